@@ -1,0 +1,172 @@
+"""Lane groups: one kernel source that is fast on CUDA and right on CPU.
+
+On CUDA a lane group is a warp: 32 lanes laid out as 8 by 4, which vote, shuffle and share a small stage in shared
+memory. On CPU a group is one lane: votes and sums are the identity, and the stage hands back the lane's own value.
+A kernel launches ``lane_count()`` threads for each group, in blocks of ``BLOCK_DIM`` threads.
+"""
+
+import warp as wp
+
+WARP_SIZE = 32
+"""Lanes of a group on CUDA."""
+
+WARP_COLUMNS, WARP_ROWS = 8, 4
+"""Layout of the lanes of a group on CUDA."""
+
+BLOCK_DIM = 128
+"""Threads of a block for every kernel that uses the stage; the stage is sized by it."""
+
+STAGE_PARTS = 3
+"""vec4 values that one slot of the stage holds."""
+
+
+def native(cuda: str, cpu: str) -> str:
+    """A native snippet that differs between CUDA and CPU."""
+    return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
+
+
+@wp.func_native(native("return 32;", "return 1;"))
+def lane_count() -> int: ...
+
+
+@wp.func_native(native("return 8;", "return 1;"))
+def lane_columns() -> int: ...
+
+
+@wp.func_native(native("return 4;", "return 1;"))
+def lane_rows() -> int: ...
+
+
+@wp.func_native(native("return __ballot_sync(0xffffffffu, x != 0);", "return x != 0 ? 1u : 0u;"))
+def lane_ballot(x: int) -> wp.uint32:
+    """Bit j is set where lane j holds a nonzero ``x``."""
+    ...
+
+
+@wp.func_native(native("return __any_sync(0xffffffffu, x != 0);", "return x != 0;"))
+def lane_any(x: int) -> int: ...
+
+
+@wp.func_native(native("return __reduce_max_sync(0xffffffffu, x);", "return x;"))
+def lane_max(x: int) -> int: ...
+
+
+@wp.func_native(
+    native("for (int o = 16; o > 0; o >>= 1) x += __shfl_xor_sync(0xffffffffu, x, o); return x;", "return x;")
+)
+def lane_sum(x: float) -> float: ...
+
+
+@wp.func_native(native("return __popc(mask);", "return (int)mask;"))
+def lane_bit_count(mask: wp.uint32) -> int:
+    """How many bits of a ballot are set."""
+    ...
+
+
+@wp.func_native(native("return __popc(mask & ((1u << lane) - 1u));", "return 0;"))
+def lane_rank(mask: wp.uint32, lane: int) -> int:
+    """How many lanes below ``lane`` have their bit set in a ballot."""
+    ...
+
+
+@wp.func_native(native("__syncwarp();", ""))
+def lane_sync(): ...
+
+
+# The stage: 32 slots of STAGE_PARTS vec4 for each lane group, in shared memory. The address is handed around as an
+# integer because a shared array is only visible in the function that declares it.
+@wp.func_native(
+    native(
+        "__shared__ float4 stage[4 * 32 * 3]; return (unsigned long long)(stage + (threadIdx.x >> 5) * 96);",
+        "return 0;",
+    )
+)
+def stage_address() -> wp.uint64: ...
+
+
+@wp.func_native(
+    native("((float4*)stage)[slot * 3 + part] = make_float4(value[0], value[1], value[2], value[3]);", "")
+)
+def stage_put(stage: wp.uint64, slot: int, part: int, value: wp.vec4): ...
+
+
+@wp.func_native(
+    native(
+        "const float4 v = ((const float4*)stage)[slot * 3 + part]; return wp::vec4(v.x, v.y, v.z, v.w);", "return own;"
+    )
+)
+def stage_get(stage: wp.uint64, slot: int, part: int, own: wp.vec4) -> wp.vec4:
+    """What a lane put into ``slot``; on CPU, where there is one lane, its ``own`` value."""
+    ...
+
+
+# A lane's own pixels, of which the CPU's single lane has a whole tile: there the loop over them is cut to the span
+# that a Gaussian covers, while on CUDA the bounds are constants and the loop unrolls into registers.
+@wp.func_native(native("return 0;", "return low <= 0.0f ? 0 : (low >= (float)size ? size : (int)ceilf(low));"))
+def span_begin(low: float, size: int) -> int:
+    """First index of [0, size) that is at least ``low``; on CUDA always 0."""
+    ...
+
+
+@wp.func_native(native("return size;", "return high < 0.0f ? 0 : (high >= (float)(size - 1) ? size : (int)high + 1);"))
+def span_end(high: float, size: int) -> int:
+    """One past the last index of [0, size) that is at most ``high``; on CUDA always ``size``."""
+    ...
+
+
+@wp.func_native("return exp2f(x);")
+def exp2(x: float) -> float: ...
+
+
+@wp.func_native("return log2f(x);")
+def log2(x: float) -> float: ...
+
+
+# Sums of K values over 32 lanes at little more than one shuffle a value instead of five: at each of the five steps a
+# lane sends the half of its values that its partner keeps, so that each lane ends with K/32 totals. They lie side by
+# side: the totals [index, index + held).
+def make_lane_add(length: int):
+    """A vector type of ``length`` floats and a function ``lane_add(values, target, row)`` that adds the lane group's
+    sum of each value to ``target[row]``, which is a row of contiguous floats."""
+    values_type = wp.types.vector(length=length, dtype=float)
+
+    @wp.func_native(
+        native(
+            """
+            constexpr int K = sizeof(values) / sizeof(float);
+            float v[K + 1];
+            #pragma unroll
+            for (int k = 0; k < K; ++k) v[k] = values[k];
+            const int lane = threadIdx.x & 31;
+            int index = 0, held = K, n = K;
+            #pragma unroll
+            for (int o = 16; o > 0; o >>= 1) {
+                const int h = (n + 1) / 2;
+                const bool up = (lane & o) != 0;
+                #pragma unroll
+                for (int k = 0; k < (K + 1) / 2; ++k) {
+                    if (k < h) {
+                        const float high = h + k < n ? v[h + k] : 0.0f;
+                        const float sent = up ? v[k] : high;
+                        const float kept = up ? high : v[k];
+                        v[k] = kept + __shfl_xor_sync(0xffffffffu, sent, o);
+                    }
+                }
+                index += up ? h : 0;
+                held = up ? held - h : min(held, h);
+                n = h;
+            }
+            float* total = &wp::index(target, row, 0) + index;
+            #pragma unroll
+            for (int k = 0; k < (K + 31) / 32; ++k)
+                if (k < held) atomicAdd(total + k, v[k]);
+            """,
+            """
+            float* total = &wp::index(target, row, 0);
+            for (int k = 0; k < (int)(sizeof(values) / sizeof(float)); ++k) total[k] += values[k];
+            """,
+        )
+    )
+    def lane_add(values: values_type, target: wp.array2d[float], row: int): ...
+
+    return values_type, lane_add

@@ -1,0 +1,249 @@
+"""EWA projection of 3D Gaussians to splats (Zwicker et al. 2001; 3DGS Eq. 5; paper Eq. 3), with its adjoint.
+
+With the camera's rotation W and translation, t = W mean + translation, depth z = t_z, u = t_x / z, v = t_y / z:
+
+    mean2d = (f_x u + c_x, f_y v + c_y)
+    J      = [[f_x / z, 0, -f_x ū / z], [0, f_y / z, -f_y v̄ / z]],  ū, v̄ = u, v clamped to a margin around the image
+    B      = J W R(q) diag(s),   cov2d = B Bᵀ = [[a', b], [b, c']],   a = a' + LOW_PASS, c = c' + LOW_PASS
+    conic  = cov2d⁻¹ = [c, -b, a] / det,   det = a c - b²
+    compensation = sqrt(det' / det), det' = a' c' - b²   (Mip-Splatting, Eq. 9: opacity of the unblurred splat)
+
+Σ itself is never formed: cov2d = B Bᵀ is positive semidefinite by construction.
+
+Adjoint: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
+    v_a = -(A² v_A + A B v_B + B² v_C),  v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C),  v_c = -(B² v_A + B C v_B + C² v_C)
+for the conic (A, B, C).
+
+A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, touches
+the image and has a finite, invertible 2D covariance. Every test is phrased so that NaN fails it.
+"""
+
+import math
+
+import warp as wp
+
+from .constants import ALPHA_MIN, FIELD_OF_VIEW_MARGIN, LOW_PASS
+from .covariance import scaled_rotation
+from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
+
+mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
+
+LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
+LARGEST_EXTENT = wp.constant(1.0e8)
+"""Half extent [px] past which a splat is culled: it must fit an int32, and float32 no longer tells its pixels apart."""
+
+
+@wp.func
+def clamped_slope(slope: float, size: float, focal: float, center: float) -> float:
+    """x / z, kept within FIELD_OF_VIEW_MARGIN of the image, beyond which the local affine map means nothing."""
+    margin = FIELD_OF_VIEW_MARGIN * 0.5 * size / focal
+    return wp.clamp(slope, -center / focal - margin, (size - center) / focal + margin)
+
+
+@wp.func
+def camera_rotation(viewmat: wp.array2d[float]) -> wp.mat33:
+    return wp.mat33(
+        viewmat[0, 0],
+        viewmat[0, 1],
+        viewmat[0, 2],
+        viewmat[1, 0],
+        viewmat[1, 1],
+        viewmat[1, 2],
+        viewmat[2, 0],
+        viewmat[2, 1],
+        viewmat[2, 2],
+    )
+
+
+@wp.func
+def camera_translation(viewmat: wp.array2d[float]) -> wp.vec3:
+    return wp.vec3(viewmat[0, 3], viewmat[1, 3], viewmat[2, 3])
+
+
+@wp.func
+def projection_jacobian(t: wp.vec3, fx: float, fy: float, u: float, v: float) -> mat23:
+    """J at camera-space point t, with the clamped slopes u and v."""
+    rz = 1.0 / t[2]
+    return mat23(fx * rz, 0.0, -fx * u * rz, 0.0, fy * rz, -fy * v * rz)
+
+
+@wp.kernel(enable_backward=False)
+def project_fwd(
+    first: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    viewmat: wp.array2d[float],
+    K: wp.array2d[float],
+    width: int,
+    height: int,
+    near: float,
+    compensate: int,
+    means2d: wp.array[wp.vec2],
+    conics: wp.array[wp.vec3],
+    depths: wp.array[float],
+    radii: wp.array[wp.vec2i],
+    splat_opacities: wp.array[float],
+):
+    i = first + wp.tid()
+    means2d[i] = wp.vec2(0.0)
+    conics[i] = wp.vec3(0.0)
+    depths[i] = 0.0
+    radii[i] = wp.vec2i(0, 0)
+    splat_opacities[i] = 0.0
+
+    rotation = camera_rotation(viewmat)
+    t = rotation * means[i] + camera_translation(viewmat)
+    if not (t[2] > near and wp.length_sq(quats[i]) > 0.0):
+        return
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
+    u = t[0] / t[2]
+    v = t[1] / t[2]
+    jacobian = projection_jacobian(
+        t, fx, fy, clamped_slope(u, float(width), fx, cx), clamped_slope(v, float(height), fy, cy)
+    )
+    spread = (jacobian * rotation) * scaled_rotation(quats[i], scales[i])
+    a_sharp = wp.dot(spread[0], spread[0])
+    b = wp.dot(spread[0], spread[1])
+    c_sharp = wp.dot(spread[1], spread[1])
+    a = a_sharp + LOW_PASS
+    c = c_sharp + LOW_PASS
+    # a c - b² in a form that cancels less: both Gram determinants are sums of squares.
+    det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+    det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
+    opacity = opacities[i]
+    if compensate != 0:
+        opacity = opacity * wp.sqrt(det_sharp / det)
+    if not (opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and det > 0.0):
+        return
+    reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
+    radius_x = wp.ceil(reach * wp.sqrt(a))
+    radius_y = wp.ceil(reach * wp.sqrt(c))
+    mean2d = wp.vec2(fx * u + cx, fy * v + cy)
+    if not (
+        mean2d[0] + radius_x > 0.0
+        and mean2d[0] - radius_x < float(width)
+        and mean2d[1] + radius_y > 0.0
+        and mean2d[1] - radius_y < float(height)
+        and radius_x < LARGEST_EXTENT
+        and radius_y < LARGEST_EXTENT
+    ):
+        return
+    means2d[i] = mean2d
+    conics[i] = wp.vec3(c / det, -b / det, a / det)
+    depths[i] = t[2]
+    radii[i] = wp.vec2i(wp.max(int(radius_x), 1), wp.max(int(radius_y), 1))
+    splat_opacities[i] = opacity
+
+
+@wp.kernel(enable_backward=False)
+def project_bwd(
+    first: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    viewmat: wp.array2d[float],
+    K: wp.array2d[float],
+    width: int,
+    height: int,
+    compensate: int,
+    conics: wp.array[wp.vec3],
+    radii: wp.array[wp.vec2i],
+    v_means2d: wp.array[wp.vec2],
+    v_conics: wp.array[wp.vec3],
+    v_depths: wp.array[float],
+    v_splat_opacities: wp.array[float],
+    v_means: wp.array[wp.vec3],
+    v_quats: wp.array[wp.vec4],
+    v_scales: wp.array[wp.vec3],
+    v_opacities: wp.array[float],
+):
+    i = first + wp.tid()
+    if radii[i][0] <= 0:
+        v_means[i] = wp.vec3(0.0)
+        v_quats[i] = wp.vec4(0.0)
+        v_scales[i] = wp.vec3(0.0)
+        v_opacities[i] = 0.0
+        return
+    rotation = camera_rotation(viewmat)
+    t = rotation * means[i] + camera_translation(viewmat)
+    fx = K[0, 0]
+    fy = K[1, 1]
+    rz = 1.0 / t[2]
+    slope_u = t[0] * rz
+    slope_v = t[1] * rz
+    u = clamped_slope(slope_u, float(width), fx, K[0, 2])
+    v = clamped_slope(slope_v, float(height), fy, K[1, 2])
+    jacobian = projection_jacobian(t, fx, fy, u, v)
+    to_image = jacobian * rotation
+    q = quats[i]
+    s = scales[i]
+    turn = quaternion_to_rotation(q)
+    shape = turn * wp.diag(s)
+    spread = to_image * shape
+
+    conic = conics[i]
+    v_conic = v_conics[i]
+    A = conic[0]
+    B = conic[1]
+    C = conic[2]
+    v_a = -(A * A * v_conic[0] + A * B * v_conic[1] + B * B * v_conic[2])
+    v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
+    v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
+
+    v_opacity = v_splat_opacities[i]
+    if compensate != 0:
+        a_sharp = wp.dot(spread[0], spread[0])
+        b = wp.dot(spread[0], spread[1])
+        c_sharp = wp.dot(spread[1], spread[1])
+        det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+        det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
+        compensation = wp.sqrt(det_sharp / det)
+        # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
+        # finite for needles and discs seen edge on, whose compensated opacity is below ALPHA_MIN long before.
+        factor = v_opacity * opacities[i] * 0.5 / (wp.max(compensation, 1.0e-6) * det)
+        kept = 1.0 - compensation * compensation
+        v_a += factor * (c_sharp * kept - LOW_PASS * compensation * compensation)
+        v_c += factor * (a_sharp * kept - LOW_PASS * compensation * compensation)
+        v_b -= factor * 2.0 * b * kept
+        v_opacity = v_opacity * compensation
+    v_opacities[i] = v_opacity
+
+    v_spread = mat23(
+        2.0 * v_a * spread[0, 0] + v_b * spread[1, 0],
+        2.0 * v_a * spread[0, 1] + v_b * spread[1, 1],
+        2.0 * v_a * spread[0, 2] + v_b * spread[1, 2],
+        v_b * spread[0, 0] + 2.0 * v_c * spread[1, 0],
+        v_b * spread[0, 1] + 2.0 * v_c * spread[1, 1],
+        v_b * spread[0, 2] + 2.0 * v_c * spread[1, 2],
+    )
+    v_shape = wp.transpose(to_image) * v_spread
+    v_scales[i] = wp.vec3(
+        turn[0, 0] * v_shape[0, 0] + turn[1, 0] * v_shape[1, 0] + turn[2, 0] * v_shape[2, 0],
+        turn[0, 1] * v_shape[0, 1] + turn[1, 1] * v_shape[1, 1] + turn[2, 1] * v_shape[2, 1],
+        turn[0, 2] * v_shape[0, 2] + turn[1, 2] * v_shape[1, 2] + turn[2, 2] * v_shape[2, 2],
+    )
+    v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
+
+    v_jacobian = (v_spread * wp.transpose(shape)) * wp.transpose(rotation)
+    v_mean2d = v_means2d[i]
+    # Through the slopes: the centre uses t_x / z itself, the Jacobian its clamped value, constant where it is clamped.
+    v_u = fx * v_mean2d[0]
+    v_v = fy * v_mean2d[1]
+    if u == slope_u:
+        v_u -= fx * rz * v_jacobian[0, 2]
+    if v == slope_v:
+        v_v -= fy * rz * v_jacobian[1, 2]
+    v_z = -rz * (
+        jacobian[0, 0] * v_jacobian[0, 0]
+        + jacobian[0, 2] * v_jacobian[0, 2]
+        + jacobian[1, 1] * v_jacobian[1, 1]
+        + jacobian[1, 2] * v_jacobian[1, 2]
+    )
+    v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v) + v_depths[i])
+    v_means[i] = wp.transpose(rotation) * v_t

@@ -1,0 +1,148 @@
+"""A splat's row in memory: everything that compositing needs of one Gaussian, in 16-byte pieces.
+
+    [x, y, a, b], [c, log2 opacity, 0, 0], [feature 0..3], [feature 4..7] …
+
+with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so that
+log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is not drawn (culled, or with a value that is not
+finite) has log2 opacity NEVER_DRAWN.
+
+``unpack`` is the adjoint: the reverse walk leaves, per Gaussian, the gradients of its features and the moments of
+s = alpha v_alpha over its pixels, and
+
+    v_mean2d  = -conic Σ s d,                v_opacity = Σ s / opacity,
+    v_conic_xx = -½ Σ s dx²,  v_conic_xy = -Σ s dx dy,  v_conic_yy = -½ Σ s dy².
+"""
+
+import functools
+
+import warp as wp
+
+from .constants import ALPHA_MIN, LOG2_E, NEVER_DRAWN
+
+GEOMETRY_PARTS = 2
+"""vec4 values before the features."""
+
+NUM_MOMENTS = 6
+"""Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy²."""
+
+NUM_ABSOLUTE = 2
+"""Σ |s (conic d)_x| and Σ |s (conic d)_y|, the absolute-value variant of the gradient of the mean."""
+
+
+def row_parts(num_channels: int) -> int:
+    """vec4 values in a row with ``num_channels`` features."""
+    return GEOMETRY_PARTS + (num_channels + 3) // 4
+
+
+def gradient_stride(num_channels: int) -> int:
+    """Floats in a Gaussian's gradient row: features, moments, absolute sums, padded to 16 bytes."""
+    return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
+
+
+@functools.cache
+def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that writes the rows of splats, one thread each; depth, if wanted, is the channel after the features."""
+    num_channels = num_features + int(with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def pack(
+        first: int,
+        means2d: wp.array[wp.vec2],
+        conics: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        features: wp.array2d[float],
+        depths: wp.array[float],
+        radii: wp.array[wp.vec2i],
+        rows: wp.array2d[wp.vec4],
+    ):
+        i = first + wp.tid()
+        mean = means2d[i]
+        conic = conics[i]
+        opacity = opacities[i]
+        radius = radii[i]
+        # A sum is finite only where all of its terms are, and a comparison with NaN fails.
+        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2]
+        for part in range(wp.static((num_channels + 3) // 4)):
+            value = wp.vec4(0.0)
+            for k in range(4):
+                if part * 4 + k < wp.static(num_features):
+                    value[k] = features[i, part * 4 + k]
+                elif part * 4 + k < wp.static(num_channels):
+                    value[k] = depths[i]
+            total += value[0] + value[1] + value[2] + value[3]
+            rows[i, wp.static(GEOMETRY_PARTS) + part] = value
+        drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0
+        drawn = drawn and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+        if drawn and wp.isfinite(total):
+            a = 0.5 * LOG2_E * conic[0]
+            rows[i, 0] = wp.vec4(mean[0], mean[1], a, LOG2_E * conic[1])
+            rows[i, 1] = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+        else:
+            rows[i, 0] = wp.vec4(0.0, 0.0, 1.0, 0.0)
+            rows[i, 1] = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
+            for part in range(wp.static((num_channels + 3) // 4)):
+                rows[i, wp.static(GEOMETRY_PARTS) + part] = wp.vec4(0.0)
+
+    return pack
+
+
+sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE, dtype=float)
+
+
+@functools.cache
+def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that turns gradient rows into the gradients of what ``make_pack``'s kernel read, one thread each.
+
+    ``gradients`` has one slice for each CPU shard; on CUDA there is one. ``norms`` gets the length of the gradient of
+    the mean and its absolute-value variant, both scaled per axis by ``half_width`` and ``half_height``.
+    """
+    num_channels = num_features + int(with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def unpack(
+        first: int,
+        conics: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        rows: wp.array2d[wp.vec4],
+        gradients: wp.array3d[float],
+        half_width: float,
+        half_height: float,
+        v_means2d: wp.array[wp.vec2],
+        v_conics: wp.array[wp.vec3],
+        v_opacities: wp.array[float],
+        v_features: wp.array2d[float],
+        v_depths: wp.array[float],
+        norms: wp.array[wp.vec2],
+    ):
+        i = first + wp.tid()
+        for k in range(wp.static(num_channels)):
+            total = float(0.0)
+            for shard in range(gradients.shape[0]):
+                total += gradients[shard, i, k]
+            if k < wp.static(num_features):
+                v_features[i, k] = total
+            else:
+                v_depths[i] = total
+        s = sums_vector()
+        for k in range(wp.static(NUM_MOMENTS + NUM_ABSOLUTE)):
+            total = float(0.0)
+            for shard in range(gradients.shape[0]):
+                total += gradients[shard, i, wp.static(num_channels) + k]
+            s[k] = total
+        if rows[i, 1][1] == NEVER_DRAWN:
+            v_means2d[i] = wp.vec2(0.0)
+            v_conics[i] = wp.vec3(0.0)
+            v_opacities[i] = 0.0
+            norms[i] = wp.vec2(0.0)
+        else:
+            conic = conics[i]
+            v_mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
+            v_means2d[i] = v_mean
+            v_conics[i] = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
+            v_opacities[i] = s[0] / opacities[i]
+            norms[i] = wp.vec2(
+                wp.length(wp.vec2(v_mean[0] * half_width, v_mean[1] * half_height)),
+                wp.length(wp.vec2(s[6] * half_width, s[7] * half_height)),
+            )
+
+    return unpack

@@ -1,0 +1,210 @@
+"""Tile binning: which Gaussians each tile has to look at, front to back.
+
+Gaussians are sorted by depth once (N keys of 32 bits); in that order each writes one intersection per tile that its
+ellipse really meets; a stable sort by tile index (M keys, only the bits that a tile index needs) then leaves every
+tile's intersections in depth order.
+
+The buffers hold ``capacity`` intersections. The true number M is only known on the device, so nothing waits for it:
+intersections that do not exist have the tile index ``num_tiles`` and sort to the end, and when M > capacity every
+tile looks at all Gaussians in depth order instead, which is slow but draws the same image. M is written to ``demand``
+in host memory, from where the next call sizes its buffers.
+"""
+
+import warp as wp
+
+from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
+from .ellipse import ellipse_half_size, ellipse_slab
+from .lanes import lane_count, lane_max
+
+CULLED_DEPTH = wp.constant(0x7F7FFFFF)
+"""Depth key of a Gaussian that is not drawn: the bits of the largest float."""
+
+SLACK = wp.constant(0.01)
+"""Pixels by which spans are widened, well above what float32 can lose at 8K, so that no intersection is missed."""
+
+
+@wp.func
+def tile_index(position: float, num_tiles: int) -> int:
+    """Tile of a pixel coordinate, clamped to one beyond the image on either side."""
+    return int(wp.clamp(wp.floor(position / float(TILE_SIZE)), -1.0, float(num_tiles)))
+
+
+@wp.func
+def tile_rows(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tiles_y: int) -> wp.vec2i:
+    """First and one past the last row of tiles that hold a pixel centre of the ellipse's bounding box.
+
+    Tile k holds pixel centres from 16 k + 0.5 to 16 k + 15.5, so the box is narrowed by half a pixel on both sides.
+    """
+    low = tile_index(row0[1] - half_size[1] + 0.5 - SLACK, tiles_y)
+    high = tile_index(row0[1] + half_size[1] - 0.5 + SLACK, tiles_y)
+    return wp.vec2i(wp.max(low, 0), wp.min(high, tiles_y - 1) + 1)
+
+
+@wp.func
+def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, tiles_x: int) -> wp.vec2i:
+    """First and one past the last tile that the ellipse meets in one row of tiles."""
+    top = float(tile_y * TILE_SIZE) + 0.5 - row0[1]
+    slab = ellipse_slab(
+        row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN, half_size, top - SLACK, top + float(TILE_SIZE - 1) + SLACK
+    )
+    low = tile_index(row0[0] + slab[0] + 0.5 - SLACK, tiles_x)
+    high = tile_index(row0[0] + slab[1] - 0.5 + SLACK, tiles_x)
+    return wp.vec2i(wp.max(low, 0), wp.min(high, tiles_x - 1) + 1)
+
+
+@wp.kernel(enable_backward=False)
+def depth_keys(
+    first: int,
+    depths: wp.array[float],
+    rows: wp.array2d[wp.vec4],
+    keys: wp.array[int],
+    gaussian_from_rank: wp.array[int],
+):
+    i = first + wp.tid()
+    key = CULLED_DEPTH
+    if rows[i, 1][1] != NEVER_DRAWN and depths[i] > 0.0:
+        key = wp.cast(depths[i], wp.int32)  # the bits of positive floats are in the order of the floats
+    keys[i] = key
+    gaussian_from_rank[i] = i
+
+
+@wp.kernel(enable_backward=False)
+def count_tiles(
+    first: int,
+    rows: wp.array2d[wp.vec4],
+    gaussian_from_rank: wp.array[int],
+    tiles_x: int,
+    tiles_y: int,
+    num_tiles_of_rank: wp.array[int],
+):
+    rank = first + wp.tid()
+    g = gaussian_from_rank[rank]
+    count = int(0)
+    row0 = rows[g, 0]
+    row1 = rows[g, 1]
+    if row1[1] != NEVER_DRAWN:
+        half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
+        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        for y in range(span_y[0], span_y[1]):
+            span_x = tile_columns(row0, row1, half_size, y, tiles_x)
+            count += wp.max(span_x[1] - span_x[0], 0)
+    num_tiles_of_rank[rank] = count
+
+
+@wp.kernel(enable_backward=False)
+def emit_isects(
+    first: int,
+    rows: wp.array2d[wp.vec4],
+    gaussian_from_rank: wp.array[int],
+    end_of_rank: wp.array[wp.int64],
+    num_gaussians: int,
+    tiles_x: int,
+    tiles_y: int,
+    capacity: int,
+    tile_from_isect: wp.array[int],
+    gaussian_from_isect: wp.array[int],
+    demand: wp.array[wp.int64],
+):
+    thread = first + wp.tid()
+    total = end_of_rank[num_gaussians - 1]
+    if thread == 0:
+        demand[0] = total
+    if thread < capacity and wp.int64(thread) >= total:
+        tile_from_isect[thread] = tiles_x * tiles_y
+    if thread >= num_gaussians or total > wp.int64(capacity):
+        return
+    isect = int(0)
+    if thread > 0:
+        isect = int(end_of_rank[thread - 1])
+    end = int(end_of_rank[thread])
+    if isect == end:
+        return
+    g = gaussian_from_rank[thread]
+    row0 = rows[g, 0]
+    row1 = rows[g, 1]
+    half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
+    span_y = tile_rows(row0, row1, half_size, tiles_y)
+    for y in range(span_y[0], span_y[1]):
+        span_x = tile_columns(row0, row1, half_size, y, tiles_x)
+        for x in range(span_x[0], span_x[1]):
+            # The count came from another kernel, whose rounding may differ: never write past it.
+            if isect < end:
+                tile_from_isect[isect] = y * tiles_x + x
+                gaussian_from_isect[isect] = g
+                isect += 1
+    while isect < end:
+        tile_from_isect[isect] = tiles_x * tiles_y
+        gaussian_from_isect[isect] = g
+        isect += 1
+
+
+@wp.kernel(enable_backward=False)
+def tile_ranges(
+    first: int,
+    end_of_rank: wp.array[wp.int64],
+    gaussian_from_rank: wp.array[int],
+    num_gaussians: int,
+    num_tiles: int,
+    capacity: int,
+    tile_from_isect: wp.array[int],
+    gaussian_from_isect: wp.array[int],
+    ranges: wp.array2d[int],
+):
+    """Runs ``max(capacity, num_tiles) + 1`` threads over the sorted intersections."""
+    thread = first + wp.tid()
+    if end_of_rank[num_gaussians - 1] > wp.int64(capacity):
+        if thread < num_gaussians:
+            gaussian_from_isect[thread] = gaussian_from_rank[thread]
+        if thread < num_tiles:
+            ranges[thread, 0] = 0
+            ranges[thread, 1] = num_gaussians
+        return
+    if thread > capacity:
+        return
+    before = int(-1)
+    here = num_tiles
+    if thread > 0:
+        before = tile_from_isect[thread - 1]
+    if thread < capacity:
+        here = tile_from_isect[thread]
+    # A tile's range begins where the tile index first reaches it, which for empty tiles is where the next one begins.
+    for tile in range(before, here):
+        if tile >= 0:
+            ranges[tile, 1] = thread
+        if tile + 1 < num_tiles:
+            ranges[tile + 1, 0] = thread
+
+
+@wp.kernel(enable_backward=False)
+def tile_ends(
+    first: int,
+    ranges: wp.array2d[int],
+    gaussian_from_isect: wp.array[int],
+    is_dynamic: wp.array[wp.uint8],
+    ends: wp.array[wp.vec2i],
+):
+    """One past the last static and the last dynamic intersection of each tile: where each branch's walk may end.
+
+    ``lane_count()`` threads for each tile, which look from the end of its list.
+    """
+    thread = first + wp.tid()
+    lane = thread % lane_count()
+    tile = thread / lane_count()
+    begin = ranges[tile, 0]
+    end_static = begin
+    end_dynamic = begin
+    base = ranges[tile, 1]
+    while base > begin and (end_static == begin or end_dynamic == begin):
+        isect = base - 1 - lane
+        is_last_static = begin
+        is_last_dynamic = begin
+        if isect >= begin:
+            if is_dynamic[gaussian_from_isect[isect]] != wp.uint8(0):
+                is_last_dynamic = isect + 1
+            else:
+                is_last_static = isect + 1
+        end_static = wp.max(end_static, lane_max(is_last_static))
+        end_dynamic = wp.max(end_dynamic, lane_max(is_last_dynamic))
+        base -= lane_count()
+    if lane == 0:
+        ends[tile] = wp.vec2i(end_static, end_dynamic)

@@ -1,0 +1,45 @@
+"""Alpha compositing in plain torch, any dtype: every pixel looks at every Gaussian, and autograd goes back."""
+
+import torch
+from torch import Tensor
+
+ALPHA_MIN = 1.0 / 255.0
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+
+
+def composite(
+    means2d: Tensor,
+    conics: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    depths: Tensor,
+    drawn: Tensor,
+    size: tuple[int, int],
+    background: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """image [H, W, C], alpha [H, W], blend weights [N, H, W] of the Gaussians for which ``drawn`` [N] is true."""
+    width, height = size
+    dtype = means2d.dtype
+    x = torch.arange(width, dtype=dtype) + 0.5
+    y = torch.arange(height, dtype=dtype) + 0.5
+    image = torch.zeros(height, width, features.shape[1], dtype=dtype)
+    T = torch.ones(height, width, dtype=dtype)
+    running = torch.ones(height, width, dtype=torch.bool)
+    weights = torch.zeros(means2d.shape[0], height, width, dtype=dtype)
+    for g in torch.argsort(depths.detach(), stable=True).tolist():
+        if not drawn[g]:
+            continue
+        dx, dy = means2d[g, 0] - x[None, :], means2d[g, 1] - y[:, None]
+        a, b, c = conics[g]
+        alpha = opacities[g] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        alpha = alpha.clamp(max=ALPHA_MAX)
+        seen = running & (alpha >= ALPHA_MIN)
+        T_next = T * (1 - alpha)
+        running = running & ~(seen & (T_next <= TRANSMITTANCE_MIN))
+        seen = seen & running
+        weight = torch.where(seen, alpha * T, torch.zeros_like(T))
+        weights[g] = weight.detach()
+        image = image + weight[..., None] * features[g]
+        T = torch.where(seen, T_next, T)
+    return image + T[..., None] * background, 1 - T, weights

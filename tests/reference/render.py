@@ -1,0 +1,33 @@
+"""The whole render in plain torch, any dtype."""
+
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.scene.splats import Splats
+
+from . import compositing, projection, sh
+
+
+def render(
+    tensors: dict[str, Tensor], camera: Camera, background: Tensor, drawn: Tensor | None = None, antialias: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """image, alpha, weights of splats given as a dict of ``Splats`` tensors; ``drawn`` [N] picks a branch."""
+    dtype = tensors["means"].dtype
+    viewmat, K = camera.viewmat.to(dtype), camera.K.to(dtype)
+    geometry = [tensors[name] for name in ("means", "quats", "scales", "opacities")]
+    means2d, conics, depths, opacities, visible = projection.project(
+        *geometry, viewmat, K, camera.size, antialias=antialias
+    )
+    if tensors.get("colors") is not None:
+        features = tensors["colors"]
+    else:
+        degree = round(tensors["sh"].shape[1] ** 0.5) - 1
+        features = sh.spherical_harmonics(tensors["means"], tensors["sh"], viewmat, degree)
+    visible = visible if drawn is None else visible & drawn
+    return compositing.composite(means2d, conics, opacities, features, depths, visible, camera.size, background)
+
+
+def as_dict(splats: Splats, **changes: Tensor) -> dict[str, Tensor]:
+    """The tensors of splats by name, in double precision."""
+    named = {name: getattr(splats, name) for name in Splats.tensor_names()}
+    return {name: t.double() if t is not None and t.is_floating_point() else t for name, t in named.items()} | changes

@@ -1,0 +1,1 @@
+"""warpgs: SplitGaussian, dynamic scenes from one moving camera, on NVIDIA Warp kernels."""

@@ -1,0 +1,65 @@
+"""Pinhole cameras."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .ops.contracts import check_image_size, check_same_device, check_tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera at one moment.
+
+    Attributes:
+        viewmat: [4, 4] rigid world-to-camera transform, OpenCV axes (x right, y down, z forward).
+        K: [3, 3] intrinsics [px], pixel centres at +0.5, principal point anywhere, no skew.
+        width, height: Size of the image [px].
+        time: Moment in [0, 1].
+    """
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_tensor("viewmat", self.viewmat, (4, 4), {})
+        check_tensor("K", self.K, (3, 3), {})
+        check_same_device({"viewmat": self.viewmat, "K": self.K})
+        check_image_size(self.width, self.height)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)."""
+        return self.width, self.height
+
+    def to(self, device: torch.device | str) -> "Camera":
+        return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+
+    @staticmethod
+    def looking_at(
+        position: Float[Tensor, "3"],
+        target: Float[Tensor, "3"],
+        up: Float[Tensor, "3"],
+        focal: float,
+        size: tuple[int, int],
+        time: float = 0.0,
+    ) -> "Camera":
+        """A camera at ``position`` that sees ``target`` in the middle of an image of ``size`` (width, height).
+
+        ``up`` points up in the world; ``focal`` is the focal length [px].
+        """
+        forward = torch.nn.functional.normalize(target - position, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+        viewmat = torch.eye(4, device=position.device)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ position
+        width, height = size
+        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], device=position.device)
+        return Camera(viewmat, K, width, height, time)

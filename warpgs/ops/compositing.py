@@ -1,0 +1,218 @@
+"""Alpha compositing of splats into one or three images, and the way back (kernels/compositing.py)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from warpgs.kernels import compositing as kernels
+from warpgs.kernels.constants import TILE_SIZE
+from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
+from warpgs.kernels.rows import gradient_stride
+
+from .contracts import check_image_size, check_same_device, check_tensor
+from .projection import Projection
+from .rows import Rows
+from .tape import PerShard, Run, differentiable
+from .tiles import Tiles, record_tile_ends, record_tiles
+
+NUM_BRANCH_IMAGES = 3
+"""Joint, static only, dynamic only."""
+
+CUDA_PIXELS_FWD = (1, 2)
+CUDA_PIXELS_BWD = (1, 2)
+"""Columns and rows of pixels that a lane composites on CUDA; see docs/performance.md for the alternatives."""
+
+CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
+
+
+class Composite(NamedTuple):
+    """What compositing makes: one entry per image (joint; or joint, static, dynamic), and statistics if asked for.
+
+    Attributes:
+        images: [H, W, C] each.
+        alphas: [H, W] each, the opacity that the splats leave, in [0, 1 - 1e-4).
+        norms: [N, 2] screen-space gradient norms, filled on the way back; see ``Rows``.
+        contributed: [N] whether the Gaussian changed a pixel of the joint image.
+        weights: [N] sum over pixels of the joint image of alpha times transmittance.
+    """
+
+    images: tuple[Float[Tensor, "H W C"], ...]
+    alphas: tuple[Float[Tensor, "H W"], ...]
+    norms: Float[Tensor, "N 2"]
+    contributed: Bool[Tensor, " N"] | None
+    weights: Float[Tensor, " N"] | None
+
+    def flat(self) -> tuple[Tensor, ...]:
+        """As a tuple of tensors, the way ``differentiable`` wants it."""
+        statistics = () if self.contributed is None or self.weights is None else (self.contributed, self.weights)
+        return (*self.images, *self.alphas, self.norms, *statistics)
+
+    @staticmethod
+    def from_flat(tensors: tuple[Tensor, ...], num_images: int) -> "Composite":
+        images, alphas = tensors[:num_images], tensors[num_images : 2 * num_images]
+        norms, *statistics = tensors[2 * num_images :]
+        contributed, weights = statistics or (None, None)
+        return Composite(images, alphas, norms, contributed, weights)
+
+
+def _launch_shape(run: Run, pixels: tuple[int, int], num_tiles: int) -> int:
+    """Threads of a compositing launch: a lane group for each block of pixels."""
+    lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
+    return num_tiles * (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1])) * lanes
+
+
+def record_composite(
+    run: Run,
+    rows: Rows,
+    tiles: Tiles,
+    size: tuple[int, int],
+    background: Tensor,
+    is_dynamic: Tensor | None,
+    statistics: bool,
+    absgrad: bool,
+) -> Composite:
+    """Composites packed rows. With ``is_dynamic`` [N] uint8 three images come out, otherwise one.
+
+    ``background`` has a value for each channel of the rows.
+    """
+    width, height = size
+    C = rows.num_channels
+    N = rows.packed.shape[0]
+    images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
+    ends = None if is_dynamic is None else record_tile_ends(run, tiles, is_dynamic)
+    image, alpha = run.empty(images, height, width, C), run.empty(images, height, width)
+    transmittance, last = run.empty(alpha.numel()), run.empty(alpha.numel(), dtype=torch.int32)
+    contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
+    weights = run.zeros(run.num_shards, N) if statistics else None
+    pixels = CUDA_PIXELS_FWD if run.is_cuda else CPU_PIXELS
+    run.launch(
+        kernels.make_composite_fwd(C, images, pixels, statistics),
+        _launch_shape(run, pixels, tiles.ranges.shape[0]),
+        tiles.ranges,
+        ends,
+        tiles.gaussian_from_isect,
+        rows.packed,
+        is_dynamic,
+        background,
+        width,
+        height,
+        image.view(-1, C),
+        alpha.view(-1),
+        transmittance,
+        last,
+        contributed,
+        None if weights is None else PerShard(weights),
+        block_dim=BLOCK_DIM,
+        work=TILE_SIZE * TILE_SIZE,
+    )
+    result = Composite(
+        images=tuple(image),
+        alphas=tuple(alpha),
+        norms=rows.norms,
+        contributed=None if contributed is None else contributed.view(torch.bool),
+        weights=None if weights is None else weights.sum(0),
+    )
+
+    def gathered(outputs: tuple[Tensor, ...]) -> Tensor | None:
+        """The cotangents of several outputs in one tensor; None where nothing has arrived at any."""
+        values = [run.adjoint(t) for t in outputs]
+        if all(v is None for v in values):
+            return None
+        if len(values) == 1:
+            return values[0]
+        return torch.stack([torch.zeros_like(t) if v is None else v for t, v in zip(outputs, values, strict=True)])
+
+    def backward() -> None:
+        v_image, v_alpha = gathered(result.images), gathered(result.alphas)
+        if v_image is None and v_alpha is None:
+            return
+        v_image = run.zeros(*image.shape) if v_image is None else v_image
+        v_alpha = run.zeros(*alpha.shape) if v_alpha is None else v_alpha
+        gradients = run.zeros(run.num_shards, N, gradient_stride(C))
+        pixels = CUDA_PIXELS_BWD if run.is_cuda else CPU_PIXELS
+        run.launch(
+            kernels.make_composite_bwd(C, images, pixels, absgrad),
+            _launch_shape(run, pixels, tiles.ranges.shape[0]),
+            tiles.ranges,
+            tiles.gaussian_from_isect,
+            rows.packed,
+            is_dynamic,
+            background,
+            width,
+            height,
+            transmittance,
+            last,
+            v_image.view(-1, C),
+            v_alpha.view(-1),
+            PerShard(gradients),
+            block_dim=BLOCK_DIM,
+            work=TILE_SIZE * TILE_SIZE,
+        )
+        run.add_adjoint(rows.packed, gradients)
+        run.add_adjoint(background, (v_image.view(-1, C) * transmittance.view(-1, 1)).sum(0))
+
+    run.on_backward(backward)
+    return result
+
+
+def composite(
+    splats: Projection,
+    features: Float[Tensor, "N C"],
+    size: tuple[int, int],
+    *,
+    background: Float[Tensor, " C"] | None = None,
+    is_dynamic: Bool[Tensor, " N"] | None = None,
+    statistics: bool = False,
+    absgrad: bool = False,
+) -> Composite:
+    """Composites projected splats front to back; differentiable in their geometry, opacities, features, background.
+
+    Args:
+        splats: From ``project``. Splats with a conic that is not positive definite, an opacity outside [1/255, 1] or a
+            value that is not finite are not drawn.
+        features: [N, C] values to blend, any number of channels.
+        size: (width, height) [px].
+        background: [C] value behind everything; zero by default.
+        is_dynamic: [N] branch of each splat; if given, three images are made: joint, static only, dynamic only.
+        statistics: Whether to report what each splat contributed.
+        absgrad: Whether the way back also gathers the absolute-value gradient norms.
+
+    Returns:
+        A ``Composite``.
+
+    Raises:
+        ValueError: On a wrong shape, dtype, device or size.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("splats.means2d", splats.means2d, ("N", 2), sizes)
+    check_tensor("splats.conics", splats.conics, ("N", 3), sizes)
+    check_tensor("splats.depths", splats.depths, ("N",), sizes)
+    check_tensor("splats.opacities", splats.opacities, ("N",), sizes)
+    check_tensor("splats.radii", splats.radii, ("N", 2), sizes, (torch.int32,))
+    check_tensor("features", features, ("N", "C"), sizes)
+    if features.shape[1] == 0:
+        raise ValueError("features must have at least one channel, got none")
+    background = torch.zeros(sizes["C"], device=features.device) if background is None else background
+    check_tensor("background", background, ("C",), sizes)
+    branch = None
+    if is_dynamic is not None:
+        check_tensor("is_dynamic", is_dynamic, ("N",), sizes, (torch.bool,))
+        branch = is_dynamic.view(torch.uint8)
+    check_same_device(
+        {**splats._asdict(), "features": features, "background": background, "is_dynamic": is_dynamic}
+    )
+    check_image_size(*size)
+
+    def op(run: Run, *tensors: Tensor) -> tuple[Tensor, ...]:
+        *geometry, features, background = tensors
+        projection = Projection(*geometry, splats.radii)
+        rows = Rows(run, projection, features, False, size)
+        tiles = record_tiles(run, rows.packed, projection.depths, size)
+        return record_composite(run, rows, tiles, size, background, branch, statistics, absgrad).flat()
+
+    tensors = differentiable(
+        op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background
+    )
+    return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES)

@@ -1,0 +1,61 @@
+"""Input checks of the public functions: fail at the door, in words."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+
+def check_tensor(
+    name: str,
+    value: object,
+    shape: tuple[int | str, ...],
+    sizes: dict[str, int],
+    dtypes: tuple[torch.dtype, ...] = (torch.float32,),
+) -> None:
+    """Raises ``ValueError`` unless ``value`` is a contiguous tensor of a shape and dtype.
+
+    Args:
+        name: How the user knows the tensor.
+        shape: A size for each axis: a number, or a letter that stands for the same size wherever it occurs.
+        sizes: Sizes of the letters seen so far; extended by this tensor.
+        dtypes: What is allowed.
+    """
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a torch tensor, got {type(value).__name__}")
+    wanted = "[" + ", ".join(str(s) for s in shape) + "]"
+    if value.ndim != len(shape):
+        raise ValueError(f"{name} must have shape {wanted}, got {list(value.shape)}")
+    for want, got in zip(shape, value.shape, strict=True):
+        if isinstance(want, str):
+            known = sizes.setdefault(want, got)
+            if known != got:
+                raise ValueError(f"{name} must have shape {wanted} with {want} = {known}, got {list(value.shape)}")
+        elif want != got:
+            raise ValueError(f"{name} must have shape {wanted}, got {list(value.shape)}")
+    if value.dtype not in dtypes:
+        raise ValueError(f"{name} must be {' or '.join(str(d) for d in dtypes)}, got {value.dtype}")
+    if not value.is_contiguous():
+        raise ValueError(f"{name} must be contiguous in memory; call .contiguous() on it")
+
+
+def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
+    """Raises ``ValueError`` unless all tensors lie on one CPU or CUDA device."""
+    given = {name: t for name, t in tensors.items() if t is not None}
+    first_name, first = next(iter(given.items()))
+    if first.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first.device}")
+    for name, tensor in given.items():
+        if tensor.device != first.device:
+            raise ValueError(
+                f"all tensors must be on one device: {first_name} is on {first.device}, {name} on {tensor.device}"
+            )
+
+
+def check_image_size(width: int, height: int) -> None:
+    """Raises ``ValueError`` unless an image has a size that can be rendered."""
+    for name, value in (("width", width), ("height", height)):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ValueError(f"{name} must be an int, got {value!r}")
+        if not 0 <= value <= 32768:
+            raise ValueError(f"{name} must be between 0 and 32768 pixels, got {value}")

@@ -1,0 +1,64 @@
+"""Splat rows: what compositing needs of each Gaussian, in 16-byte pieces (kernels/rows.py)."""
+
+from torch import Tensor
+
+from warpgs.kernels import rows as kernels
+
+from .projection import Projection
+from .tape import Run
+
+
+class Rows:
+    """Packed splats, and what the way back leaves of them.
+
+    Attributes:
+        packed: [N, parts, 4] rows.
+        num_channels: Features, and depth where it is one of them.
+        norms: [N, 2] length of the gradient of the screen-space mean and its absolute-value variant (the lengths'
+            terms summed over pixels before squaring), in normalised device coordinates (pixels × size / 2) as the
+            densification of 3DGS expects; zero until the way back has been gone.
+    """
+
+    def __init__(self, run: Run, splats: Projection, features: Tensor, with_depth: bool, size: tuple[int, int]):
+        N, num_features = features.shape
+        self.num_channels = num_features + int(with_depth)
+        self.packed = run.empty(N, kernels.row_parts(self.num_channels), 4)
+        self.norms = run.zeros(N, 2)
+        pack = kernels.make_pack(num_features, with_depth)
+        run.launch(
+            pack, N, splats.means2d, splats.conics, splats.opacities, features, splats.depths, splats.radii, self.packed
+        )
+
+        packed, norms = self.packed, self.norms
+
+        def backward() -> None:
+            gradients = run.adjoint(packed)
+            if gradients is None:
+                return
+            v_means2d, v_conics = run.empty(N, 2), run.empty(N, 3)
+            v_opacities, v_features = run.empty(N), run.empty(N, num_features)
+            v_depths = run.empty(N) if with_depth else None
+            run.launch(
+                kernels.make_unpack(num_features, with_depth),
+                N,
+                splats.conics,
+                splats.opacities,
+                packed,
+                gradients,
+                0.5 * size[0],
+                0.5 * size[1],
+                v_means2d,
+                v_conics,
+                v_opacities,
+                v_features,
+                v_depths,
+                norms,
+            )
+            run.add_adjoint(splats.means2d, v_means2d)
+            run.add_adjoint(splats.conics, v_conics)
+            run.add_adjoint(splats.opacities, v_opacities)
+            run.add_adjoint(features, v_features)
+            if v_depths is not None:
+                run.add_adjoint(splats.depths, v_depths)
+
+        run.on_backward(backward)

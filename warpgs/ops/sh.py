@@ -1,0 +1,89 @@
+"""View-dependent colour from spherical harmonics (kernels/sh.py)."""
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from warpgs.kernels import sh as kernels
+
+from .contracts import check_same_device, check_tensor
+from .tape import Run, differentiable
+
+MAX_DEGREE = 3
+
+
+def num_bases(degree: int) -> int:
+    """How many basis functions harmonics up to a degree have."""
+    return (degree + 1) ** 2
+
+
+def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) -> int:
+    """Raises ``ValueError`` unless ``sh`` [N, bases, 3] holds harmonics of ``degree``; returns the degree to use."""
+    check_tensor("sh", sh, ("N", "bases", 3), sizes)
+    held = round(sh.shape[1] ** 0.5) - 1
+    if num_bases(held) != sh.shape[1] or not 0 <= held <= MAX_DEGREE:
+        raise ValueError(f"sh must have shape [N, bases, 3] with 1, 4, 9 or 16 bases, got {list(sh.shape)}")
+    if degree is None:
+        return held
+    if not 0 <= degree <= held:
+        raise ValueError(f"sh_degree must be between 0 and the {held} that sh holds, got {degree}")
+    return degree
+
+
+def record_sh(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
+    """``spherical_harmonics`` as a step of a run; Gaussians of radius 0 stay black."""
+    N = means.shape[0]
+    colors = run.empty(N, 3)
+    run.launch(kernels.sh_fwd, N, means, sh, viewmat, radii, num_bases(degree), colors)
+
+    def backward() -> None:
+        v_colors = run.adjoint(colors)
+        if v_colors is None:
+            return
+        v_means, v_sh = run.empty(*means.shape), run.empty(*sh.shape)
+        run.launch(
+            kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh
+        )
+        run.add_adjoint(means, v_means)
+        run.add_adjoint(sh, v_sh)
+
+    run.on_backward(backward)
+    return colors
+
+
+def spherical_harmonics(
+    means: Float[Tensor, "N 3"],
+    sh: Float[Tensor, "N bases 3"],
+    viewmat: Float[Tensor, "4 4"],
+    *,
+    degree: int | None = None,
+    radii: Int32[Tensor, "N 2"] | None = None,
+) -> Float[Tensor, "N 3"]:
+    """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k); differentiable in means and sh.
+
+    Args:
+        means: [N, 3] centres in the world.
+        sh: [N, bases, 3] coefficients with 1, 4, 9 or 16 bases (degree 0 to 3).
+        viewmat: [4, 4] rigid world-to-camera transform.
+        degree: Highest degree to use; all that ``sh`` holds by default.
+        radii: [N, 2] of a ``Projection``; colours of culled Gaussians (radius 0) are not computed and stay black.
+
+    Returns:
+        [N, 3] RGB, not negative.
+
+    Raises:
+        ValueError: On a wrong shape, dtype or device.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("means", means, ("N", 3), sizes)
+    used = check_coefficients(sizes, sh, degree)
+    check_tensor("viewmat", viewmat, (4, 4), sizes)
+    if radii is None:
+        radii = torch.ones(means.shape[0], 2, dtype=torch.int32, device=means.device)
+    check_tensor("radii", radii, ("N", 2), sizes, (torch.int32,))
+    check_same_device({"means": means, "sh": sh, "viewmat": viewmat, "radii": radii})
+
+    def op(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
+        return (record_sh(run, means, sh, viewmat, radii, used),)
+
+    return differentiable(op, means, sh, viewmat, radii)[0]

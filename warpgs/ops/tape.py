@@ -1,0 +1,393 @@
+"""The only bridge between torch and Warp: memory, streams, launches and adjoints.
+
+An op is a function ``op(run, *tensors, ...) -> tensors``. Through its ``Run`` it allocates (from torch), launches
+kernels on torch's current stream, and records how to go back; ``differentiable`` wraps it into autograd. All ops of one
+``differentiable`` call share one ``wp.Tape``, so a whole render crosses between torch and Warp once each way.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.log_level = wp.LOG_WARNING
+wp.init()
+
+CHUNKS_PER_SHARD = 8
+"""A CPU launch is cut into this many pieces a core, dealt out in turn, so that cores get like shares of a busy image."""
+
+SMALLEST_SHARD = 2048
+"""Threads below which a CPU launch is not worth another core."""
+
+
+@dataclass(frozen=True)
+class PerShard:
+    """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
+
+    tensor: Tensor
+
+
+@dataclass
+class KernelTime:
+    """One launch seen by ``profile``: start and duration in milliseconds."""
+
+    name: str
+    start_ms: float
+    duration_ms: float
+
+
+@dataclass
+class Profile:
+    """What ``profile`` gathers; ``times`` waits for the device."""
+
+    _origin: float = field(default_factory=time.perf_counter)
+    _first_event: Any = None
+    _entries: list[tuple[str, Any, Any]] = field(default_factory=list)
+
+    def times(self) -> list[KernelTime]:
+        if self._first_event is not None:
+            torch.cuda.synchronize()
+        result = []
+        for name, begin, end in self._entries:
+            if isinstance(begin, float):
+                result.append(KernelTime(name, (begin - self._origin) * 1e3, (end - begin) * 1e3))
+            else:
+                result.append(KernelTime(name, self._first_event.elapsed_time(begin), begin.elapsed_time(end)))
+        return result
+
+    @contextlib.contextmanager
+    def span(self, name: str, device: torch.device) -> Iterator[None]:
+        if device.type == "cuda":
+            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            begin.record()
+            self._first_event = self._first_event or begin
+            yield
+            end.record()
+            self._entries.append((name, begin, end))
+        else:
+            start = time.perf_counter()
+            yield
+            self._entries.append((name, start, time.perf_counter()))
+
+
+_active_profile: Profile | None = None
+
+
+@contextlib.contextmanager
+def profile() -> Iterator[Profile]:
+    """Times every kernel launched inside: CUDA events on a GPU, wall time on CPU."""
+    global _active_profile
+    if _active_profile is not None:
+        raise RuntimeError("a profile is already being taken")
+    _active_profile = Profile()
+    try:
+        yield _active_profile
+    finally:
+        _active_profile = None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Launches
+
+
+class _Command:
+    """A recorded launch of one kernel whose arguments are rewritten in place.
+
+    ``wp.launch`` packs and checks every argument anew (22 µs on the host for a typical kernel, more than many kernels
+    take); here an argument that has the shape of last time costs one pointer.
+    """
+
+    def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
+        arguments = kernel.adj.args
+        blank = [None if hasattr(a.type, "ndim") else 0 for a in arguments]
+        self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
+        self.dim = 1
+        self.slots = list(zip(arguments, self.launch.params[1:], strict=True))
+        self.shapes: list[Any] = [None] * len(arguments)
+
+    def set(self, index: int, value: Tensor | float | int | None) -> None:
+        argument, slot = self.slots[index]
+        if isinstance(value, Tensor):
+            shape = value.shape
+            slot.data = value.data_ptr()
+            if shape != self.shapes[index]:
+                self.shapes[index] = shape
+                _describe(argument, slot, value)
+        elif value is None:
+            slot.data = 0
+            slot.shape[0] = 0
+            self.shapes[index] = None
+        else:
+            slot.value = value
+
+    def __call__(self, dim: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
+        if dim != self.dim:
+            self.launch.set_dim(dim)
+            self.dim = dim
+        for index, value in enumerate(arguments):
+            self.set(index, value)
+        self.launch.launch(stream)
+
+
+def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
+    """Writes a tensor's shape and strides into a kernel argument, after checking that the kernel may read it so."""
+    dtype, ndim = argument.type.dtype, argument.type.ndim
+    inner = getattr(dtype, "_shape_", ())
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    if wp.dtype_to_torch(scalar) != tensor.dtype or tuple(tensor.shape[ndim:]) != tuple(inner):
+        raise TypeError(
+            f"kernel argument {argument.label} is a {ndim}-d array of {dtype.__name__}, "
+            f"got {tuple(tensor.shape)} {tensor.dtype}"
+        )
+    if not tensor.is_contiguous():
+        raise TypeError(f"kernel argument {argument.label} must be contiguous")
+    slot.ndim = ndim
+    strides = tensor.stride()
+    for axis in range(ndim):
+        slot.shape[axis] = tensor.shape[axis]
+        slot.strides[axis] = strides[axis] * tensor.element_size()
+
+
+_commands = threading.local()
+_pool: ThreadPoolExecutor | None = None
+_pool_lock = threading.Lock()
+_load_lock = threading.Lock()
+
+
+def _command(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> _Command:
+    """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
+    cache = _commands.__dict__.setdefault("cache", {})
+    key = (kernel, device.alias, block_dim)
+    command = cache.get(key)
+    if command is None:
+        with _load_lock:  # two threads that compile and load one module at once unload each other's code
+            command = cache[key] = _Command(kernel, device, block_dim)
+    return command
+
+
+def _workers() -> ThreadPoolExecutor:
+    global _pool
+    with _pool_lock:
+        if _pool is None:
+            _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="warpgs")
+        return _pool
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Runs
+
+
+class Run:
+    """One forward pass of an op, and the way back.
+
+    Attributes:
+        device: Where the tensors live.
+        needs_grad: Whether anything will ask for gradients; if not, ops keep nothing for the way back.
+        num_shards: Cores that a CPU launch is spread over (``torch.get_num_threads()``); 1 on CUDA.
+    """
+
+    def __init__(self, device: torch.device, needs_grad: bool):
+        self.device = device
+        self.needs_grad = needs_grad
+        self.is_cuda = device.type == "cuda"
+        self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), os.cpu_count() or 1))
+        self._warp_device = wp.device_from_torch(device)
+        self._tape = wp.Tape()
+        self._adjoints: dict[int, Tensor | None] = {}
+        self._kept: list[Tensor] = []
+
+    def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=self.device)
+
+    def zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self.device)
+
+    # Going back -------------------------------------------------------------------------------------------------------
+
+    def on_backward(self, function: Callable[[], None]) -> None:
+        """Records how to go back over what was just launched; called in reverse order."""
+        if self.needs_grad:
+            self._tape.record_func(function, [])
+
+    def adjoint(self, tensor: Tensor) -> Tensor | None:
+        """What has arrived at a tensor on the way back, contiguous; None where nothing has."""
+        value = self._adjoints.get(id(tensor))
+        return None if value is None else value.contiguous()
+
+    def add_adjoint(self, tensor: Tensor, value: Tensor) -> None:
+        """Passes a gradient on to a tensor that an op read."""
+        known = self._adjoints.get(id(tensor))
+        self._adjoints[id(tensor)] = value if known is None else known + value
+        self._kept.append(tensor)  # so that its id stays its own
+
+    def backward(self, outputs: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> None:
+        self._adjoints = {id(o): g for o, g in zip(outputs, gradients, strict=True)}
+        self._tape.backward()
+
+    def forget_adjoints(self) -> None:
+        """Frees what a way back has gathered; the way itself may be gone again (``retain_graph``)."""
+        self._adjoints = {}
+        self._kept = []
+
+    # Launching --------------------------------------------------------------------------------------------------------
+
+    def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int = 1) -> None:
+        """Runs ``dim`` threads of a kernel; ``arguments`` follow its first parameter, ``first``.
+
+        ``work`` says how many times a plain thread's work one of these does, for sharing out CPU launches.
+        """
+        if dim == 0:
+            return
+        if _active_profile is not None:
+            with _active_profile.span(kernel.func.__name__, self.device):
+                self._launch(kernel, dim, arguments, block_dim, work)
+        else:
+            self._launch(kernel, dim, arguments, block_dim, work)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int) -> None:
+        if self.is_cuda:
+            values = [a.tensor[0] if isinstance(a, PerShard) else a for a in arguments]
+            _command(kernel, self._warp_device, block_dim)(dim, [0, *values], self.stream)
+            return
+        shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
+        chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
+
+        def run_shard(shard: int) -> None:
+            values = [a.tensor[shard] if isinstance(a, PerShard) else a for a in arguments]
+            command = _command(kernel, self._warp_device, 1)
+            for first in range(shard * chunk, dim, shards * chunk):
+                command(min(chunk, dim - first), [first, *values], None)
+
+        if shards == 1:
+            run_shard(0)
+        else:
+            list(_workers().map(run_shard, range(shards)))
+
+    @property
+    def stream(self) -> wp.Stream:
+        """torch's current stream, as Warp knows it."""
+        handle = torch.cuda.current_stream(self.device).cuda_stream
+        stream = _streams.get((self.device.index, handle))
+        if stream is None:
+            stream = wp.Stream(self._warp_device, cuda_stream=handle)
+            _streams[self.device.index, handle] = stream
+        return stream
+
+    def sort_pairs(self, keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
+        """Stable radix sort of the first ``count`` int32 pairs by the low bits of the keys; buffers hold twice that."""
+        span = _active_profile.span("sort_pairs", self.device) if _active_profile else contextlib.nullcontext()
+        with span, self._warp_stream():
+            wp.utils.radix_sort_pairs(
+                wp.from_torch(keys, requires_grad=False), wp.from_torch(values, requires_grad=False), count, 0, num_bits
+            )
+
+    @contextlib.contextmanager
+    def _warp_stream(self) -> Iterator[None]:
+        """Makes torch's stream Warp's own. No event is waited for, which a CUDA graph capture would not allow."""
+        if not self.is_cuda:
+            yield
+            return
+        previous = self._warp_device.stream
+        self._warp_device.set_stream(self.stream, sync=False)
+        try:
+            yield
+        finally:
+            self._warp_device.set_stream(previous, sync=False)
+
+
+_streams: dict[tuple[int, int], wp.Stream] = {}
+
+
+class _Differentiable(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        device = next(t.device for t in tensors if t is not None)
+        ctx.run = Run(device, needs_grad=True)
+        ctx.set_materialize_grads(False)
+        ctx.raw_inputs = tensors
+        ctx.raw_outputs = op(ctx.run, *tensors)
+        # Saving the inputs makes torch notice when they are changed in place before the way back. The outputs are
+        # handed out as aliases, because the run keeps the originals and would otherwise keep its own graph alive.
+        ctx.save_for_backward(*tensors)
+        outputs = tuple(o.detach() for o in ctx.raw_outputs)
+        ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
+        return outputs
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        _ = ctx.saved_tensors
+        with torch.no_grad():
+            ctx.run.backward(ctx.raw_outputs, gradients)
+            adjoints = [None if t is None else ctx.run.adjoint(t) for t in ctx.raw_inputs]
+            ctx.run.forget_adjoints()
+            return None, *(a if n else None for a, n in zip(adjoints, ctx.needs_input_grad[1:], strict=True))
+
+
+def differentiable(op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    """Runs ``op(run, *tensors)`` and, where a tensor wants gradients, lets autograd go back through it.
+
+    Args:
+        op: Returns a tuple of tensors; those of integer type carry no gradient.
+        tensors: Its inputs, all on one device, contiguous; None is passed through.
+    """
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
+        return _Differentiable.apply(op, *tensors)
+    device = next(t.device for t in tensors if t is not None)
+    with torch.no_grad():
+        return op(Run(device, needs_grad=False), *tensors)
+
+
+def adjoint_launch(run: Run, kernel: wp.Kernel, dim: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+    """Launches a kernel forward and records the adjoint that Warp generated for it.
+
+    ``inputs`` and ``outputs`` are float tensors, in the order of the kernel's parameters after ``first``.
+    """
+    run.launch(kernel, dim, *inputs, *outputs)
+
+    def backward() -> None:
+        types = [a.type.dtype for a in kernel.adj.args[1:]]
+        tensors = [*inputs, *outputs]
+        v_inputs = [torch.zeros_like(t) for t in inputs]
+        v_outputs = [run.adjoint(t) for t in outputs]
+        v_tensors = [*v_inputs, *(torch.zeros_like(t) if v is None else v for t, v in zip(outputs, v_outputs))]
+        arrays = [wp.from_torch(t.detach(), dtype=d, requires_grad=False) for t, d in zip(tensors, types, strict=True)]
+        adjoints = [wp.from_torch(t, dtype=d, requires_grad=False) for t, d in zip(v_tensors, types, strict=True)]
+        wp.launch(
+            kernel,
+            dim=dim,
+            inputs=[0, *arrays],
+            adj_inputs=[0, *adjoints],
+            adjoint=True,
+            device=run._warp_device,
+            stream=run.stream if run.is_cuda else None,
+        )
+        for tensor, value in zip(inputs, v_inputs, strict=True):
+            run.add_adjoint(tensor, value)
+
+    run.on_backward(backward)
+
+
+def pinned_counter(device: torch.device) -> Tensor:
+    """One int64 in host memory that a kernel on ``device`` can write to, zero at first."""
+    counter = torch.zeros(1, dtype=torch.int64)
+    return counter.pin_memory() if device.type == "cuda" else counter
+
+
+__all__ = [
+    "KernelTime",
+    "PerShard",
+    "Profile",
+    "Run",
+    "adjoint_launch",
+    "differentiable",
+    "pinned_counter",
+    "profile",
+]

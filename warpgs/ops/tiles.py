@@ -1,0 +1,146 @@
+"""Tile binning: each tile's Gaussians, front to back (kernels/tiles.py)."""
+
+import threading
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from warpgs.kernels import tiles as kernels
+from warpgs.kernels.constants import TILE_SIZE
+from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
+
+from .tape import Run, pinned_counter
+
+HEADROOM = 1.2
+"""Buffers hold this many times the most intersections seen lately."""
+
+DECAY = 0.999
+"""Per frame, what was seen earlier counts this much less."""
+
+DEPTH_BITS = 31
+
+
+class Tiles(NamedTuple):
+    """Which Gaussians each tile of 16×16 pixels looks at, in row-major order of tiles.
+
+    Attributes:
+        ranges: [num_tiles, 2] int32 begin and end of each tile's run in ``gaussian_from_isect``.
+        gaussian_from_isect: int32 Gaussian of each (Gaussian, tile) intersection, by tile, then front to back; longer
+            than the last range's end.
+        demand: [1] int64 number of intersections, in host memory; valid once the device has come this far.
+    """
+
+    ranges: Tensor
+    gaussian_from_isect: Tensor
+    demand: Tensor
+
+
+@dataclass
+class _Budget:
+    """How many intersections to provide for, learned from the frames before.
+
+    The device writes each frame's demand into pinned host memory; it is read a frame or more later, without waiting.
+    A frame whose demand turns out larger than its buffers is still drawn in full, by the kernels' slow way.
+    """
+
+    device: torch.device
+    most: float = 0.0
+    demand: Tensor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.demand = pinned_counter(self.device)
+
+    def capacity(self, num_gaussians: int) -> int:
+        """Buffer size for the next frame, in steps of an eighth so that the allocator sees few sizes."""
+        self.most = max(float(self.demand.item()), self.most * DECAY)
+        wanted = max(int(self.most * HEADROOM), num_gaussians, 1024)
+        step = 1 << max(wanted.bit_length() - 4, 0)
+        return -(-wanted // step) * step
+
+
+_budgets = threading.local()
+
+
+def _budget(device: torch.device, width: int, height: int) -> _Budget:
+    cache = _budgets.__dict__.setdefault("cache", {})
+    key = (device, width, height)
+    if key not in cache:
+        cache[key] = _Budget(device)
+    return cache[key]
+
+
+def num_tiles(width: int, height: int) -> tuple[int, int]:
+    """Columns and rows of tiles that cover an image."""
+    return -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+
+
+def record_tiles(run: Run, rows: Tensor, depths: Tensor, size: tuple[int, int]) -> Tiles:
+    """Bins splat rows (see ``ops.rows``) into the tiles of an image of ``size`` (width, height).
+
+    Waits for the device only on the first frame of a size; later frames provide for what earlier ones needed.
+    """
+    N = rows.shape[0]
+    tiles_x, tiles_y = num_tiles(*size)
+    total = tiles_x * tiles_y
+    int32 = torch.int32
+    if N == 0 or total == 0:
+        return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), pinned_counter(run.device))
+    keys, gaussian_from_rank = run.empty(2 * N, dtype=int32), run.empty(2 * N, dtype=int32)
+    run.launch(kernels.depth_keys, N, depths, rows, keys, gaussian_from_rank)
+    run.sort_pairs(keys, gaussian_from_rank, N, DEPTH_BITS)
+    counts = run.empty(N, dtype=int32)
+    run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, counts)
+    end_of_rank = torch.cumsum(counts, 0, dtype=torch.int64)
+
+    budget = _budget(run.device, *size)
+    if budget.most == 0.0 or not run.is_cuda:
+        budget.demand.copy_(end_of_rank[-1:])
+    capacity = budget.capacity(N) if run.is_cuda else max(int(budget.demand.item()), N)
+    tile_from_isect, gaussian_from_isect = run.empty(2 * capacity, dtype=int32), run.empty(2 * capacity, dtype=int32)
+    run.launch(
+        kernels.emit_isects,
+        max(N, capacity),
+        rows,
+        gaussian_from_rank,
+        end_of_rank,
+        N,
+        tiles_x,
+        tiles_y,
+        capacity,
+        tile_from_isect,
+        gaussian_from_isect,
+        budget.demand,
+    )
+    run.sort_pairs(tile_from_isect, gaussian_from_isect, capacity, total.bit_length())
+    ranges = run.empty(total, 2, dtype=int32)
+    run.launch(
+        kernels.tile_ranges,
+        max(capacity, total) + 1,
+        end_of_rank,
+        gaussian_from_rank,
+        N,
+        total,
+        capacity,
+        tile_from_isect,
+        gaussian_from_isect,
+        ranges,
+    )
+    return Tiles(ranges, gaussian_from_isect, budget.demand)
+
+
+def record_tile_ends(run: Run, tiles: Tiles, is_dynamic: Tensor) -> Tensor:
+    """[num_tiles, 2] int32: one past each tile's last static and last dynamic intersection."""
+    ends = run.empty(*tiles.ranges.shape, dtype=torch.int32)
+    lanes = WARP_SIZE if run.is_cuda else 1
+    run.launch(
+        kernels.tile_ends,
+        tiles.ranges.shape[0] * lanes,
+        tiles.ranges,
+        tiles.gaussian_from_isect,
+        is_dynamic,
+        ends,
+        block_dim=BLOCK_DIM,
+    )
+    return ends

@@ -1,0 +1,138 @@
+"""Rendering: splats, camera, background → images."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+
+from .cameras import Camera
+from .config import RenderSettings
+from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
+from .ops.contracts import check_same_device, check_tensor
+from .ops.projection import record_projection
+from .ops.rows import Rows
+from .ops.sh import record_sh
+from .ops.tape import Run, differentiable
+from .ops.tiles import record_tiles
+from .scene.splats import Splats
+
+SMALLEST_ALPHA = 1e-6
+"""Opacity under which a pixel has no depth: keeps depth / alpha finite where nothing was drawn."""
+
+
+class Layer(NamedTuple):
+    """One image.
+
+    Attributes:
+        image: [H, W, C] over the background.
+        alpha: [H, W] opacity, in [0, 1).
+        depth: [H, W] mean depth of what was drawn, weighted by its contribution [scene units]; 0 where nothing was.
+            None unless asked for.
+    """
+
+    image: Float[Tensor, "H W C"]
+    alpha: Float[Tensor, "H W"]
+    depth: Float[Tensor, "H W"] | None
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What ``render`` makes.
+
+    Attributes:
+        joint: All Gaussians.
+        static, dynamic: The Gaussians of one branch alone; None unless asked for.
+        radii: [N, 2] half sizes on screen [px]; 0 = culled.
+        gradient_norms: [N, 2] after the backward pass: length of the screen-space gradient of each mean, plain and (if
+            asked for) with absolute values per pixel, in normalised device coordinates as 3DGS densifies by.
+        contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless asked for.
+        weights: [N] sum of its blend weights over the joint image; None unless asked for.
+    """
+
+    joint: Layer
+    static: Layer | None
+    dynamic: Layer | None
+    radii: Int32[Tensor, "N 2"]
+    gradient_norms: Float[Tensor, "N 2"]
+    contributed: Bool[Tensor, " N"] | None
+    weights: Float[Tensor, " N"] | None
+
+
+def render(
+    splats: Splats,
+    camera: Camera,
+    background: Float[Tensor, " C"] | None = None,
+    settings: RenderSettings | None = None,
+) -> Rendering:
+    """Renders splats through a camera; differentiable in every splat parameter and in the background.
+
+    Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have a parameter that is
+    not finite (or a zero quaternion) are culled: they leave the image unchanged and get zero gradients.
+
+    Args:
+        splats: N Gaussians, N may be 0.
+        camera: On the device of the splats. No gradient flows to it.
+        background: [C] colour behind everything, black by default.
+        settings: What to compute besides the joint image.
+
+    Returns:
+        A ``Rendering``.
+
+    Raises:
+        ValueError: If the background does not fit the splats, devices differ, or branches are asked for of splats
+            without ``is_dynamic``.
+    """
+    settings = settings or RenderSettings()
+    C = splats.num_channels
+    if background is None:
+        background = torch.zeros(C, device=splats.means.device)
+    check_tensor("background", background, (C,), {})
+    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
+    branch = None
+    if settings.branches:
+        if splats.is_dynamic is None:
+            raise ValueError("branches were asked for, but splats.is_dynamic is None")
+        branch = splats.is_dynamic.view(torch.uint8)
+    degree = None if splats.sh is None else splats.sh_degree
+    if degree is None and splats.sh is not None:
+        degree = round(splats.sh.shape[1] ** 0.5) - 1
+
+    def op(
+        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, appearance: Tensor, behind: Tensor
+    ) -> tuple[Tensor, ...]:
+        geometry = (means, quats, scales, opacities, camera.viewmat, camera.K)
+        projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
+        features = appearance
+        if degree is not None:
+            features = record_sh(run, means, appearance, camera.viewmat, projection.radii, degree)
+        rows = Rows(run, projection, features, settings.depth, camera.size)
+        tiles = record_tiles(run, rows.packed, projection.depths, camera.size)
+        composite = record_composite(
+            run, rows, tiles, camera.size, behind, branch, settings.statistics, settings.absgrad
+        )
+        return (projection.radii, *composite.flat())
+
+    appearance = splats.colors if splats.sh is None else splats.sh
+    behind = torch.cat([background, background.new_zeros(1)]) if settings.depth else background
+    radii, *flat = differentiable(
+        op, splats.means, splats.quats, splats.scales, splats.opacities, appearance, behind
+    )
+    composite = Composite.from_flat(tuple(flat), NUM_BRANCH_IMAGES if settings.branches else 1)
+    layers = [_layer(*pair, settings.depth) for pair in zip(composite.images, composite.alphas, strict=True)]
+    return Rendering(
+        joint=layers[0],
+        static=layers[1] if settings.branches else None,
+        dynamic=layers[2] if settings.branches else None,
+        radii=radii,
+        gradient_norms=composite.norms,
+        contributed=composite.contributed,
+        weights=composite.weights,
+    )
+
+
+def _layer(image: Tensor, alpha: Tensor, depth: bool) -> Layer:
+    if not depth:
+        return Layer(image, alpha, None)
+    return Layer(image[..., :-1], alpha, image[..., -1] / alpha.clamp_min(SMALLEST_ALPHA))
