@@ -50,7 +50,7 @@ from .lanes import (
     stage_get,
     stage_put,
 )
-from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS
+from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 
 
 @wp.func
@@ -137,7 +137,7 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
         T = state()
         n = state_int()
         color = color_state()
-        remaining = wp.vec2i(0, 0)  # open pixels of the joint image, or of the static and the dynamic one
+        remaining = wp.vec2i(0, 0)  # open pixels of the static and of the dynamic image; unless mixed, of the joint one
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 if pixel_x + i * lane_columns() < width and pixel_y + j * lane_rows() < height:
@@ -148,8 +148,10 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
         begin = tile_ranges[tile][0]
         end = tile_ranges[tile][1]
         ends = wp.vec2i(end, begin)  # where the last Gaussian of each branch lies
+        mixed = int(0)  # with one branch only, its image is the joint one and needs no walk of its own
         if wp.static(images == 3):
             ends = tile_ends[tile]
+            mixed = int(ends[0] > begin and ends[1] > begin)
         stage = stage_address()
         base = begin
         while base < end:
@@ -171,13 +173,13 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
                     if branch != 0:
                         wanted = open_dynamic
                 if wanted:
-                    own0 = rows[own_g, 0]
-                    own1 = rows[own_g, 1]
+                    own0 = row_load(rows, own_g, 0)
+                    own1 = row_load(rows, own_g, 1)
                     if meets_block(own0, own1, box_left, box_top, box_right, box_bottom):
                         hit = 1
                         own1[2] = wp.cast(own_g, wp.float32)
                         own1[3] = wp.cast(2 * (isect + 1 - begin) + branch, wp.float32)
-                        own2 = rows[own_g, wp.static(GEOMETRY_PARTS)]
+                        own2 = row_load(rows, own_g, wp.static(GEOMETRY_PARTS))
             ballot = lane_ballot(hit)
             if hit != 0:
                 slot = lane_rank(ballot, lane)
@@ -190,13 +192,15 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
                 row1 = stage_get(stage, slot, 1, own1)
                 quad = stage_get(stage, slot, 2, own2)
                 g = wp.cast(row1[2], wp.int32)
-                position = wp.cast(row1[3], wp.int32)
-                branch = position & 1
+                position = wp.cast(row1[3], wp.int32) >> 1
+                selected = int(-1)  # the branch image that this Gaussian goes into, besides the joint one
+                if mixed != 0:
+                    selected = 1 + (wp.cast(row1[3], wp.int32) & 1)
                 features = feature_vector()
                 for c in range(wp.static(min(C, 4))):
                     features[c] = quad[c]
                 for c in range(4, wp.static(C)):
-                    features[c] = rows[g, wp.static(GEOMETRY_PARTS) + c / 4][c % 4]
+                    features[c] = row_load(rows, g, wp.static(GEOMETRY_PARTS) + c / 4)[c % 4]
                 threshold = row1[1] - LOG2_ALPHA_MIN
                 half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
                 weight = float(0.0)
@@ -215,23 +219,25 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
                         if log2_alpha >= LOG2_ALPHA_MIN:
                             alpha = wp.min(ALPHA_MAX, exp2(log2_alpha))
                             for m in range(wp.static(images)):
-                                if m == 0 or m == 1 + branch:
+                                if m == 0 or m == selected:
                                     k = m * wp.static(P) + j * wp.static(columns) + i
                                     t = T[k]
                                     if t > 0.0:
                                         t_next = t - alpha * t
                                         if t_next <= TRANSMITTANCE_MIN:
                                             T[k] = -t
-                                            if m == wp.static(0 if images == 1 else 1):
+                                            if m == 0 and mixed == 0:
+                                                remaining -= wp.vec2i(1, 1)
+                                            elif m == 1:
                                                 remaining[0] -= 1
-                                            if m == 2:
+                                            elif m == 2:
                                                 remaining[1] -= 1
                                         else:
                                             w = alpha * t
                                             for c in range(wp.static(C)):
                                                 color[k * wp.static(C) + c] += w * features[c]
                                             T[k] = t_next
-                                            n[k] = position >> 1
+                                            n[k] = position
                                             if m == 0:
                                                 weight += w
                 if wp.static(statistics):
@@ -242,6 +248,14 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
             lane_sync()
             base += lane_count()
 
+        if wp.static(images == 3):
+            for m in range(2):
+                if mixed == 0 and ends[m] > begin:
+                    for k in range(wp.static(P)):
+                        T[(m + 1) * wp.static(P) + k] = T[k]
+                        n[(m + 1) * wp.static(P) + k] = n[k]
+                    for k in range(wp.static(P * C)):
+                        color[(m + 1) * wp.static(P * C) + k] = color[k]
         for m in range(wp.static(images)):
             for j in range(wp.static(rows_per_lane)):
                 for i in range(wp.static(columns)):
@@ -255,7 +269,10 @@ def make_composite_fwd(num_channels: int, images: int, pixels: tuple[int, int], 
                         transmittance[p] = t
                         last[p] = n[k]
                         for c in range(wp.static(C)):
-                            image[p, c] = color[k * wp.static(C) + c] + t * background[c]
+                            value = color[k * wp.static(C) + c]
+                            if background.shape[0] > 0:
+                                value += t * background[c]
+                            image[p, c] = value
 
     return composite_fwd
 
@@ -284,6 +301,7 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
     def composite_bwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],
+        tile_ends: wp.array[wp.vec2i],
         gaussian_from_isect: wp.array[int],
         rows: wp.array2d[wp.vec4],
         is_dynamic: wp.array[wp.uint8],
@@ -328,15 +346,28 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
                         T[k] = transmittance[p]
                         n[k] = last[p]
                         n_max = wp.max(n_max, n[k])
-                        behind = -v_alpha_image[p]
+                        behind = float(0.0)
+                        if v_alpha_image.shape[0] > 0:
+                            behind = -v_alpha_image[p]
                         for c in range(wp.static(C)):
                             v = v_image[p, c]
                             v_color[k * wp.static(C) + c] = v
-                            behind += background[c] * v
+                            if background.shape[0] > 0:
+                                behind += background[c] * v
                         R[k] = T[k] * behind
         n_max = lane_max(n_max)
 
         begin = tile_ranges[corner[0]][0]
+        mixed = int(0)
+        if wp.static(images == 3):
+            ends = tile_ends[corner[0]]
+            mixed = int(ends[0] > begin and ends[1] > begin)
+            for m in range(2):
+                if mixed == 0 and ends[m] > begin:
+                    for k in range(wp.static(P)):
+                        R[k] = R[k] + R[(m + 1) * wp.static(P) + k]
+                    for k in range(wp.static(P * C)):
+                        v_color[k] = v_color[k] + v_color[(m + 1) * wp.static(P * C) + k]
         stage = stage_address()
         base = (n_max - 1) / lane_count() * lane_count()
         while base >= 0 and n_max > 0:
@@ -347,8 +378,8 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
             hit = int(0)
             if index < n_max:
                 own_g = gaussian_from_isect[begin + index]
-                own0 = rows[own_g, 0]
-                own1 = rows[own_g, 1]
+                own0 = row_load(rows, own_g, 0)
+                own1 = row_load(rows, own_g, 1)
                 if meets_block(own0, own1, box_left, box_top, box_right, box_bottom):
                     hit = 1
                     branch = int(0)
@@ -356,7 +387,7 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
                         branch = int(is_dynamic[own_g])
                     own1[2] = wp.cast(own_g, wp.float32)
                     own1[3] = wp.cast(2 * (index + 1) + branch, wp.float32)
-                    own2 = rows[own_g, wp.static(GEOMETRY_PARTS)]
+                    own2 = row_load(rows, own_g, wp.static(GEOMETRY_PARTS))
             ballot = lane_ballot(hit)
             if hit != 0:
                 slot = lane_rank(ballot, lane)
@@ -372,12 +403,14 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
                 quad = stage_get(stage, slot, 2, own2)
                 g = wp.cast(row1[2], wp.int32)
                 position = wp.cast(row1[3], wp.int32) >> 1
-                branch = wp.cast(row1[3], wp.int32) & 1
+                selected = int(-1)
+                if mixed != 0:
+                    selected = 1 + (wp.cast(row1[3], wp.int32) & 1)
                 features = feature_vector()
                 for c in range(wp.static(min(C, 4))):
                     features[c] = quad[c]
                 for c in range(4, wp.static(C)):
-                    features[c] = rows[g, wp.static(GEOMETRY_PARTS) + c / 4][c % 4]
+                    features[c] = row_load(rows, g, wp.static(GEOMETRY_PARTS) + c / 4)[c % 4]
                 threshold = row1[1] - LOG2_ALPHA_MIN
                 half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
                 sums = sums_vector()
@@ -400,7 +433,7 @@ def make_composite_bwd(num_channels: int, images: int, pixels: tuple[int, int], 
                             scale = 1.0 / (1.0 - alpha)
                             v_alpha = float(0.0)
                             for m in range(wp.static(images)):
-                                if m == 0 or m == 1 + branch:
+                                if m == 0 or m == selected:
                                     k = m * wp.static(P) + j * wp.static(columns) + i
                                     if position <= n[k]:
                                         touched = 1

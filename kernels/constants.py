@@ -31,3 +31,6 @@ FIELD_OF_VIEW_MARGIN = wp.constant(0.3)
 
 NEVER_DRAWN = wp.constant(-1.0e30)
 """Base-2 log-opacity of a culled Gaussian: finite, so that no product with it is NaN."""
+
+CULLED_DEPTH = wp.constant(0x7F7FFFFF)
+"""Sort key of a Gaussian that is not drawn: the bits of the largest float."""

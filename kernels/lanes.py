@@ -69,6 +69,36 @@ def lane_rank(mask: wp.uint32, lane: int) -> int:
     ...
 
 
+@wp.func_native(native("return __ffs(mask) - 1;", "return 0;"))
+def lane_lowest(mask: wp.uint32) -> int:
+    """Lowest lane whose bit is set in a ballot that is not zero."""
+    ...
+
+
+@wp.func_native(native("return __shfl_sync(0xffffffffu, x, lane);", "return x;"))
+def lane_broadcast(x: int, lane: int) -> int:
+    """``x`` of one lane."""
+    ...
+
+
+@wp.func_native(
+    native(
+        """
+        int sum = x;
+        for (int o = 1; o < 32; o <<= 1) {
+            const int below = __shfl_up_sync(0xffffffffu, sum, o);
+            if (lane >= o) sum += below;
+        }
+        return sum - x;
+        """,
+        "return 0;",
+    )
+)
+def lane_sum_before(x: int, lane: int) -> int:
+    """Sum of ``x`` over the lanes below ``lane``."""
+    ...
+
+
 @wp.func_native(native("__syncwarp();", ""))
 def lane_sync(): ...
 

@@ -17,7 +17,8 @@ import functools
 
 import warp as wp
 
-from .constants import ALPHA_MIN, LOG2_E, NEVER_DRAWN
+from .constants import ALPHA_MIN, CULLED_DEPTH, LOG2_E, NEVER_DRAWN
+from .lanes import native
 
 GEOMETRY_PARTS = 2
 """vec4 values before the features."""
@@ -27,6 +28,25 @@ NUM_MOMENTS = 6
 
 NUM_ABSOLUTE = 2
 """Σ |s (conic d)_x| and Σ |s (conic d)_y|, the absolute-value variant of the gradient of the mean."""
+
+
+# Warp's vec4 is aligned to 4 bytes, so its loads and stores are four; rows are aligned to 16 and want one.
+@wp.func_native(
+    native(
+        "const float4 v = *(const float4*)&wp::index(rows, i, part); return wp::vec4(v.x, v.y, v.z, v.w);",
+        "return wp::index(rows, i, part);",
+    )
+)
+def row_load(rows: wp.array2d[wp.vec4], i: int, part: int) -> wp.vec4: ...
+
+
+@wp.func_native(
+    native(
+        "*(float4*)&wp::index(rows, i, part) = make_float4(value[0], value[1], value[2], value[3]);",
+        "wp::index(rows, i, part) = value;",
+    )
+)
+def row_store(rows: wp.array2d[wp.vec4], i: int, part: int, value: wp.vec4): ...
 
 
 def row_parts(num_channels: int) -> int:
@@ -41,7 +61,10 @@ def gradient_stride(num_channels: int) -> int:
 
 @functools.cache
 def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the rows of splats, one thread each; depth, if wanted, is the channel after the features."""
+    """Kernel that writes the rows of splats, one thread each; depth, if wanted, is the channel after the features.
+
+    It also writes what the depth sort starts from, a key and the splat's own index, and clears ``norms``.
+    """
     num_channels = num_features + int(with_depth)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -54,34 +77,42 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         depths: wp.array[float],
         radii: wp.array[wp.vec2i],
         rows: wp.array2d[wp.vec4],
+        depth_keys: wp.array[int],
+        gaussian_from_rank: wp.array[int],
+        norms: wp.array[wp.vec2],
     ):
         i = first + wp.tid()
         mean = means2d[i]
         conic = conics[i]
         opacity = opacities[i]
         radius = radii[i]
+        depth = depths[i]
         # A sum is finite only where all of its terms are, and a comparison with NaN fails.
-        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2]
+        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
         for part in range(wp.static((num_channels + 3) // 4)):
             value = wp.vec4(0.0)
             for k in range(4):
                 if part * 4 + k < wp.static(num_features):
                     value[k] = features[i, part * 4 + k]
                 elif part * 4 + k < wp.static(num_channels):
-                    value[k] = depths[i]
+                    value[k] = depth
             total += value[0] + value[1] + value[2] + value[3]
-            rows[i, wp.static(GEOMETRY_PARTS) + part] = value
-        drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0
+            row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
+        drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
         drawn = drawn and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+        key = CULLED_DEPTH
+        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
+        row1 = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
         if drawn and wp.isfinite(total):
-            a = 0.5 * LOG2_E * conic[0]
-            rows[i, 0] = wp.vec4(mean[0], mean[1], a, LOG2_E * conic[1])
-            rows[i, 1] = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
-        else:
-            rows[i, 0] = wp.vec4(0.0, 0.0, 1.0, 0.0)
-            rows[i, 1] = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
-            for part in range(wp.static((num_channels + 3) // 4)):
-                rows[i, wp.static(GEOMETRY_PARTS) + part] = wp.vec4(0.0)
+            key = wp.cast(depth, wp.int32)  # the bits of positive floats are in the order of the floats
+            row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
+            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+        row_store(rows, i, 0, row0)
+        row_store(rows, i, 1, row1)
+        depth_keys[i] = key
+        gaussian_from_rank[i] = i
+        if norms.shape[0] > 0:
+            norms[i] = wp.vec2(0.0)
 
     return pack
 

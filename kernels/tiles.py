@@ -14,13 +14,15 @@ import warp as wp
 
 from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
-from .lanes import lane_count, lane_max
-
-CULLED_DEPTH = wp.constant(0x7F7FFFFF)
-"""Depth key of a Gaussian that is not drawn: the bits of the largest float."""
+from .lanes import lane_ballot, lane_broadcast, lane_count, lane_lowest, lane_max, lane_sum_before
+from .rows import row_load
 
 SLACK = wp.constant(0.01)
 """Pixels by which spans are widened, well above what float32 can lose at 8K, so that no intersection is missed."""
+
+
+MANY_TILES = wp.constant(24)
+"""Intersections above which a Gaussian's are written by a whole lane group instead of one thread."""
 
 
 @wp.func
@@ -53,42 +55,26 @@ def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, 
 
 
 @wp.kernel(enable_backward=False)
-def depth_keys(
-    first: int,
-    depths: wp.array[float],
-    rows: wp.array2d[wp.vec4],
-    keys: wp.array[int],
-    gaussian_from_rank: wp.array[int],
-):
-    i = first + wp.tid()
-    key = CULLED_DEPTH
-    if rows[i, 1][1] != NEVER_DRAWN and depths[i] > 0.0:
-        key = wp.cast(depths[i], wp.int32)  # the bits of positive floats are in the order of the floats
-    keys[i] = key
-    gaussian_from_rank[i] = i
-
-
-@wp.kernel(enable_backward=False)
 def count_tiles(
     first: int,
     rows: wp.array2d[wp.vec4],
     gaussian_from_rank: wp.array[int],
     tiles_x: int,
     tiles_y: int,
-    num_tiles_of_rank: wp.array[int],
+    num_tiles_of_rank: wp.array[wp.int64],
 ):
     rank = first + wp.tid()
     g = gaussian_from_rank[rank]
     count = int(0)
-    row0 = rows[g, 0]
-    row1 = rows[g, 1]
+    row0 = row_load(rows, g, 0)
+    row1 = row_load(rows, g, 1)
     if row1[1] != NEVER_DRAWN:
         half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
         span_y = tile_rows(row0, row1, half_size, tiles_y)
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             count += wp.max(span_x[1] - span_x[0], 0)
-    num_tiles_of_rank[rank] = count
+    num_tiles_of_rank[rank] = wp.int64(count)
 
 
 @wp.kernel(enable_backward=False)
@@ -111,31 +97,68 @@ def emit_isects(
         demand[0] = total
     if thread < capacity and wp.int64(thread) >= total:
         tile_from_isect[thread] = tiles_x * tiles_y
-    if thread >= num_gaussians or total > wp.int64(capacity):
+    if total > wp.int64(capacity):
         return
+    lane = thread % lane_count()
     isect = int(0)
-    if thread > 0:
-        isect = int(end_of_rank[thread - 1])
-    end = int(end_of_rank[thread])
-    if isect == end:
-        return
-    g = gaussian_from_rank[thread]
-    row0 = rows[g, 0]
-    row1 = rows[g, 1]
-    half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
-    span_y = tile_rows(row0, row1, half_size, tiles_y)
-    for y in range(span_y[0], span_y[1]):
-        span_x = tile_columns(row0, row1, half_size, y, tiles_x)
-        for x in range(span_x[0], span_x[1]):
-            # The count came from another kernel, whose rounding may differ: never write past it.
-            if isect < end:
-                tile_from_isect[isect] = y * tiles_x + x
-                gaussian_from_isect[isect] = g
-                isect += 1
-    while isect < end:
-        tile_from_isect[isect] = tiles_x * tiles_y
-        gaussian_from_isect[isect] = g
-        isect += 1
+    end = int(0)
+    g = int(0)
+    if thread < num_gaussians:
+        g = gaussian_from_rank[thread]
+        end = int(end_of_rank[thread])
+        if thread > 0:
+            isect = int(end_of_rank[thread - 1])
+    many = int(end - isect > MANY_TILES)
+    if end > isect and many == 0:
+        row0 = row_load(rows, g, 0)
+        row1 = row_load(rows, g, 1)
+        half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
+        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        for y in range(span_y[0], span_y[1]):
+            span_x = tile_columns(row0, row1, half_size, y, tiles_x)
+            for x in range(span_x[0], span_x[1]):
+                # The count came from another kernel, whose rounding may differ: never write past it.
+                if isect < end:
+                    tile_from_isect[isect] = y * tiles_x + x
+                    gaussian_from_isect[isect] = g
+                    isect += 1
+        while isect < end:
+            tile_from_isect[isect] = tiles_x * tiles_y
+            gaussian_from_isect[isect] = g
+            isect += 1
+    # Gaussians with many tiles are written by the whole lane group, one after the other: a thread on its own would
+    # keep everyone waiting for the few that cover the image.
+    ballot = lane_ballot(many)
+    while ballot != wp.uint32(0):
+        writer = lane_lowest(ballot)
+        ballot = ballot & (ballot - wp.uint32(1))
+        big_g = lane_broadcast(g, writer)
+        big_isect = lane_broadcast(isect, writer)
+        big_end = lane_broadcast(end, writer)
+        row0 = row_load(rows, big_g, 0)
+        row1 = row_load(rows, big_g, 1)
+        half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
+        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        y_base = span_y[0]
+        while y_base < span_y[1]:
+            span_x = wp.vec2i(0, 0)
+            if y_base + lane < span_y[1]:
+                span_x = tile_columns(row0, row1, half_size, y_base + lane, tiles_x)
+            length = wp.max(span_x[1] - span_x[0], 0)
+            before = lane_sum_before(length, lane)
+            for k in range(wp.min(lane_count(), span_y[1] - y_base)):
+                row_length = lane_broadcast(length, k)
+                row_begin = lane_broadcast(span_x[0], k)
+                row_isect = big_isect + lane_broadcast(before, k)
+                for x in range(lane, row_length, lane_count()):
+                    if row_isect + x < big_end:
+                        tile_from_isect[row_isect + x] = (y_base + k) * tiles_x + row_begin + x
+                        gaussian_from_isect[row_isect + x] = big_g
+            big_isect += lane_broadcast(before + length, lane_count() - 1)
+            y_base += lane_count()
+        for k in range(big_isect + lane, big_end, lane_count()):
+            tile_from_isect[k] = tiles_x * tiles_y
+            gaussian_from_isect[k] = big_g
 
 
 @wp.kernel(enable_backward=False)

@@ -86,9 +86,8 @@ def render(
     """
     settings = settings or RenderSettings()
     C = splats.num_channels
-    if background is None:
-        background = torch.zeros(C, device=splats.means.device)
-    check_tensor("background", background, (C,), {})
+    if background is not None:
+        check_tensor("background", background, (C,), {})
     check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
     branch = None
     if settings.branches:
@@ -100,7 +99,7 @@ def render(
         degree = round(splats.sh.shape[1] ** 0.5) - 1
 
     def op(
-        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, appearance: Tensor, behind: Tensor
+        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, appearance: Tensor, behind: Tensor | None
     ) -> tuple[Tensor, ...]:
         geometry = (means, quats, scales, opacities, camera.viewmat, camera.K)
         projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
@@ -108,14 +107,16 @@ def render(
         if degree is not None:
             features = record_sh(run, means, appearance, camera.viewmat, projection.radii, degree)
         rows = Rows(run, projection, features, settings.depth, camera.size)
-        tiles = record_tiles(run, rows.packed, projection.depths, camera.size)
+        tiles = record_tiles(run, rows, camera.size)
         composite = record_composite(
             run, rows, tiles, camera.size, behind, branch, settings.statistics, settings.absgrad
         )
         return (projection.radii, *composite.flat())
 
     appearance = splats.colors if splats.sh is None else splats.sh
-    behind = torch.cat([background, background.new_zeros(1)]) if settings.depth else background
+    behind = background
+    if background is not None and settings.depth:
+        behind = torch.cat([background, background.new_zeros(1)])
     radii, *flat = differentiable(
         op, splats.means, splats.quats, splats.scales, splats.opacities, appearance, behind
     )

@@ -68,14 +68,14 @@ def record_composite(
     rows: Rows,
     tiles: Tiles,
     size: tuple[int, int],
-    background: Tensor,
+    background: Tensor | None,
     is_dynamic: Tensor | None,
     statistics: bool,
     absgrad: bool,
 ) -> Composite:
     """Composites packed rows. With ``is_dynamic`` [N] uint8 three images come out, otherwise one.
 
-    ``background`` has a value for each channel of the rows.
+    ``background`` has a value for each channel of the rows; none is black.
     """
     width, height = size
     C = rows.num_channels
@@ -116,7 +116,7 @@ def record_composite(
     )
 
     def gathered(outputs: tuple[Tensor, ...]) -> Tensor | None:
-        """The cotangents of several outputs in one tensor; None where nothing has arrived at any."""
+        """The cotangents of several outputs in one tensor, flat; None where nothing has arrived at any."""
         values = [run.adjoint(t) for t in outputs]
         if all(v is None for v in values):
             return None
@@ -129,13 +129,13 @@ def record_composite(
         if v_image is None and v_alpha is None:
             return
         v_image = run.zeros(*image.shape) if v_image is None else v_image
-        v_alpha = run.zeros(*alpha.shape) if v_alpha is None else v_alpha
         gradients = run.zeros(run.num_shards, N, gradient_stride(C))
         pixels = CUDA_PIXELS_BWD if run.is_cuda else CPU_PIXELS
         run.launch(
             kernels.make_composite_bwd(C, images, pixels, absgrad),
             _launch_shape(run, pixels, tiles.ranges.shape[0]),
             tiles.ranges,
+            ends,
             tiles.gaussian_from_isect,
             rows.packed,
             is_dynamic,
@@ -145,13 +145,14 @@ def record_composite(
             transmittance,
             last,
             v_image.view(-1, C),
-            v_alpha.view(-1),
+            None if v_alpha is None else v_alpha.view(-1),
             PerShard(gradients),
             block_dim=BLOCK_DIM,
             work=TILE_SIZE * TILE_SIZE,
         )
         run.add_adjoint(rows.packed, gradients)
-        run.add_adjoint(background, (v_image.view(-1, C) * transmittance.view(-1, 1)).sum(0))
+        if background is not None and run.wants(background):
+            run.add_adjoint(background, transmittance @ v_image.view(-1, C))
 
     run.on_backward(backward)
     return result
@@ -194,8 +195,8 @@ def composite(
     check_tensor("features", features, ("N", "C"), sizes)
     if features.shape[1] == 0:
         raise ValueError("features must have at least one channel, got none")
-    background = torch.zeros(sizes["C"], device=features.device) if background is None else background
-    check_tensor("background", background, ("C",), sizes)
+    if background is not None:
+        check_tensor("background", background, ("C",), sizes)
     branch = None
     if is_dynamic is not None:
         check_tensor("is_dynamic", is_dynamic, ("N",), sizes, (torch.bool,))
@@ -207,9 +208,8 @@ def composite(
 
     def op(run: Run, *tensors: Tensor) -> tuple[Tensor, ...]:
         *geometry, features, background = tensors
-        projection = Projection(*geometry, splats.radii)
-        rows = Rows(run, projection, features, False, size)
-        tiles = record_tiles(run, rows.packed, projection.depths, size)
+        rows = Rows(run, Projection(*geometry, splats.radii), features, False, size)
+        tiles = record_tiles(run, rows, size)
         return record_composite(run, rows, tiles, size, background, branch, statistics, absgrad).flat()
 
     tensors = differentiable(

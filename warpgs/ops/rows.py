@@ -1,6 +1,6 @@
 """Splat rows: what compositing needs of each Gaussian, in 16-byte pieces (kernels/rows.py)."""
 
-from torch import Tensor
+from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
 
@@ -17,16 +17,29 @@ class Rows:
         norms: [N, 2] length of the gradient of the screen-space mean and its absolute-value variant (the lengths'
             terms summed over pixels before squaring), in normalised device coordinates (pixels × size / 2) as the
             densification of 3DGS expects; zero until the way back has been gone.
+        depth_keys, gaussian_from_rank: [2 N] int32, first half filled: what the depth sort starts from.
     """
 
     def __init__(self, run: Run, splats: Projection, features: Tensor, with_depth: bool, size: tuple[int, int]):
         N, num_features = features.shape
         self.num_channels = num_features + int(with_depth)
         self.packed = run.empty(N, kernels.row_parts(self.num_channels), 4)
-        self.norms = run.zeros(N, 2)
-        pack = kernels.make_pack(num_features, with_depth)
+        self.norms = run.empty(N, 2)
+        self.depth_keys = run.empty(2 * N, dtype=int32)
+        self.gaussian_from_rank = run.empty(2 * N, dtype=int32)
         run.launch(
-            pack, N, splats.means2d, splats.conics, splats.opacities, features, splats.depths, splats.radii, self.packed
+            kernels.make_pack(num_features, with_depth),
+            N,
+            splats.means2d,
+            splats.conics,
+            splats.opacities,
+            features,
+            splats.depths,
+            splats.radii,
+            self.packed,
+            self.depth_keys,
+            self.gaussian_from_rank,
+            self.norms,
         )
 
         packed, norms = self.packed, self.norms

@@ -6,6 +6,7 @@ kernels on torch's current stream, and records how to go back; ``differentiable`
 """
 
 import contextlib
+import functools
 import os
 import threading
 import time
@@ -113,27 +114,25 @@ class _Command:
         self.slots = list(zip(arguments, self.launch.params[1:], strict=True))
         self.shapes: list[Any] = [None] * len(arguments)
 
-    def set(self, index: int, value: Tensor | float | int | None) -> None:
-        argument, slot = self.slots[index]
-        if isinstance(value, Tensor):
-            shape = value.shape
-            slot.data = value.data_ptr()
-            if shape != self.shapes[index]:
-                self.shapes[index] = shape
-                _describe(argument, slot, value)
-        elif value is None:
-            slot.data = 0
-            slot.shape[0] = 0
-            self.shapes[index] = None
-        else:
-            slot.value = value
-
     def __call__(self, dim: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
+        shapes = self.shapes
         for index, value in enumerate(arguments):
-            self.set(index, value)
+            argument, slot = self.slots[index]
+            if isinstance(value, Tensor):
+                slot.data = value.data_ptr()
+                shape = value.shape
+                if shape != shapes[index]:
+                    _describe(argument, slot, value)
+                    shapes[index] = shape
+            elif value is not None:
+                slot.value = value
+            elif shapes[index] is not None:
+                slot.data = 0
+                slot.shape[0] = 0
+                shapes[index] = None
         self.launch.launch(stream)
 
 
@@ -194,12 +193,14 @@ class Run:
         num_shards: Cores that a CPU launch is spread over (``torch.get_num_threads()``); 1 on CUDA.
     """
 
-    def __init__(self, device: torch.device, needs_grad: bool):
+    def __init__(self, device: torch.device, wanted: Sequence[Tensor]):
         self.device = device
-        self.needs_grad = needs_grad
+        self.needs_grad = bool(wanted)
+        self._wanted = {id(t) for t in wanted}
         self.is_cuda = device.type == "cuda"
         self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), os.cpu_count() or 1))
         self._warp_device = wp.device_from_torch(device)
+        self.stream = self._current_stream()
         self._tape = wp.Tape()
         self._adjoints: dict[int, Tensor | None] = {}
         self._kept: list[Tensor] = []
@@ -209,6 +210,10 @@ class Run:
 
     def zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(shape, dtype=dtype, device=self.device)
+
+    def wants(self, tensor: Tensor) -> bool:
+        """Whether a gradient of this input of the op is asked for."""
+        return id(tensor) in self._wanted
 
     # Going back -------------------------------------------------------------------------------------------------------
 
@@ -229,6 +234,7 @@ class Run:
         self._kept.append(tensor)  # so that its id stays its own
 
     def backward(self, outputs: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> None:
+        self.stream = self._current_stream()
         self._adjoints = {id(o): g for o, g in zip(outputs, gradients, strict=True)}
         self._tape.backward()
 
@@ -271,23 +277,22 @@ class Run:
         else:
             list(_workers().map(run_shard, range(shards)))
 
-    @property
-    def stream(self) -> wp.Stream:
-        """torch's current stream, as Warp knows it."""
+    def _current_stream(self) -> wp.Stream | None:
+        """torch's current stream, as Warp knows it; None on CPU."""
+        if not self.is_cuda:
+            return None
         handle = torch.cuda.current_stream(self.device).cuda_stream
         stream = _streams.get((self.device.index, handle))
         if stream is None:
-            stream = wp.Stream(self._warp_device, cuda_stream=handle)
-            _streams[self.device.index, handle] = stream
+            stream = _streams[self.device.index, handle] = wp.Stream(self._warp_device, cuda_stream=handle)
         return stream
 
     def sort_pairs(self, keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
         """Stable radix sort of the first ``count`` int32 pairs by the low bits of the keys; buffers hold twice that."""
+        arrays = [_int_array(t.data_ptr(), t.numel(), self._warp_device.alias) for t in (keys, values)]
         span = _active_profile.span("sort_pairs", self.device) if _active_profile else contextlib.nullcontext()
         with span, self._warp_stream():
-            wp.utils.radix_sort_pairs(
-                wp.from_torch(keys, requires_grad=False), wp.from_torch(values, requires_grad=False), count, 0, num_bits
-            )
+            wp.utils.radix_sort_pairs(*arrays, count, 0, num_bits)
 
     @contextlib.contextmanager
     def _warp_stream(self) -> Iterator[None]:
@@ -306,11 +311,17 @@ class Run:
 _streams: dict[tuple[int, int], wp.Stream] = {}
 
 
+@functools.lru_cache(maxsize=256)
+def _int_array(pointer: int, size: int, device: str) -> wp.array:
+    """Memory that torch owns, as Warp's sort wants it; torch's allocator hands out the same blocks again and again."""
+    return wp.array(ptr=pointer, dtype=wp.int32, shape=(size,), device=device)
+
+
 class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
         device = next(t.device for t in tensors if t is not None)
-        ctx.run = Run(device, needs_grad=True)
+        ctx.run = Run(device, [t for t in tensors if t is not None and t.requires_grad])
         ctx.set_materialize_grads(False)
         ctx.raw_inputs = tensors
         ctx.raw_outputs = op(ctx.run, *tensors)
@@ -342,7 +353,7 @@ def differentiable(op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | Non
         return _Differentiable.apply(op, *tensors)
     device = next(t.device for t in tensors if t is not None)
     with torch.no_grad():
-        return op(Run(device, needs_grad=False), *tensors)
+        return op(Run(device, []), *tensors)
 
 
 def adjoint_launch(run: Run, kernel: wp.Kernel, dim: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:

@@ -11,6 +11,7 @@ from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
 
+from .rows import Rows
 from .tape import Run, pinned_counter
 
 HEADROOM = 1.2
@@ -76,23 +77,22 @@ def num_tiles(width: int, height: int) -> tuple[int, int]:
     return -(-width // TILE_SIZE), -(-height // TILE_SIZE)
 
 
-def record_tiles(run: Run, rows: Tensor, depths: Tensor, size: tuple[int, int]) -> Tiles:
-    """Bins splat rows (see ``ops.rows``) into the tiles of an image of ``size`` (width, height).
+def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
+    """Bins splats into the tiles of an image of ``size`` (width, height).
 
     Waits for the device only on the first frame of a size; later frames provide for what earlier ones needed.
     """
+    rows, gaussian_from_rank = splat_rows.packed, splat_rows.gaussian_from_rank
     N = rows.shape[0]
     tiles_x, tiles_y = num_tiles(*size)
     total = tiles_x * tiles_y
     int32 = torch.int32
     if N == 0 or total == 0:
         return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), pinned_counter(run.device))
-    keys, gaussian_from_rank = run.empty(2 * N, dtype=int32), run.empty(2 * N, dtype=int32)
-    run.launch(kernels.depth_keys, N, depths, rows, keys, gaussian_from_rank)
-    run.sort_pairs(keys, gaussian_from_rank, N, DEPTH_BITS)
-    counts = run.empty(N, dtype=int32)
+    run.sort_pairs(splat_rows.depth_keys, gaussian_from_rank, N, DEPTH_BITS)
+    counts = run.empty(N, dtype=torch.int64)
     run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, counts)
-    end_of_rank = torch.cumsum(counts, 0, dtype=torch.int64)
+    end_of_rank = torch.cumsum(counts, 0)
 
     budget = _budget(run.device, *size)
     if budget.most == 0.0 or not run.is_cuda:
