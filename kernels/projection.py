@@ -187,8 +187,11 @@ def project_bwd(
     shape = turn * wp.diag(s)
     spread = to_image * shape
 
+    # What has no cotangent comes as an empty array.
     conic = conics[i]
-    v_conic = v_conics[i]
+    v_conic = wp.vec3(0.0)
+    if v_conics.shape[0] > 0:
+        v_conic = v_conics[i]
     A = conic[0]
     B = conic[1]
     C = conic[2]
@@ -196,7 +199,9 @@ def project_bwd(
     v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
     v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
 
-    v_opacity = v_splat_opacities[i]
+    v_opacity = float(0.0)
+    if v_splat_opacities.shape[0] > 0:
+        v_opacity = v_splat_opacities[i]
     if compensate != 0:
         a_sharp = wp.dot(spread[0], spread[0])
         b = wp.dot(spread[0], spread[1])
@@ -231,7 +236,9 @@ def project_bwd(
     v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
 
     v_jacobian = (v_spread * wp.transpose(shape)) * wp.transpose(rotation)
-    v_mean2d = v_means2d[i]
+    v_mean2d = wp.vec2(0.0)
+    if v_means2d.shape[0] > 0:
+        v_mean2d = v_means2d[i]
     # Through the slopes: the centre uses t_x / z itself, the Jacobian its clamped value, constant where it is clamped.
     v_u = fx * v_mean2d[0]
     v_v = fy * v_mean2d[1]
@@ -245,5 +252,7 @@ def project_bwd(
         + jacobian[1, 1] * v_jacobian[1, 1]
         + jacobian[1, 2] * v_jacobian[1, 2]
     )
-    v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v) + v_depths[i])
+    if v_depths.shape[0] > 0:
+        v_z += v_depths[i]
+    v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
     v_means[i] = wp.transpose(rotation) * v_t

@@ -20,7 +20,7 @@ import warp as wp
 from .constants import ALPHA_MIN, CULLED_DEPTH, LOG2_E, NEVER_DRAWN
 from .lanes import native
 
-GEOMETRY_PARTS = 2
+GEOMETRY_PARTS = wp.constant(2)
 """vec4 values before the features."""
 
 NUM_MOMENTS = 6

@@ -1,12 +1,14 @@
-"""Alpha compositing of splats into one or three images, and the way back (kernels/compositing.py)."""
+"""Alpha compositing of splats into one or three images, and the way back (kernels/compositing_{fwd,bwd}.py)."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from warpgs.kernels import compositing as kernels
+from warpgs.kernels.compositing_bwd import make_composite_bwd
+from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
@@ -20,9 +22,8 @@ from .tiles import Tiles, record_tile_ends, record_tiles
 NUM_BRANCH_IMAGES = 3
 """Joint, static only, dynamic only."""
 
-CUDA_PIXELS_FWD = (1, 2)
-CUDA_PIXELS_BWD = (1, 2)
-"""Columns and rows of pixels that a lane composites on CUDA; see docs/performance.md for the alternatives."""
+CUDA_PIXELS = {1: (1, 2), NUM_BRANCH_IMAGES: (1, 1)}
+"""Columns and rows of pixels that a lane composites on CUDA, by images; the alternatives are in docs/performance.md."""
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
@@ -57,10 +58,22 @@ class Composite(NamedTuple):
         return Composite(images, alphas, norms, contributed, weights)
 
 
-def _launch_shape(run: Run, pixels: tuple[int, int], num_tiles: int) -> int:
-    """Threads of a compositing launch: a lane group for each block of pixels."""
+def _launch(
+    run: Run, make_kernel: Callable[..., Any], channels: int, images: int, flag: bool, tiles: Tiles, *arguments: Any
+) -> None:
+    """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
     lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    return num_tiles * (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1])) * lanes
+    for walked in sorted({1, images}):
+        pixels = CUDA_PIXELS[walked] if run.is_cuda else CPU_PIXELS
+        blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
+        run.launch(
+            make_kernel(channels, walked, images, pixels, flag),
+            tiles.ranges.shape[0] * blocks * lanes,
+            tiles.ranges,
+            *arguments,
+            block_dim=BLOCK_DIM,
+            work=TILE_SIZE * TILE_SIZE,
+        )
 
 
 def record_composite(
@@ -86,11 +99,13 @@ def record_composite(
     transmittance, last = run.empty(alpha.numel()), run.empty(alpha.numel(), dtype=torch.int32)
     contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
     weights = run.zeros(run.num_shards, N) if statistics else None
-    pixels = CUDA_PIXELS_FWD if run.is_cuda else CPU_PIXELS
-    run.launch(
-        kernels.make_composite_fwd(C, images, pixels, statistics),
-        _launch_shape(run, pixels, tiles.ranges.shape[0]),
-        tiles.ranges,
+    _launch(
+        run,
+        make_composite_fwd,
+        C,
+        images,
+        statistics,
+        tiles,
         ends,
         tiles.gaussian_from_isect,
         rows.packed,
@@ -104,8 +119,6 @@ def record_composite(
         last,
         contributed,
         None if weights is None else PerShard(weights),
-        block_dim=BLOCK_DIM,
-        work=TILE_SIZE * TILE_SIZE,
     )
     result = Composite(
         images=tuple(image),
@@ -130,11 +143,13 @@ def record_composite(
             return
         v_image = run.zeros(*image.shape) if v_image is None else v_image
         gradients = run.zeros(run.num_shards, N, gradient_stride(C))
-        pixels = CUDA_PIXELS_BWD if run.is_cuda else CPU_PIXELS
-        run.launch(
-            kernels.make_composite_bwd(C, images, pixels, absgrad),
-            _launch_shape(run, pixels, tiles.ranges.shape[0]),
-            tiles.ranges,
+        _launch(
+            run,
+            make_composite_bwd,
+            C,
+            images,
+            absgrad,
+            tiles,
             ends,
             tiles.gaussian_from_isect,
             rows.packed,
@@ -147,8 +162,6 @@ def record_composite(
             v_image.view(-1, C),
             None if v_alpha is None else v_alpha.view(-1),
             PerShard(gradients),
-            block_dim=BLOCK_DIM,
-            work=TILE_SIZE * TILE_SIZE,
         )
         run.add_adjoint(rows.packed, gradients)
         if background is not None and run.wants(background):

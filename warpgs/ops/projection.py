@@ -65,10 +65,7 @@ def record_projection(
     )
 
     def backward() -> None:
-        cotangents = [
-            run.zeros(*t.shape) if (v := run.adjoint(t)) is None else v
-            for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)
-        ]
+        cotangents = [run.adjoint(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
         inputs = (means, quats, scales, opacities)
         gradients = [run.empty(*t.shape) for t in inputs]
         run.launch(

@@ -107,25 +107,24 @@ class _Command:
     """
 
     def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
-        arguments = kernel.adj.args
-        blank = [None if hasattr(a.type, "ndim") else 0 for a in arguments]
+        self.arguments = kernel.adj.args
+        blank = [None if hasattr(a.type, "ndim") else 0 for a in self.arguments]
         self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
         self.dim = 1
-        self.slots = list(zip(arguments, self.launch.params[1:], strict=True))
-        self.shapes: list[Any] = [None] * len(arguments)
+        self.slots = self.launch.params[1:]
+        self.shapes: list[Any] = [None] * len(blank)
 
     def __call__(self, dim: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
         shapes = self.shapes
-        for index, value in enumerate(arguments):
-            argument, slot = self.slots[index]
+        for index, (slot, value) in enumerate(zip(self.slots, arguments, strict=True)):
             if isinstance(value, Tensor):
                 slot.data = value.data_ptr()
                 shape = value.shape
                 if shape != shapes[index]:
-                    _describe(argument, slot, value)
+                    _describe(self.arguments[index], slot, value)
                     shapes[index] = shape
             elif value is not None:
                 slot.value = value
@@ -155,6 +154,7 @@ def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
         slot.strides[axis] = strides[axis] * tensor.element_size()
 
 
+_CORES = os.cpu_count() or 1
 _commands = threading.local()
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
@@ -163,12 +163,14 @@ _load_lock = threading.Lock()
 
 def _command(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> _Command:
     """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
-    cache = _commands.__dict__.setdefault("cache", {})
-    key = (kernel, device.alias, block_dim)
-    command = cache.get(key)
-    if command is None:
-        with _load_lock:  # two threads that compile and load one module at once unload each other's code
-            command = cache[key] = _Command(kernel, device, block_dim)
+    try:
+        return _commands.cache[kernel, device, block_dim]
+    except AttributeError:
+        _commands.cache = {}
+    except KeyError:
+        pass
+    with _load_lock:  # two threads that compile and load one module at once unload each other's code
+        command = _commands.cache[kernel, device, block_dim] = _Command(kernel, device, block_dim)
     return command
 
 
@@ -176,7 +178,7 @@ def _workers() -> ThreadPoolExecutor:
     global _pool
     with _pool_lock:
         if _pool is None:
-            _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="warpgs")
+            _pool = ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="warpgs")
         return _pool
 
 
@@ -198,7 +200,7 @@ class Run:
         self.needs_grad = bool(wanted)
         self._wanted = {id(t) for t in wanted}
         self.is_cuda = device.type == "cuda"
-        self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), os.cpu_count() or 1))
+        self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), _CORES))
         self._warp_device = wp.device_from_torch(device)
         self.stream = self._current_stream()
         self._tape = wp.Tape()
@@ -252,17 +254,18 @@ class Run:
         """
         if dim == 0:
             return
-        if _active_profile is not None:
-            with _active_profile.span(kernel.func.__name__, self.device):
-                self._launch(kernel, dim, arguments, block_dim, work)
-        else:
-            self._launch(kernel, dim, arguments, block_dim, work)
-
-    def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int) -> None:
-        if self.is_cuda:
-            values = [a.tensor[0] if isinstance(a, PerShard) else a for a in arguments]
-            _command(kernel, self._warp_device, block_dim)(dim, [0, *values], self.stream)
+        run = self._launch_cuda if self.is_cuda else self._launch_cpu
+        if _active_profile is None:
+            run(kernel, dim, arguments, block_dim, work)
             return
+        with _active_profile.span(kernel.func.__name__, self.device):
+            run(kernel, dim, arguments, block_dim, work)
+
+    def _launch_cuda(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int) -> None:
+        values = [a.tensor[0] if type(a) is PerShard else a for a in arguments]
+        _command(kernel, self._warp_device, block_dim)(dim, [0, *values], self.stream)
+
+    def _launch_cpu(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], _block_dim: int, work: int) -> None:
         shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
         chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 

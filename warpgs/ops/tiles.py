@@ -90,9 +90,9 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
     if N == 0 or total == 0:
         return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), pinned_counter(run.device))
     run.sort_pairs(splat_rows.depth_keys, gaussian_from_rank, N, DEPTH_BITS)
-    counts = run.empty(N, dtype=torch.int64)
-    run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, counts)
-    end_of_rank = torch.cumsum(counts, 0)
+    end_of_rank = run.empty(N, dtype=torch.int64)
+    run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, end_of_rank)
+    torch.cumsum(end_of_rank, 0, out=end_of_rank)
 
     budget = _budget(run.device, *size)
     if budget.most == 0.0 or not run.is_cuda:

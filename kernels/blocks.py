@@ -1,0 +1,96 @@
+"""Blocks of pixels: which pixels a lane group composites, and how it fetches the Gaussians that matter to them.
+
+A lane group owns a block; each lane owns ``pixels`` (columns, rows) of it, a lane layout's width or height apart. The
+lanes fetch one Gaussian each, test it against the block and put the survivors on the stage, in order; then all lanes
+composite the survivors one by one. On CPU the one lane owns the whole block and has no stage.
+"""
+
+import functools
+
+import warp as wp
+
+from .constants import LOG2_ALPHA_MIN, TILE_SIZE
+from .ellipse import ellipse_meets_box
+from .lanes import lane_ballot, lane_rank, lane_sync, stage_put
+from .rows import GEOMETRY_PARTS, row_load
+
+
+@functools.cache
+def state_types(num_channels: int, num_states: int) -> tuple[type, type, type, type]:
+    """Vector types of what a lane holds: a float, an int and a colour for each of its pixels in each image (so many
+    states), and one Gaussian's features."""
+    return (
+        wp.types.vector(length=num_states, dtype=float),
+        wp.types.vector(length=num_states, dtype=int),
+        wp.types.vector(length=num_states * num_channels, dtype=float),
+        wp.types.vector(length=num_channels, dtype=float),
+    )
+
+
+@wp.func
+def block_corner(group: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
+    """Tile index and left, top [px] of a lane group's block. Blocks of a tile follow each other."""
+    blocks_x = TILE_SIZE / block_width
+    blocks = blocks_x * (TILE_SIZE / block_height)
+    tile = group / blocks
+    block = group % blocks
+    tiles_x = (width + TILE_SIZE - 1) / TILE_SIZE
+    left = (tile % tiles_x) * TILE_SIZE + (block % blocks_x) * block_width
+    top = (tile / tiles_x) * TILE_SIZE + (block / blocks_x) * block_height
+    return wp.vec3i(tile, left, top)
+
+
+@wp.func
+def block_box(corner: wp.vec3i, block_width: int, block_height: int, width: int, height: int) -> wp.vec4:
+    """Left, top, right, bottom of the outermost pixel centres of a block inside the image."""
+    return wp.vec4(
+        float(corner[1]) + 0.5,
+        float(corner[2]) + 0.5,
+        float(wp.min(corner[1] + block_width, width)) - 0.5,
+        float(wp.min(corner[2] + block_height, height)) - 0.5,
+    )
+
+
+@wp.func
+def stage_survivors(
+    g: int, tag: int, box: wp.vec4, rows: wp.array2d[wp.vec4], lane: int, stage: wp.uint64
+):
+    """Puts the lane group's Gaussians that reach into the block on the stage, each with its index and a tag.
+
+    Args:
+        g: This lane's Gaussian, or -1 for none.
+        tag: A number that goes with it.
+
+    Returns:
+        The ballot of survivors and, for the CPU's single lane, its own three parts: [x, y, a, b],
+        [c, log2 opacity, g, tag] (the last two as bits), [feature 0..3].
+    """
+    own0 = wp.vec4(0.0)
+    own1 = wp.vec4(0.0)
+    own2 = wp.vec4(0.0)
+    hit = int(0)
+    if g >= 0:
+        own0 = row_load(rows, g, 0)
+        own1 = row_load(rows, g, 1)
+        if ellipse_meets_box(
+            own0[2],
+            own0[3],
+            own1[0],
+            own1[1] - LOG2_ALPHA_MIN,
+            box[0] - own0[0],
+            box[1] - own0[1],
+            box[2] - own0[0],
+            box[3] - own0[1],
+        ):
+            hit = 1
+            own1[2] = wp.cast(g, wp.float32)
+            own1[3] = wp.cast(tag, wp.float32)
+            own2 = row_load(rows, g, GEOMETRY_PARTS)
+    ballot = lane_ballot(hit)
+    if hit != 0:
+        slot = lane_rank(ballot, lane)
+        stage_put(stage, slot, 0, own0)
+        stage_put(stage, slot, 1, own1)
+        stage_put(stage, slot, 2, own2)
+    lane_sync()
+    return ballot, own0, own1, own2

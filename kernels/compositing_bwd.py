@@ -1,0 +1,204 @@
+"""The reverse walk of alpha compositing (see ``compositing_fwd``).
+
+With the cotangents g of the image and h of alpha, and R_i = Σ_{j>i} alpha_j T_j (feature_j · g) + T_end (background · g
+- h) gathered while walking back to front,
+
+    v_feature_i = Σ_p alpha_i T_i g,      v_alpha_i = T_i (feature_i · g) - R_i / (1 - alpha_i),
+
+and v_alpha_i reaches the Gaussian's six geometric numbers through the moments of s = alpha_i v_alpha_i over its
+pixels: Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy². ``rows`` turns them into gradients, once per Gaussian.
+T_i is rebuilt from T_end by dividing by 1 - alpha_i, which ALPHA_MAX keeps away from zero.
+"""
+
+import functools
+
+import warp as wp
+
+from .blocks import block_box, block_corner, stage_survivors, state_types
+from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN
+from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
+from .lanes import (
+    exp2,
+    lane_any,
+    lane_bit_count,
+    lane_columns,
+    lane_count,
+    lane_max,
+    lane_rows,
+    lane_sync,
+    make_lane_add,
+    span_begin,
+    span_end,
+    stage_address,
+    stage_get,
+)
+from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
+
+
+@functools.cache
+def make_composite_bwd(num_channels: int, images: int, outputs: int, pixels: tuple[int, int], absolute: bool) -> wp.Kernel:
+    """Reverse walk, launched like the forward kernel.
+
+    Args:
+        num_channels, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the forward kernel's.
+        absolute: Whether the absolute-value variant of the means' gradient is gathered too.
+
+    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero.
+    """
+    C = num_channels
+    columns, rows_per_lane = pixels
+    P = columns * rows_per_lane
+    scalars, integers, colors, features_vector = state_types(C, images * P)
+    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+    def composite_bwd(
+        first: int,
+        tile_ranges: wp.array[wp.vec2i],
+        tile_ends: wp.array[wp.vec2i],
+        gaussian_from_isect: wp.array[int],
+        rows: wp.array2d[wp.vec4],
+        is_dynamic: wp.array[wp.uint8],
+        background: wp.array[float],
+        width: int,
+        height: int,
+        transmittance: wp.array[float],
+        last: wp.array[int],
+        v_image: wp.array2d[float],
+        v_alpha_image: wp.array[float],
+        gradients: wp.array2d[float],
+    ):
+        thread = first + wp.tid()
+        lane = thread % lane_count()
+        block_width = lane_columns() * wp.static(columns)
+        block_height = lane_rows() * wp.static(rows_per_lane)
+        corner = block_corner(thread / lane_count(), width, block_width, block_height)
+        if corner[1] >= width or corner[2] >= height:
+            return  # a block of an edge tile that lies outside the image; its whole lane group leaves
+        begin = tile_ranges[corner[0]][0]
+        ends = wp.vec2i(begin, begin)
+        if wp.static(outputs == 3):
+            ends = tile_ends[corner[0]]
+            if (ends[0] > begin and ends[1] > begin) != wp.static(images == 3):
+                return  # the other kernel's tile
+        box = block_box(corner, block_width, block_height, width, height)
+        pixel_x = corner[1] + lane % lane_columns()
+        pixel_y = corner[2] + lane / lane_columns()
+        x0 = float(pixel_x) + 0.5
+        y0 = float(pixel_y) + 0.5
+
+        T = scalars()
+        R = scalars()
+        n = integers()
+        v_color = colors()
+        n_last = wp.vec3i(0, 0, 0)
+        for j in range(wp.static(rows_per_lane)):
+            for i in range(wp.static(columns)):
+                x = pixel_x + i * lane_columns()
+                y = pixel_y + j * lane_rows()
+                if x < width and y < height:
+                    for m in range(wp.static(outputs)):
+                        # In a tile of one branch its image is the joint one, and so their cotangents add up.
+                        if wp.static(outputs == images) or m == 0 or ends[wp.max(m - 1, 0)] > begin:
+                            k = wp.static(P * (images // 3)) * m + j * wp.static(columns) + i
+                            p = (m * height + y) * width + x
+                            T[k] = transmittance[p]
+                            n[k] = last[p]
+                            n_last[wp.static(images // 3) * m] = wp.max(n_last[wp.static(images // 3) * m], n[k])
+                            behind = float(0.0)
+                            if v_alpha_image.shape[0] > 0:
+                                behind = -v_alpha_image[p]
+                            for c in range(wp.static(C)):
+                                v = v_image[p, c]
+                                v_color[k * wp.static(C) + c] += v
+                                if background.shape[0] > 0:
+                                    behind += background[c] * v
+                            R[k] += T[k] * behind
+        for m in range(wp.static(images)):
+            n_last[m] = lane_max(n_last[m])  # from here on the lane group's
+        n_max = wp.max(n_last[0], wp.max(n_last[1], n_last[2]))
+
+        stage = stage_address()
+        base = (n_max - 1) / lane_count() * lane_count()
+        while base >= 0 and n_max > 0:
+            index = base + lane
+            own_g = int(-1)
+            tag = index + 1
+            if index < n_max:
+                own_g = gaussian_from_isect[begin + index]
+                if wp.static(images == 3):
+                    branch = int(is_dynamic[own_g])
+                    tag = 2 * tag + branch
+                    if index >= wp.max(n_last[0], wp.where(branch == 0, n_last[1], n_last[2])):
+                        own_g = -1
+            ballot, own0, own1, own2 = stage_survivors(own_g, tag, box, rows, lane, stage)
+            count = lane_bit_count(ballot)
+            for back in range(count):
+                slot = count - 1 - back
+                row0 = stage_get(stage, slot, 0, own0)
+                row1 = stage_get(stage, slot, 1, own1)
+                quad = stage_get(stage, slot, 2, own2)
+                g = wp.cast(row1[2], wp.int32)
+                position = wp.cast(row1[3], wp.int32)
+                branch_image = int(-1)
+                if wp.static(images == 3):
+                    branch_image = 1 + (position & 1)
+                    position = position >> 1
+                features = features_vector()
+                for c in range(wp.static(min(C, 4))):
+                    features[c] = quad[c]
+                for c in range(4, wp.static(C)):
+                    features[c] = row_load(rows, g, GEOMETRY_PARTS + c / 4)[c % 4]
+                threshold = row1[1] - LOG2_ALPHA_MIN
+                half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
+                sums = sums_vector()
+                touched = int(0)
+                for j in range(
+                    span_begin(row0[1] - half_size[1] - y0, wp.static(rows_per_lane)),
+                    span_end(row0[1] + half_size[1] - y0, wp.static(rows_per_lane)),
+                ):
+                    dy = row0[1] - (y0 + float(j * lane_rows()))
+                    span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
+                    for i in range(
+                        span_begin(row0[0] - span[1] - x0, wp.static(columns)),
+                        span_end(row0[0] - span[0] - x0, wp.static(columns)),
+                    ):
+                        dx = row0[0] - (x0 + float(i * lane_columns()))
+                        log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
+                        if log2_alpha >= LOG2_ALPHA_MIN:
+                            unclamped = exp2(log2_alpha)
+                            alpha = wp.min(ALPHA_MAX, unclamped)
+                            scale = 1.0 / (1.0 - alpha)
+                            v_alpha = float(0.0)
+                            for m in range(wp.static(images)):
+                                if m == 0 or m == branch_image:
+                                    k = m * wp.static(P) + j * wp.static(columns) + i
+                                    if position <= n[k]:
+                                        touched = 1
+                                        t = T[k] * scale
+                                        w = alpha * t
+                                        seen = float(0.0)
+                                        for c in range(wp.static(C)):
+                                            v = v_color[k * wp.static(C) + c]
+                                            seen += features[c] * v
+                                            sums[c] += w * v
+                                        v_alpha += t * seen - R[k] * scale
+                                        R[k] = R[k] + w * seen
+                                        T[k] = t
+                            if unclamped <= ALPHA_MAX:
+                                s = alpha * v_alpha
+                                sums[wp.static(C)] += s
+                                sums[wp.static(C + 1)] += s * dx
+                                sums[wp.static(C + 2)] += s * dy
+                                sums[wp.static(C + 3)] += s * dx * dx
+                                sums[wp.static(C + 4)] += s * dx * dy
+                                sums[wp.static(C + 5)] += s * dy * dy
+                                if wp.static(absolute):
+                                    sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
+                                    sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
+                if lane_any(touched) != 0:
+                    lane_add(sums, gradients, g)
+            lane_sync()
+            base -= lane_count()
+
+    return composite_bwd
