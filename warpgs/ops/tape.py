@@ -161,7 +161,7 @@ _pool_lock = threading.Lock()
 _load_lock = threading.Lock()
 
 
-def _command(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> _Command:
+def _command(kernel: wp.Kernel, device: torch.device, block_dim: int) -> _Command:
     """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
     try:
         return _commands.cache[kernel, device, block_dim]
@@ -170,7 +170,9 @@ def _command(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> _Command:
     except KeyError:
         pass
     with _load_lock:  # two threads that compile and load one module at once unload each other's code
-        command = _commands.cache[kernel, device, block_dim] = _Command(kernel, device, block_dim)
+        command = _commands.cache[kernel, device, block_dim] = _Command(
+            kernel, wp.device_from_torch(device), block_dim
+        )
     return command
 
 
@@ -263,7 +265,7 @@ class Run:
 
     def _launch_cuda(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int) -> None:
         values = [a.tensor[0] if type(a) is PerShard else a for a in arguments]
-        _command(kernel, self._warp_device, block_dim)(dim, [0, *values], self.stream)
+        _command(kernel, self.device, block_dim)(dim, [0, *values], self.stream)
 
     def _launch_cpu(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], _block_dim: int, work: int) -> None:
         shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
@@ -271,7 +273,7 @@ class Run:
 
         def run_shard(shard: int) -> None:
             values = [a.tensor[shard] if isinstance(a, PerShard) else a for a in arguments]
-            command = _command(kernel, self._warp_device, 1)
+            command = _command(kernel, self.device, 1)
             for first in range(shard * chunk, dim, shards * chunk):
                 command(min(chunk, dim - first), [first, *values], None)
 
