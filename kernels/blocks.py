@@ -27,6 +27,12 @@ def state_types(num_channels: int, num_states: int) -> tuple[type, type, type, t
     )
 
 
+def module_options(pixels_per_lane: int) -> dict[str, object]:
+    """Compile options of a compositing kernel: a lane's few pixels on CUDA are unrolled into registers, the CPU lane's
+    whole tile is looped over."""
+    return {"fast_math": True, "max_unroll": 16 if pixels_per_lane <= 8 else 4}
+
+
 @wp.func
 def block_corner(group: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
     """Tile index and left, top [px] of a lane group's block. Blocks of a tile follow each other."""
@@ -52,9 +58,7 @@ def block_box(corner: wp.vec3i, block_width: int, block_height: int, width: int,
 
 
 @wp.func
-def stage_survivors(
-    g: int, tag: int, box: wp.vec4, rows: wp.array2d[wp.vec4], lane: int, stage: wp.uint64
-):
+def stage_survivors(g: int, tag: int, box: wp.vec4, rows: wp.array2d[wp.vec4], lane: int, stage: wp.uint64):
     """Puts the lane group's Gaussians that reach into the block on the stage, each with its index and a tag.
 
     Args:

@@ -14,7 +14,7 @@ import functools
 
 import warp as wp
 
-from .blocks import block_box, block_corner, stage_survivors, state_types
+from .blocks import block_box, block_corner, module_options, stage_survivors, state_types
 from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
@@ -36,11 +36,14 @@ from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 
 
 @functools.cache
-def make_composite_bwd(num_channels: int, images: int, outputs: int, pixels: tuple[int, int], absolute: bool) -> wp.Kernel:
+def make_composite_bwd(
+    num_channels: int, images: int, outputs: int, pixels: tuple[int, int], absolute: bool
+) -> wp.Kernel:
     """Reverse walk, launched like the forward kernel.
 
     Args:
-        num_channels, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the forward kernel's.
+        num_channels, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the forward
+            kernel's.
         absolute: Whether the absolute-value variant of the means' gradient is gathered too.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero.
@@ -51,7 +54,7 @@ def make_composite_bwd(num_channels: int, images: int, outputs: int, pixels: tup
     scalars, integers, colors, features_vector = state_types(C, images * P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],

@@ -18,7 +18,7 @@ import functools
 
 import warp as wp
 
-from .blocks import block_box, block_corner, stage_survivors, state_types
+from .blocks import block_box, block_corner, module_options, stage_survivors, state_types
 from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
@@ -39,7 +39,9 @@ from .rows import GEOMETRY_PARTS, row_load
 
 
 @functools.cache
-def make_composite_fwd(num_channels: int, images: int, outputs: int, pixels: tuple[int, int], statistics: bool) -> wp.Kernel:
+def make_composite_fwd(
+    num_channels: int, images: int, outputs: int, pixels: tuple[int, int], statistics: bool
+) -> wp.Kernel:
     """Forward kernel, ``lane_count()`` threads for each block of pixels.
 
     Args:
@@ -54,7 +56,7 @@ def make_composite_fwd(num_channels: int, images: int, outputs: int, pixels: tup
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, images * P)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+    @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_fwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],

@@ -114,9 +114,7 @@ def lane_sync(): ...
 def stage_address() -> wp.uint64: ...
 
 
-@wp.func_native(
-    native("((float4*)stage)[slot * 3 + part] = make_float4(value[0], value[1], value[2], value[3]);", "")
-)
+@wp.func_native(native("((float4*)stage)[slot * 3 + part] = make_float4(value[0], value[1], value[2], value[3]);", ""))
 def stage_put(stage: wp.uint64, slot: int, part: int, value: wp.vec4): ...
 
 

@@ -11,7 +11,8 @@ With the camera's rotation W and translation, t = W mean + translation, depth z 
 Σ itself is never formed: cov2d = B Bᵀ is positive semidefinite by construction.
 
 Adjoint: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
-    v_a = -(A² v_A + A B v_B + B² v_C),  v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C),  v_c = -(B² v_A + B C v_B + C² v_C)
+    v_a = -(A² v_A + A B v_B + B² v_C),  v_c = -(B² v_A + B C v_B + C² v_C),
+    v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C)
 for the conic (A, B, C).
 
 A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, touches

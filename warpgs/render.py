@@ -99,7 +99,13 @@ def render(
         degree = round(splats.sh.shape[1] ** 0.5) - 1
 
     def op(
-        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, appearance: Tensor, behind: Tensor | None
+        run: Run,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        appearance: Tensor,
+        behind: Tensor | None,
     ) -> tuple[Tensor, ...]:
         geometry = (means, quats, scales, opacities, camera.viewmat, camera.K)
         projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
@@ -117,9 +123,7 @@ def render(
     behind = background
     if background is not None and settings.depth:
         behind = torch.cat([background, background.new_zeros(1)])
-    radii, *flat = differentiable(
-        op, splats.means, splats.quats, splats.scales, splats.opacities, appearance, behind
-    )
+    radii, *flat = differentiable(op, splats.means, splats.quats, splats.scales, splats.opacities, appearance, behind)
     composite = Composite.from_flat(tuple(flat), NUM_BRANCH_IMAGES if settings.branches else 1)
     layers = [_layer(*pair, settings.depth) for pair in zip(composite.images, composite.alphas, strict=True)]
     return Rendering(

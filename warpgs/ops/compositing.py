@@ -214,18 +214,15 @@ def composite(
     if is_dynamic is not None:
         check_tensor("is_dynamic", is_dynamic, ("N",), sizes, (torch.bool,))
         branch = is_dynamic.view(torch.uint8)
-    check_same_device(
-        {**splats._asdict(), "features": features, "background": background, "is_dynamic": is_dynamic}
-    )
+    check_same_device({**splats._asdict(), "features": features, "background": background, "is_dynamic": is_dynamic})
     check_image_size(*size)
 
     def op(run: Run, *tensors: Tensor) -> tuple[Tensor, ...]:
         *geometry, features, background = tensors
-        rows = Rows(run, Projection(*geometry, splats.radii), features, False, size)
+        means2d, conics, depths, opacities = geometry
+        rows = Rows(run, Projection(means2d, conics, depths, opacities, splats.radii), features, False, size)
         tiles = record_tiles(run, rows, size)
         return record_composite(run, rows, tiles, size, background, branch, statistics, absgrad).flat()
 
-    tensors = differentiable(
-        op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background
-    )
+    tensors = differentiable(op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background)
     return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES)

@@ -47,9 +47,7 @@ def record_projection(
     """``project`` as a step of a run; ``size`` is (width, height)."""
     N = means.shape[0]
     width, height = size
-    splats = Projection(
-        run.empty(N, 2), run.empty(N, 3), run.empty(N), run.empty(N), run.empty(N, 2, dtype=int32)
-    )
+    splats = Projection(run.empty(N, 2), run.empty(N, 3), run.empty(N), run.empty(N), run.empty(N, 2, dtype=int32))
     geometry = (means, quats, scales, opacities, viewmat, K, width, height)
     run.launch(
         kernels.project_fwd,
@@ -128,7 +126,9 @@ def project(
     check_geometry({}, means, quats, scales, opacities, viewmat, K)
     check_image_size(*size)
 
-    def op(run: Run, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return record_projection(run, *tensors, size, near, antialias)  # type: ignore[call-arg]
+    def op(
+        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor
+    ) -> tuple[Tensor, ...]:
+        return record_projection(run, means, quats, scales, opacities, viewmat, K, size, near, antialias)
 
     return Projection(*differentiable(op, means, quats, scales, opacities, viewmat, K))

@@ -41,9 +41,7 @@ def record_sh(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tenso
         if v_colors is None:
             return
         v_means, v_sh = run.empty(*means.shape), run.empty(*sh.shape)
-        run.launch(
-            kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh
-        )
+        run.launch(kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh)
         run.add_adjoint(means, v_means)
         run.add_adjoint(sh, v_sh)
 

@@ -27,9 +27,7 @@ def ssim_map(
     def op(run: Run, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
         similarity = run.empty(H, W, C)
         partials = run.empty(3, H, W, C) if run.needs_grad else None
-        run.launch(
-            kernels.ssim_fwd, strips * W * C, image, target, kept, similarity, partials, work=kernels.STRIP
-        )
+        run.launch(kernels.ssim_fwd, strips * W * C, image, target, kept, similarity, partials, work=kernels.STRIP)
 
         def backward() -> None:
             v_similarity = run.adjoint(similarity)

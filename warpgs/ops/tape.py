@@ -23,7 +23,7 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 CHUNKS_PER_SHARD = 8
-"""A CPU launch is cut into this many pieces a core, dealt out in turn, so that cores get like shares of a busy image."""
+"""Pieces a core that a CPU launch is cut into and that are dealt out in turn, so that cores get like shares."""
 
 SMALLEST_SHARD = 2048
 """Threads below which a CPU launch is not worth another core."""
@@ -170,9 +170,7 @@ def _command(kernel: wp.Kernel, device: torch.device, block_dim: int) -> _Comman
     except KeyError:
         pass
     with _load_lock:  # two threads that compile and load one module at once unload each other's code
-        command = _commands.cache[kernel, device, block_dim] = _Command(
-            kernel, wp.device_from_torch(device), block_dim
-        )
+        command = _commands.cache[kernel, device, block_dim] = _Command(kernel, wp.device_from_torch(device), block_dim)
     return command
 
 
@@ -338,7 +336,7 @@ class _Differentiable(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         with torch.no_grad():
             ctx.run.backward(ctx.raw_outputs, gradients)
@@ -373,7 +371,10 @@ def adjoint_launch(run: Run, kernel: wp.Kernel, dim: int, inputs: Sequence[Tenso
         tensors = [*inputs, *outputs]
         v_inputs = [torch.zeros_like(t) for t in inputs]
         v_outputs = [run.adjoint(t) for t in outputs]
-        v_tensors = [*v_inputs, *(torch.zeros_like(t) if v is None else v for t, v in zip(outputs, v_outputs))]
+        v_tensors = [
+            *v_inputs,
+            *(torch.zeros_like(t) if v is None else v for t, v in zip(outputs, v_outputs, strict=True)),
+        ]
         arrays = [wp.from_torch(t.detach(), dtype=d, requires_grad=False) for t, d in zip(tensors, types, strict=True)]
         adjoints = [wp.from_torch(t, dtype=d, requires_grad=False) for t, d in zip(v_tensors, types, strict=True)]
         wp.launch(

@@ -1,5 +1,6 @@
 """Gaussians in activated form, ready to be rendered."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -65,5 +66,5 @@ class Splats:
         return 3 if self.colors is None else self.colors.shape[1]
 
     def to(self, device: torch.device | str) -> "Splats":
-        moved = {n: None if (t := getattr(self, n)) is None else t.to(device) for n in self.tensor_names()}
-        return Splats(**moved, sh_degree=self.sh_degree)
+        moved = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
+        return dataclasses.replace(self, **moved)

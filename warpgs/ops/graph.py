@@ -1,0 +1,48 @@
+"""CUDA graphs: work recorded once and replayed with one launch."""
+
+from collections.abc import Callable
+
+import torch
+import warp as wp
+from torch import Tensor
+
+WARM_UPS = 3
+"""Runs before the capture: they compile kernels, allocate scratch memory and learn how many intersections to expect."""
+
+
+def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor, ...]]:
+    """Captures ``step`` in a CUDA graph and returns a function that replays it.
+
+    The replay runs on torch's current stream and returns the same tensors every time, with new values. The graph holds
+    addresses, not tensors: what ``step`` reads must stay alive and may only be changed in place. Scalars, image sizes
+    and the size of the buffers for intersections are those of the capture; a replay with more intersections than these
+    buffers hold is still drawn in full, but slowly.
+
+    A capture must not wait for the device, which ``render`` does on the first frame of an image size on each thread, to
+    learn the number of intersections. So ``step`` is first run a few times, on this thread and on the stream that the
+    capture uses. (The way back runs on autograd's own thread, where nothing waits.)
+
+    Args:
+        step: Works on the current CUDA device without reading anything back from it.
+    """
+    stream = torch.cuda.Stream()
+    warp_stream = wp.stream_from_torch(stream)
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(WARM_UPS):
+            step()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
+    with (
+        torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+        wp.ScopedStream(warp_stream, sync_enter=False),
+        wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
+    ):
+        outputs = step()
+
+    def replay() -> tuple[Tensor, ...]:
+        graph.replay()
+        return outputs
+
+    return replay
