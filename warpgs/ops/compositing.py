@@ -22,8 +22,8 @@ from .tiles import Tiles, record_tile_ends, record_tiles
 NUM_BRANCH_IMAGES = 3
 """Joint, static only, dynamic only."""
 
-CUDA_PIXELS = {1: (1, 2), NUM_BRANCH_IMAGES: (1, 1)}
-"""Columns and rows of pixels that a lane composites on CUDA, by images; the alternatives are in docs/performance.md."""
+CUDA_PIXELS = (1, 2)
+"""Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
@@ -64,7 +64,7 @@ def _launch(
     """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
     lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
     for walked in sorted({1, images}):
-        pixels = CUDA_PIXELS[walked] if run.is_cuda else CPU_PIXELS
+        pixels = CUDA_PIXELS if run.is_cuda else CPU_PIXELS
         blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
         run.launch(
             make_kernel(channels, walked, images, pixels, flag),

@@ -27,14 +27,23 @@ def ssim_map(
     def op(run: Run, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
         similarity = run.empty(H, W, C)
         partials = run.empty(3, H, W, C) if run.needs_grad else None
-        run.launch(kernels.ssim_fwd, strips * W * C, image, target, kept, similarity, partials, work=kernels.STRIP)
+        run.launch(
+            kernels.make_ssim_fwd(kept is not None),
+            strips * W * C,
+            image,
+            target,
+            kept,
+            similarity,
+            partials,
+            work=kernels.STRIP,
+        )
 
         def backward() -> None:
             v_similarity = run.adjoint(similarity)
             if v_similarity is not None:
                 v_image = run.empty(H, W, C)
                 run.launch(
-                    kernels.ssim_bwd,
+                    kernels.make_ssim_bwd(kept is not None),
                     strips * W * C,
                     image,
                     target,
