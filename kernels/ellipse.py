@@ -43,7 +43,8 @@ def ellipse_span(a: float, b: float, c: float, t: float, dy: float) -> wp.vec2:
     if not (discriminant >= 0.0):
         return wp.vec2(1.0, -1.0)
     root = wp.sqrt(discriminant)
-    return wp.vec2((-half_b - root) / a, (-half_b + root) / a)
+    scale = 1.0 / a
+    return wp.vec2((-half_b - root) * scale, (-half_b + root) * scale)
 
 
 @wp.func

@@ -21,7 +21,7 @@ import warp as wp
 
 WINDOW = 11
 RADIUS = 5
-STRIP = wp.constant(32)
+STRIP = wp.constant(16)
 """Pixels of one column that a thread handles; the lines above and below it are filtered again."""
 
 C1 = wp.constant(0.01**2)
