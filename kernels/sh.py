@@ -115,10 +115,10 @@ def sh_fwd(
         for k in range(NUM_BASES):
             if k < num_bases:
                 color += bases[k] * coefficients[i, k]
-        # Written so that NaN stays NaN: the row is then culled as a whole instead of turning black.
-        for c in range(3):
-            if color[c] < 0.0:
-                color[c] = 0.0
+        if wp.isfinite(color[0] + color[1] + color[2]):
+            color = wp.max(color, wp.vec3(0.0))
+        else:
+            color = wp.vec3(wp.nan)  # so that the Gaussian is left out as a whole instead of turning black
     colors[i] = color
 
 
@@ -143,7 +143,7 @@ def sh_bwd(
     for c in range(3):
         if not (colors[i][c] > 0.0):
             v[c] = 0.0
-    if radii[i][0] > 0:
+    if radii[i][0] > 0 and wp.isfinite(colors[i][0]):
         origin = viewpoint(viewmat)
         d = direction_from(means[i], origin)
         bases = sh_bases(d)

@@ -20,10 +20,11 @@ from .bench_workloads import PARAMETERS, Workload, make_gsplat_workload, make_wo
 from .cameras import Camera
 from .config import RenderSettings
 from .ops.graph import capture
+from .ops.profiling import KernelTime, profile
 from .ops.projection import record_projection
 from .ops.rows import Rows
 from .ops.ssim import ssim
-from .ops.tape import KernelTime, Run, profile
+from .ops.tape import Run
 from .ops.tiles import record_tiles
 from .scene.splats import Splats
 

@@ -13,7 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from .ops.tape import KernelTime
+from .ops.profiling import KernelTime
 
 WIDTH = 120
 """Columns of the output when it is not a terminal."""

@@ -128,7 +128,7 @@ def record_composite(
         weights=None if weights is None else weights.sum(0),
     )
 
-    def gathered(outputs: tuple[Tensor, ...]) -> Tensor | None:
+    def gathered(run: Run, outputs: tuple[Tensor, ...]) -> Tensor | None:
         """The cotangents of several outputs in one tensor, flat; None where nothing has arrived at any."""
         values = [run.adjoint(t) for t in outputs]
         if all(v is None for v in values):
@@ -137,8 +137,8 @@ def record_composite(
             return values[0]
         return torch.stack([torch.zeros_like(t) if v is None else v for t, v in zip(outputs, values, strict=True)])
 
-    def backward() -> None:
-        v_image, v_alpha = gathered(result.images), gathered(result.alphas)
+    def backward(run: Run) -> None:
+        v_image, v_alpha = gathered(run, result.images), gathered(run, result.alphas)
         if v_image is None and v_alpha is None:
             return
         v_image = run.zeros(*image.shape) if v_image is None else v_image
@@ -217,12 +217,19 @@ def composite(
     check_same_device({**splats._asdict(), "features": features, "background": background, "is_dynamic": is_dynamic})
     check_image_size(*size)
 
-    def op(run: Run, *tensors: Tensor) -> tuple[Tensor, ...]:
-        *geometry, features, background = tensors
-        means2d, conics, depths, opacities = geometry
-        rows = Rows(run, Projection(means2d, conics, depths, opacities, splats.radii), features, False, size)
+    def op(
+        run: Run,
+        means2d: Tensor,
+        conics: Tensor,
+        depths: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        behind: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        projection = Projection(means2d, conics, depths, opacities, splats.radii)
+        rows = Rows(run, projection, features, False, size)
         tiles = record_tiles(run, rows, size)
-        return record_composite(run, rows, tiles, size, background, branch, statistics, absgrad).flat()
+        return record_composite(run, rows, tiles, size, behind, branch, statistics, absgrad).flat()
 
     tensors = differentiable(op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background)
     return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES)

@@ -62,7 +62,7 @@ def record_projection(
         splats.opacities,
     )
 
-    def backward() -> None:
+    def backward(run: Run) -> None:
         cotangents = [run.adjoint(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
         inputs = (means, quats, scales, opacities)
         gradients = [run.empty(*t.shape) for t in inputs]

@@ -44,7 +44,7 @@ class Rows:
 
         packed, norms = self.packed, self.norms
 
-        def backward() -> None:
+        def backward(run: Run) -> None:
             gradients = run.adjoint(packed)
             if gradients is None:
                 return

@@ -36,7 +36,7 @@ def record_sh(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tenso
     colors = run.empty(N, 3)
     run.launch(kernels.sh_fwd, N, means, sh, viewmat, radii, num_bases(degree), colors)
 
-    def backward() -> None:
+    def backward(run: Run) -> None:
         v_colors = run.adjoint(colors)
         if v_colors is None:
             return

@@ -38,7 +38,7 @@ def ssim_map(
             work=kernels.STRIP,
         )
 
-        def backward() -> None:
+        def backward(run: Run) -> None:
             v_similarity = run.adjoint(similarity)
             if v_similarity is not None:
                 v_image = run.empty(H, W, C)

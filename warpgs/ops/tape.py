@@ -9,15 +9,17 @@ import contextlib
 import functools
 import os
 import threading
-import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
+
+from . import profiling
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -34,65 +36,6 @@ class PerShard:
     """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
 
     tensor: Tensor
-
-
-@dataclass
-class KernelTime:
-    """One launch seen by ``profile``: start and duration in milliseconds."""
-
-    name: str
-    start_ms: float
-    duration_ms: float
-
-
-@dataclass
-class Profile:
-    """What ``profile`` gathers; ``times`` waits for the device."""
-
-    _origin: float = field(default_factory=time.perf_counter)
-    _first_event: Any = None
-    _entries: list[tuple[str, Any, Any]] = field(default_factory=list)
-
-    def times(self) -> list[KernelTime]:
-        if self._first_event is not None:
-            torch.cuda.synchronize()
-        result = []
-        for name, begin, end in self._entries:
-            if isinstance(begin, float):
-                result.append(KernelTime(name, (begin - self._origin) * 1e3, (end - begin) * 1e3))
-            else:
-                result.append(KernelTime(name, self._first_event.elapsed_time(begin), begin.elapsed_time(end)))
-        return result
-
-    @contextlib.contextmanager
-    def span(self, name: str, device: torch.device) -> Iterator[None]:
-        if device.type == "cuda":
-            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            begin.record()
-            self._first_event = self._first_event or begin
-            yield
-            end.record()
-            self._entries.append((name, begin, end))
-        else:
-            start = time.perf_counter()
-            yield
-            self._entries.append((name, start, time.perf_counter()))
-
-
-_active_profile: Profile | None = None
-
-
-@contextlib.contextmanager
-def profile() -> Iterator[Profile]:
-    """Times every kernel launched inside: CUDA events on a GPU, wall time on CPU."""
-    global _active_profile
-    if _active_profile is not None:
-        raise RuntimeError("a profile is already being taken")
-    _active_profile = Profile()
-    try:
-        yield _active_profile
-    finally:
-        _active_profile = None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -219,10 +162,15 @@ class Run:
 
     # Going back -------------------------------------------------------------------------------------------------------
 
-    def on_backward(self, function: Callable[[], None]) -> None:
-        """Records how to go back over what was just launched; called in reverse order."""
+    def on_backward(self, function: Callable[["Run"], None]) -> None:
+        """Records how to go back over what was just launched; called with the run, in reverse order.
+
+        The function takes the run as its argument and must not hold it: the run holds the function, and in a cycle
+        the memory of a whole render would wait for Python's garbage collector.
+        """
         if self.needs_grad:
-            self._tape.record_func(function, [])
+            this = weakref.proxy(self)
+            self._tape.record_func(lambda: function(this), [])
 
     def adjoint(self, tensor: Tensor) -> Tensor | None:
         """What has arrived at a tensor on the way back, contiguous; None where nothing has."""
@@ -255,11 +203,30 @@ class Run:
         if dim == 0:
             return
         run = self._launch_cuda if self.is_cuda else self._launch_cpu
-        if _active_profile is None:
+        with profiling.span(kernel.func.__name__, self.device):
             run(kernel, dim, arguments, block_dim, work)
-            return
-        with _active_profile.span(kernel.func.__name__, self.device):
-            run(kernel, dim, arguments, block_dim, work)
+
+    def launch_adjoint(
+        self, kernel: wp.Kernel, dim: int, tensors: Sequence[Tensor], adjoints: Sequence[Tensor]
+    ) -> None:
+        """Runs the adjoint that Warp generated for a kernel: adds to the adjoints of what the kernel read.
+
+        ``tensors`` and ``adjoints`` follow the kernel's first parameter, ``first``.
+        """
+
+        def arrays(values: Sequence[Tensor]) -> list[wp.array]:
+            types = [argument.type.dtype for argument in kernel.adj.args[1:]]
+            return [wp.from_torch(t.detach(), d, requires_grad=False) for t, d in zip(values, types, strict=True)]
+
+        wp.launch(
+            kernel,
+            dim=dim,
+            inputs=[0, *arrays(tensors)],
+            adj_inputs=[0, *arrays(adjoints)],
+            adjoint=True,
+            device=self._warp_device,
+            stream=self.stream,
+        )
 
     def _launch_cuda(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int) -> None:
         values = [a.tensor[0] if type(a) is PerShard else a for a in arguments]
@@ -293,8 +260,7 @@ class Run:
     def sort_pairs(self, keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
         """Stable radix sort of the first ``count`` int32 pairs by the low bits of the keys; buffers hold twice that."""
         arrays = [_int_array(t.data_ptr(), t.numel(), self._warp_device.alias) for t in (keys, values)]
-        span = _active_profile.span("sort_pairs", self.device) if _active_profile else contextlib.nullcontext()
-        with span, self._warp_stream():
+        with profiling.span("sort_pairs", self.device), self._warp_stream():
             wp.utils.radix_sort_pairs(*arrays, count, 0, num_bits)
 
     @contextlib.contextmanager
@@ -366,26 +332,11 @@ def adjoint_launch(run: Run, kernel: wp.Kernel, dim: int, inputs: Sequence[Tenso
     """
     run.launch(kernel, dim, *inputs, *outputs)
 
-    def backward() -> None:
-        types = [a.type.dtype for a in kernel.adj.args[1:]]
-        tensors = [*inputs, *outputs]
+    def backward(run: Run) -> None:
         v_inputs = [torch.zeros_like(t) for t in inputs]
-        v_outputs = [run.adjoint(t) for t in outputs]
-        v_tensors = [
-            *v_inputs,
-            *(torch.zeros_like(t) if v is None else v for t, v in zip(outputs, v_outputs, strict=True)),
-        ]
-        arrays = [wp.from_torch(t.detach(), dtype=d, requires_grad=False) for t, d in zip(tensors, types, strict=True)]
-        adjoints = [wp.from_torch(t, dtype=d, requires_grad=False) for t, d in zip(v_tensors, types, strict=True)]
-        wp.launch(
-            kernel,
-            dim=dim,
-            inputs=[0, *arrays],
-            adj_inputs=[0, *adjoints],
-            adjoint=True,
-            device=run._warp_device,
-            stream=run.stream if run.is_cuda else None,
-        )
+        v_outputs = [torch.zeros_like(t) if (v := run.adjoint(t)) is None else v for t in outputs]
+        if dim > 0:
+            run.launch_adjoint(kernel, dim, [*inputs, *outputs], [*v_inputs, *v_outputs])
         for tensor, value in zip(inputs, v_inputs, strict=True):
             run.add_adjoint(tensor, value)
 
@@ -396,15 +347,3 @@ def pinned_counter(device: torch.device) -> Tensor:
     """One int64 in host memory that a kernel on ``device`` can write to, zero at first."""
     counter = torch.zeros(1, dtype=torch.int64)
     return counter.pin_memory() if device.type == "cuda" else counter
-
-
-__all__ = [
-    "KernelTime",
-    "PerShard",
-    "Profile",
-    "Run",
-    "adjoint_launch",
-    "differentiable",
-    "pinned_counter",
-    "profile",
-]

@@ -1,0 +1,26 @@
+"""Fixtures of all tests; every annotated shape and type of the package is checked at run time while they run."""
+
+from pathlib import Path
+
+import jaxtyping
+
+# The kernels lie outside this folder and are left out: Warp reads their annotations itself.
+PACKAGE = Path(__file__).parent.parent / "warpgs"
+CHECKED = [f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if not path.stem.startswith("__")]
+jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def contracts_off():
+    """Turns the run-time checks of annotations off, so that the package's own checks have the word."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -1,0 +1,167 @@
+"""Alpha compositing of 2D splats: values, gradients, cut-offs."""
+
+import pytest
+import torch
+
+from tests.reference.compositing import composite as reference
+from tests.scenes import error, generator, pulled, random_like, relative_error
+from warpgs.ops.compositing import composite
+from warpgs.ops.projection import Projection
+
+SIZE = (50, 37)
+INPUTS = ("means2d", "conics", "opacities", "features", "background")
+
+
+def make_inputs(num=40, size=SIZE, channels=3, opacity=0.9, spread=0.25, seed=3) -> list[torch.Tensor]:
+    """means2d, conics, opacities, features, background, depths of splats all over an image."""
+    g = generator(seed)
+    means2d = torch.rand(num, 2, generator=g) * torch.tensor(size)
+    root = torch.randn(num, 2, 2, generator=g) * spread
+    precision = root @ root.mT + 0.01 * torch.eye(2)
+    conics = torch.stack([precision[:, 0, 0], precision[:, 0, 1], precision[:, 1, 1]], -1)
+    opacities = torch.rand(num, generator=g) * opacity + 0.05
+    features = torch.rand(num, channels, generator=g)
+    return [means2d, conics, opacities, features, torch.rand(channels, generator=g), torch.rand(num, generator=g) + 1]
+
+
+def ours(inputs, size=SIZE, **options):
+    means2d, conics, opacities, features, background, depths = inputs
+    radii = torch.full(means2d.shape, 1000, dtype=torch.int32)
+    splats = Projection(means2d, conics, depths, opacities, radii)
+    return composite(splats, features, size, background=background, **options)
+
+
+def theirs(inputs, size=SIZE, drawn=None):
+    means2d, conics, opacities, features, background, depths = inputs
+    drawn = torch.ones(means2d.shape[0], dtype=torch.bool) if drawn is None else drawn
+    return reference(means2d, conics, opacities, features, depths, drawn, size, background)
+
+
+def leaves(inputs, dtype=torch.float32):
+    return [t.detach().clone().to(dtype).requires_grad_() for t in inputs]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), SIZE])
+def test_image_and_alpha_are_those_of_the_reference(size):
+    inputs = make_inputs(size=size)
+    image, alpha, _ = theirs([t.double() for t in inputs], size)
+    result = ours(inputs, size)
+    assert error(result.images[0], image) < 2e-6
+    assert error(result.alphas[0], alpha) < 2e-6
+
+
+@pytest.mark.parametrize("num", [0, 1, 40])
+def test_gradients_are_those_of_the_reference(num):
+    inputs = make_inputs(num)
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result = ours(single)
+    outputs = [result.images[0], result.alphas[0]]
+    cotangents = random_like(outputs)
+    pulled(outputs, cotangents).backward()
+    pulled(theirs(double)[:2], cotangents).backward()
+    for name, actual, expected in zip(INPUTS, single, double, strict=False):
+        wanted = torch.zeros_like(expected) if expected.grad is None else expected.grad
+        assert (actual.grad - wanted).norm() <= 1e-5 * wanted.norm(), name
+
+
+def test_gradients_of_three_images_are_those_of_the_reference():
+    inputs = make_inputs()
+    branch = torch.rand(40) > 0.5
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result = ours(single, is_dynamic=branch, statistics=True)
+    outputs = [*result.images, *result.alphas]
+    cotangents = random_like(outputs)
+    expected = [theirs(double, drawn=drawn) for drawn in (None, ~branch, branch)]
+    pulled(outputs, cotangents).backward()
+    pulled([e[k] for k in (0, 1) for e in expected], cotangents).backward()
+    for name, actual, wanted in zip(INPUTS, single, double, strict=False):
+        assert relative_error(actual.grad, wanted.grad) < 1e-5, name
+
+
+@pytest.mark.parametrize("chosen", ["image", "alpha"])
+def test_a_cotangent_of_one_output_alone_is_enough(chosen):
+    inputs = make_inputs()
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result = ours(single)
+    actual, expected = (
+        (result.images[0], theirs(double)[0]) if chosen == "image" else (result.alphas[0], theirs(double)[1])
+    )
+    cotangents = random_like([actual])
+    pulled([actual], cotangents).backward()
+    pulled([expected], cotangents).backward()
+    assert relative_error(single[0].grad, double[0].grad) < 1e-5
+    assert relative_error(single[2].grad, double[2].grad) < 1e-5
+
+
+def test_a_stack_of_opaque_splats_stops_where_the_reference_stops():
+    inputs = make_inputs(60, opacity=0.0, spread=0.0)
+    inputs[1] = torch.tensor([[2e-4, 0.0, 3e-4]]).repeat(60, 1)
+    inputs[2] = torch.full((60,), 0.83)
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result, (image, _, weights) = ours(single, statistics=True), theirs(double)
+    hidden = weights.sum((1, 2)) == 0
+    assert hidden.any()
+    assert torch.equal(result.contributed, ~hidden)
+    assert error(result.images[0], image) < 2e-6
+    cotangents = random_like([result.images[0]])
+    pulled(result.images, cotangents).backward()
+    pulled([image], cotangents).backward()
+    assert relative_error(single[2].grad, double[2].grad) < 1e-5
+    assert not single[2].grad[hidden].any()
+
+
+def test_a_fully_opaque_splat_is_clamped_and_gets_no_gradient_where_it_is():
+    inputs = make_inputs(1)
+    inputs[0] = torch.tensor([[25.5, 18.5]])
+    inputs[2] = torch.ones(1)
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result, alpha = ours(single), theirs(double)[1]
+    assert result.alphas[0].max().item() == pytest.approx(0.999, abs=1e-6)
+    cotangents = random_like([alpha])
+    pulled(result.alphas, cotangents).backward()
+    pulled([alpha], cotangents).backward()
+    assert relative_error(single[2].grad, double[2].grad) < 1e-5
+
+
+def test_statistics_are_the_sums_of_the_blend_weights():
+    inputs = make_inputs()
+    weights = theirs([t.double() for t in inputs])[2].sum((1, 2))
+    result = ours(inputs, statistics=True)
+    assert relative_error(result.weights, weights) < 2e-6
+    assert torch.equal(result.contributed, weights > 0)
+
+
+def test_absolute_norms_sum_the_lengths_pixel_by_pixel():
+    size = (20, 17)
+    inputs = make_inputs(8, size=size)
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result, (image, _, _) = ours(single, size, absgrad=True), theirs(double, size)
+    (cotangent,) = random_like([image])
+    pulled(result.images, [cotangent]).backward()
+    per_pixel = (image * cotangent).sum(-1).flatten()
+    gradients = torch.stack([torch.autograd.grad(p, double[0], retain_graph=True)[0] for p in per_pixel])
+    half_size = torch.tensor([size[0] / 2, size[1] / 2])
+    assert relative_error(result.norms[:, 0], (gradients.sum(0) * half_size).norm(dim=-1)) < 1e-5
+    assert relative_error(result.norms[:, 1], (gradients.abs().sum(0) * half_size).norm(dim=-1)) < 1e-5
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [{"opacities": 1.5}, {"opacities": 0.9 / 255}, {"conics": -1.0}, {"means2d": float("nan")}, {"depths": 0.0}],
+)
+def test_splats_that_make_no_sense_are_not_drawn(spoilt):
+    inputs = make_inputs()
+    ((name, value),) = spoilt.items()
+    names = (*INPUTS, "depths")
+    bad = [t.clone() for t in inputs]
+    bad[names.index(name)][::4] = value
+    kept = torch.arange(40) % 4 != 0
+    without = [t if n == "background" else t[kept].contiguous() for n, t in zip(names, inputs, strict=True)]
+    assert torch.equal(ours(bad).images[0], ours(without).images[0])
+
+
+def test_without_a_background_black_is_behind():
+    inputs = make_inputs()
+    plain = [*inputs[:4], None, inputs[5]]
+    black = [*inputs[:4], torch.zeros(3), inputs[5]]
+    assert torch.equal(ours(plain).images[0], ours(black).images[0])

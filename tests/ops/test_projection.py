@@ -1,0 +1,139 @@
+"""EWA projection: values, gradients, culling."""
+
+import pytest
+import torch
+
+from tests.reference.projection import project as reference
+from tests.scenes import GEOMETRY, make_camera, make_splats, pulled, random_like, relative_error
+from warpgs.ops.projection import project
+
+CAMERA = make_camera()
+NUM = 150
+
+
+def inputs(requires_grad: bool = False):
+    splats = make_splats(NUM)
+    return [getattr(splats, name).clone().requires_grad_(requires_grad) for name in GEOMETRY]
+
+
+def project_here(*tensors, near=0.01, antialias=False):
+    return project(*tensors, CAMERA.viewmat, CAMERA.K, CAMERA.size, near=near, antialias=antialias)
+
+
+def reference_here(*tensors, near=0.01, antialias=False):
+    camera = CAMERA.viewmat.double(), CAMERA.K.double()
+    return reference(*tensors, *camera, CAMERA.size, near=near, antialias=antialias)
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("near", [0.01, 3.5])
+def test_values_are_those_of_the_reference(antialias, near):
+    splats = project_here(*inputs(), near=near, antialias=antialias)
+    *values, visible = reference_here(*(t.double() for t in inputs()), near=near, antialias=antialias)
+    assert 10 < visible.sum() < NUM
+    assert torch.equal(splats.radii.gt(0).all(-1), visible)
+    for actual, expected in zip(splats[:4], values, strict=True):
+        assert relative_error(actual[visible], expected[visible]) < 1e-6
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_gradients_are_those_of_the_reference(antialias):
+    ours, theirs = inputs(True), [t.double().requires_grad_() for t in inputs()]
+    splats = project_here(*ours, antialias=antialias)[:4]
+    *values, visible = reference_here(*theirs, antialias=antialias)
+    cotangents = random_like(splats)
+    pulled(splats, cotangents).backward()
+    pulled((v[visible] for v in values), (c[visible] for c in cotangents)).backward()
+    for name, actual, expected in zip(GEOMETRY, ours, theirs, strict=True):
+        assert relative_error(actual.grad, expected.grad) < 1e-5, name
+
+
+@pytest.mark.parametrize("output", range(4))
+def test_each_output_sends_its_own_gradient_back(output):
+    ours, theirs = inputs(True), [t.double().requires_grad_() for t in inputs()]
+    splats = project_here(*ours)
+    *values, visible = reference_here(*theirs)
+    (cotangent,) = random_like([splats[output]])
+    pulled([splats[output]], [cotangent]).backward()
+    pulled([values[output][visible]], [cotangent[visible]]).backward()
+    for actual, expected in zip(ours, theirs, strict=True):
+        wanted = torch.zeros_like(expected) if expected.grad is None else expected.grad
+        assert (actual.grad - wanted).norm() <= 1e-5 * wanted.norm()
+
+
+def test_slopes_beyond_the_margin_of_the_image_get_the_clamped_jacobian():
+    means = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])
+    rest = torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
+    ours = [t.clone().requires_grad_() for t in (means, *rest)]
+    theirs = [t.double().requires_grad_() for t in (means, *rest)]
+    splats = project_here(*ours)
+    *values, visible = reference_here(*theirs)
+    assert visible.all()
+    cotangents = random_like(splats[:4])
+    pulled(splats[:4], cotangents).backward()
+    pulled(values, cotangents).backward()
+    assert relative_error(splats.conics, values[1]) < 2e-6
+    for actual, expected in zip(ours, theirs, strict=True):
+        assert relative_error(actual.grad, expected.grad) < 1e-5
+
+
+def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
+    """A round Gaussian seen by a camera that stands at the origin of a 64 × 64 image."""
+    K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]])
+    means, quats = torch.tensor([[x, 0.0, depth]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    return project(means, quats, torch.full((1, 3), scale), torch.tensor([opacity]), torch.eye(4), K, (64, 64))
+
+
+@pytest.mark.parametrize(
+    "culled",
+    [
+        {"depth": -2.0},
+        {"depth": 0.0},
+        {"depth": 0.01},
+        {"x": 5.0},
+        {"x": -5.0},
+        {"opacity": 0.9999 / 255},
+        {"opacity": 1.0001},
+        {"opacity": -0.5},
+        {"opacity": float("nan")},
+        {"scale": float("inf")},
+        {"scale": float("nan")},
+    ],
+)
+def test_what_cannot_be_seen_has_radius_zero_and_zero_values(culled):
+    assert one().radii.min() > 0
+    for value in one(**culled):
+        assert not value.any()
+
+
+def test_just_visible_opacity_and_depth_are_kept():
+    assert one(opacity=1.0001 / 255).radii.min() > 0
+    assert one(depth=0.0101, scale=1e-4).radii.min() > 0
+
+
+def test_alpha_is_below_the_cut_off_outside_the_radii():
+    splats = project_here(*inputs())
+    seen = splats.radii[:, 0] > 0
+    a, b, c = splats.conics[seen].double().unbind(-1)
+    reach = 2 * (255 * splats.opacities[seen].double()).log()
+    determinant = a * c - b * b
+    half_sizes = torch.stack([(reach * c / determinant).sqrt(), (reach * a / determinant).sqrt()], -1)
+    radii = splats.radii[seen].double()
+    assert (radii >= half_sizes - 1e-4).all()
+    assert (radii <= half_sizes + 1 + 1e-4).all()
+
+
+def test_antialiasing_only_lowers_opacities():
+    plain, compensated = project_here(*inputs()), project_here(*inputs(), antialias=True)
+    both = (plain.radii[:, 0] > 0) & (compensated.radii[:, 0] > 0)
+    assert both.sum() > 10
+    assert (compensated.opacities[both] < plain.opacities[both]).all()
+    assert torch.equal(compensated.conics[both], plain.conics[both])
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_few_gaussians_are_enough(num):
+    splats = make_splats(num)
+    tensors = [getattr(splats, name).requires_grad_() for name in GEOMETRY]
+    project_here(*tensors).means2d.sum().backward()
+    assert all(t.grad.shape == t.shape for t in tensors)

@@ -1,0 +1,79 @@
+"""Spherical harmonics as colour."""
+
+import pytest
+import torch
+
+from tests.reference.sh import spherical_harmonics as reference
+from tests.scenes import error, make_camera, make_splats, random_like, relative_error
+from warpgs.ops.sh import spherical_harmonics
+
+VIEW = make_camera().viewmat
+
+
+def inputs(held=3, num=60):
+    splats = make_splats(num, degree=held)
+    return splats.means, 4 * splats.sh  # wide enough that some colours are cut at zero
+
+
+@pytest.mark.parametrize("held", range(4))
+def test_colours_are_those_of_the_reference(held):
+    means, sh = inputs(held)
+    expected = reference(means.double(), sh.double(), VIEW.double(), held)
+    assert error(spherical_harmonics(means, sh, VIEW), expected) < 2e-6
+
+
+@pytest.mark.parametrize("held", range(4))
+def test_gradients_are_those_of_the_reference(held):
+    ours = [t.clone().requires_grad_() for t in inputs(held)]
+    theirs = [t.double().requires_grad_() for t in inputs(held)]
+    colors = spherical_harmonics(*ours, VIEW)
+    expected = reference(*theirs, VIEW.double(), held)
+    assert (expected == 0).any()
+    (cotangent,) = random_like([colors])
+    colors.backward(cotangent)
+    expected.backward(cotangent.double())
+    if held == 0:
+        assert not ours[0].grad.any()
+    else:
+        assert relative_error(ours[0].grad, theirs[0].grad) < 1e-5
+    assert relative_error(ours[1].grad, theirs[1].grad) < 1e-6
+
+
+@pytest.mark.parametrize("degree", range(3))
+def test_a_lower_degree_ignores_the_higher_bases(degree):
+    means, sh = inputs(3)
+    sh.requires_grad_()
+    bases = (degree + 1) ** 2
+    colors = spherical_harmonics(means, sh, VIEW, degree=degree)
+    colors.sum().backward()
+    assert torch.equal(colors, spherical_harmonics(means, sh[:, :bases].contiguous(), VIEW))
+    assert sh.grad[:, :bases].any()
+    assert not sh.grad[:, bases:].any()
+
+
+def test_culled_gaussians_stay_black_and_get_no_gradient():
+    means, sh = (t.clone().requires_grad_() for t in inputs())
+    radii = torch.ones(60, 2, dtype=torch.int32)
+    radii[::2] = 0
+    colors = spherical_harmonics(means, sh, VIEW, radii=radii)
+    colors.sum().backward()
+    for value in (colors, means.grad, sh.grad):
+        assert not value[::2].any()
+        assert value[1::2].any()
+
+
+def test_a_gaussian_at_the_viewpoint_has_finite_colour_and_gradients():
+    means = torch.zeros(1, 3, requires_grad=True)
+    sh = torch.rand(1, 16, 3, requires_grad=True)
+    colors = spherical_harmonics(means, sh, torch.eye(4))
+    colors.sum().backward()
+    assert colors.isfinite().all()
+    assert means.grad.isfinite().all()
+    assert sh.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_few_gaussians_are_enough(num):
+    means, sh = (t.clone().requires_grad_() for t in inputs(num=num))
+    spherical_harmonics(means, sh, VIEW).sum().backward()
+    assert sh.grad.shape == (num, 16, 3)

@@ -1,0 +1,96 @@
+"""Structural similarity."""
+
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from tests.reference.ssim import ssim_map as reference
+from tests.scenes import error, generator, random_like, relative_error
+from warpgs.ops.ssim import ssim, ssim_map
+
+SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2)]
+"""Also higher than one thread's strip, and narrower than the window."""
+
+
+def images(size=(37, 50, 3)):
+    g = generator()
+    mask = torch.rand(size[:2], generator=g) > 0.3
+    mask[0, 0] = True
+    return torch.rand(size, generator=g), torch.rand(size, generator=g), mask
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_map_is_that_of_the_reference(size, masked):
+    image, target, mask = images(size)
+    mask = mask if masked else None
+    assert error(ssim_map(image, target, mask), reference(image.double(), target.double(), mask)) < 4e-6
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_gradient_is_that_of_the_reference(size, masked):
+    image, target, mask = images(size)
+    mask = mask if masked else None
+    double = image.double().requires_grad_()
+    image.requires_grad_()
+    value = ssim_map(image, target, mask)
+    (cotangent,) = random_like([value])
+    value.backward(cotangent)
+    reference(double, target.double(), mask).backward(cotangent.double())
+    assert relative_error(image.grad, double.grad) < 1e-5
+
+
+def test_interior_is_that_of_scikit_image():
+    image, target, _ = images()
+    expected = structural_similarity(
+        image.double().numpy(),
+        target.double().numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )[1]
+    inside = (slice(6, -6), slice(6, -6))
+    assert error(ssim_map(image, target)[inside], torch.from_numpy(expected)[inside]) < 4e-6
+
+
+def test_equal_images_have_similarity_one():
+    image, _, mask = images()
+    assert ssim(image, image).item() == pytest.approx(1, abs=1e-6)
+    assert ssim(image, image, mask).item() == pytest.approx(1, abs=1e-6)
+
+
+def test_pixels_outside_the_mask_do_not_matter_and_get_no_gradient():
+    image, target, mask = images()
+    changed = torch.where(mask[..., None], image, 0.123).requires_grad_()
+    value = ssim(changed, target, mask)
+    value.backward()
+    assert torch.equal(value, ssim(image, target, mask))
+    assert not changed.grad[~mask].any()
+    assert changed.grad[mask].any()
+
+
+def test_an_empty_mask_makes_everything_alike():
+    image, target, mask = images()
+    assert ssim(image, target, torch.zeros_like(mask)).item() == pytest.approx(1, abs=1e-6)
+
+
+def test_the_target_gets_no_gradient():
+    image, target, _ = (t.requires_grad_() if t.is_floating_point() else t for t in images())
+    ssim(image, target).backward()
+    assert image.grad is not None
+    assert target.grad is None
+
+
+def test_the_mean_of_the_map_is_the_similarity():
+    image, target, _ = images()
+    assert torch.equal(ssim(image, target), ssim_map(image, target).mean())
+
+
+def test_an_image_without_pixels_is_refused():
+    empty = torch.zeros(0, 5, 3)
+    with pytest.raises(ValueError, match="image must have pixels"):
+        ssim(empty, empty)

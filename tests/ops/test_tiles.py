@@ -1,0 +1,195 @@
+"""Tile binning: every tile's list holds the Gaussians that reach into it, front to back."""
+
+import pytest
+import torch
+
+from tests.scenes import HEIGHT, WIDTH, make_camera, make_splats
+from warpgs.ops import tiles
+from warpgs.ops.compositing import composite
+from warpgs.ops.projection import Projection, project
+from warpgs.ops.rows import Rows
+from warpgs.ops.tape import Run
+
+NUM = 120
+ALPHA_MIN = 1 / 255
+
+
+def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
+    camera, splats = make_camera(width, height), make_splats(num)
+    geometry = splats.means, splats.quats, splats.scales, splats.opacities
+    return project(*geometry, camera.viewmat, camera.K, camera.size)
+
+
+def binned(splats: Projection, width=WIDTH, height=HEIGHT) -> tuple[list[list[int]], int]:
+    """Each tile's list, and how many intersections were counted."""
+    run = Run(torch.device("cpu"), [])
+    rows = Rows(run, splats, torch.zeros(splats.depths.shape[0], 3), False, (width, height))
+    result = tiles.record_tiles(run, rows, (width, height))
+    isects = result.gaussian_from_isect.tolist()
+    return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.demand.item())
+
+
+def greatest_alphas(splats: Projection, width: int, height: int, step: float) -> torch.Tensor:
+    """[N, tiles] greatest alpha over points ``step`` apart in the box of each tile's pixel centres in the image."""
+    mean, opacity = splats.means2d.double(), splats.opacities.double()[:, None, None]
+    a, b, c = (entry[:, None, None] for entry in splats.conics.double().unbind(-1))
+    columns, rows = tiles.num_tiles(width, height)
+    greatest = []
+    for tile in range(columns * rows):
+        left, top = tile % columns * 16, tile // columns * 16
+        x = torch.arange(left + 0.5, min(left + 16, width), step, dtype=torch.float64)
+        y = torch.arange(top + 0.5, min(top + 16, height), step, dtype=torch.float64)
+        dx, dy = mean[:, 0, None, None] - x, mean[:, 1, None, None] - y[:, None]
+        alphas = opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        greatest.append(alphas.flatten(1).max(1).values)
+    return torch.stack(greatest, 1) * (splats.radii[:, :1] > 0)
+
+
+@pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (16, 16), (1, 1), (130, 7)])
+def test_every_gaussian_drawn_in_a_tile_is_in_its_list(size):
+    splats = projected()
+    splats = splats._replace(means2d=splats.means2d * torch.tensor(size) / torch.tensor([WIDTH, HEIGHT]))
+    lists, _ = binned(splats, *size)
+    drawn = greatest_alphas(splats, *size, step=1.0) >= ALPHA_MIN
+    assert drawn.any()
+    for tile, listed in enumerate(lists):
+        assert set(drawn[:, tile].nonzero()[:, 0].tolist()) <= set(listed)
+
+
+def test_a_listed_gaussian_reaches_into_its_tile():
+    splats = projected(64, 48)
+    lists, _ = binned(splats, 64, 48)
+    alphas = greatest_alphas(splats, 64, 48, step=0.125)
+    for tile, listed in enumerate(lists):
+        assert (alphas[listed, tile] >= 0.8 * ALPHA_MIN).all()
+
+
+def test_hardly_a_gaussian_is_listed_in_vain():
+    splats = projected()
+    lists, _ = binned(splats)
+    drawn = (greatest_alphas(splats, WIDTH, HEIGHT, step=1.0) >= ALPHA_MIN).sum().item()
+    listed = sum(map(len, lists))
+    assert drawn <= listed <= 1.05 * drawn
+
+
+def test_lists_are_in_order_of_depth_and_without_repeats():
+    splats = projected()
+    lists, _ = binned(splats)
+    for listed in lists:
+        depths = splats.depths[listed]
+        assert torch.equal(depths, depths.sort().values)
+        assert len(set(listed)) == len(listed)
+
+
+def test_equal_depths_keep_the_order_of_the_input():
+    splats = projected()
+    lists, _ = binned(splats._replace(depths=torch.ones(NUM)))
+    assert any(len(listed) > 5 for listed in lists)
+    for listed in lists:
+        assert listed == sorted(listed)
+
+
+def test_the_demand_is_the_length_of_all_lists():
+    lists, demand = binned(projected())
+    assert sum(map(len, lists)) == demand
+
+
+def test_culled_gaussians_are_in_no_list():
+    splats = projected()
+    gone = torch.arange(NUM) % 3 == 0
+    lists, _ = binned(splats._replace(radii=torch.where(gone[:, None], 0, splats.radii)))
+    assert not any(gone[listed].any() for listed in lists)
+    kept = [[g for g in listed if not gone[g]] for listed in binned(splats)[0]]
+    assert lists == kept
+
+
+def test_a_gaussian_in_a_corner_leaves_the_other_tiles_empty():
+    splats = projected()
+    corner = splats._replace(
+        means2d=torch.full((NUM, 2), 4.0),
+        conics=torch.tensor([[1.0, 0.0, 1.0]]).repeat(NUM, 1),
+        depths=torch.ones(NUM),
+        radii=torch.full((NUM, 2), 4, dtype=torch.int32),
+        opacities=torch.full((NUM,), 0.9),
+    )
+    lists, _ = binned(corner)
+    assert [len(listed) for listed in lists] == [NUM] + [0] * 11
+
+
+def test_no_gaussians_make_empty_lists():
+    lists, demand = binned(Projection(*(t[:0] for t in projected())))
+    assert lists == [[]] * 12
+    assert demand == 0
+
+
+def test_all_gaussians_culled_make_empty_lists():
+    splats = projected()
+    lists, demand = binned(splats._replace(radii=torch.zeros_like(splats.radii)))
+    assert lists == [[]] * 12
+    assert demand == 0
+
+
+class _Unlearned(torch.Tensor):
+    """A counter that cannot be told how much will be needed."""
+
+    def copy_(self, *_):
+        return self
+
+
+@pytest.fixture
+def too_small(monkeypatch):
+    """Buffers hold no more than one intersection for each Gaussian."""
+
+    def budget(device, _width, _height):
+        result = tiles._Budget(device)
+        result.demand = result.demand.as_subclass(_Unlearned)
+        return result
+
+    monkeypatch.setattr(tiles, "_budget", budget)
+
+
+def drawn_with_gradients():
+    splats = projected()
+    leaves = [t.clone().requires_grad_() for t in splats[:4]]
+    colors = torch.rand(NUM, 3, generator=torch.Generator().manual_seed(5)).requires_grad_()
+    image = composite(Projection(*leaves, splats.radii), colors, (WIDTH, HEIGHT)).images[0]
+    image.square().sum().backward()
+    return [image.detach(), *(t.grad for t in (leaves[0], leaves[1], leaves[3], colors))]
+
+
+def test_the_slow_way_of_full_buffers_draws_the_same(request):
+    _, demand = binned(projected())
+    assert demand > NUM
+    expected = drawn_with_gradients()
+    request.getfixturevalue("too_small")
+    actual = drawn_with_gradients()
+    for a, e in zip(actual, expected, strict=True):
+        assert torch.equal(a, e)
+
+
+def test_full_buffers_make_every_tile_look_at_all_gaussians_in_depth_order(too_small):
+    splats = projected()
+    lists, demand = binned(splats)
+    assert demand > NUM
+    keys = torch.where(splats.radii[:, 0] > 0, splats.depths, torch.inf)
+    assert lists == [keys.argsort(stable=True).tolist()] * 12
+
+
+def test_the_next_budget_covers_what_was_needed_and_little_more():
+    budget = tiles._Budget(torch.device("cpu"))
+    for demand in (0, 5_000, 123_457, 40):
+        budget.demand.fill_(demand)
+        capacity = budget.capacity(3_000)
+        wanted = max(demand * tiles.HEADROOM, 3_000)
+        assert capacity >= wanted
+        assert demand == 40 or capacity <= 1.13 * wanted
+
+
+def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
+    splats = projected()
+    few = torch.arange(NUM) % 10 == 0
+    names = few.nonzero()[:, 0].tolist()
+    lists, _ = binned(Projection(*(t[few].contiguous() for t in splats)))
+    assert [[names[g] for g in listed] for listed in lists] == [
+        [g for g in listed if few[g]] for listed in binned(splats)[0]
+    ]

@@ -1,0 +1,95 @@
+"""Small random scenes away from every cut-off, and how results are compared."""
+
+import dataclasses
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.scene.splats import Splats
+
+WIDTH, HEIGHT = 50, 37
+GEOMETRY = ("means", "quats", "scales", "opacities")
+
+
+def generator(seed: int = 3) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def make_camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
+    """Turned and moved, with two focal lengths and a principal point off the middle."""
+    turn = torch.tensor(0.2)
+    viewmat = torch.eye(4)
+    viewmat[0, 0] = viewmat[2, 2] = torch.cos(turn)
+    viewmat[0, 2], viewmat[2, 0] = torch.sin(turn), -torch.sin(turn)
+    viewmat[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
+    K = torch.tensor([[45.0, 0.0, 27.3], [0.0, 43.0, 16.1], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, width, height)
+
+
+def make_splats(num: int = 60, seed: int = 3, channels: int | None = None, degree: int = 3) -> Splats:
+    """With harmonics of a degree or, if a number of channels is given, with plain colours."""
+    g = generator(seed)
+    corner, size = torch.tensor([-2.0, -1.5, 1.5]), torch.tensor([4.0, 3.0, 4.0])
+    means = torch.rand(num, 3, generator=g) * size + corner
+    quats = torch.randn(num, 4, generator=g)
+    scales = torch.exp(torch.randn(num, 3, generator=g) * 0.6 - 1.8)
+    opacities = torch.rand(num, generator=g) * 0.9 + 0.05
+    is_dynamic = torch.rand(num, generator=g) > 0.5
+    if channels is not None:
+        colors = torch.rand(num, channels, generator=g)
+        return Splats(means, quats, scales, opacities, colors=colors, is_dynamic=is_dynamic)
+    sh = torch.randn(num, (degree + 1) ** 2, 3, generator=g) * 0.3
+    return Splats(means, quats, scales, opacities, sh=sh, is_dynamic=is_dynamic)
+
+
+def float_tensors(splats: Splats) -> dict[str, Tensor]:
+    """The differentiable tensors of splats by name."""
+    named = {name: getattr(splats, name) for name in Splats.tensor_names()}
+    return {name: t for name, t in named.items() if t is not None and t.is_floating_point()}
+
+
+def as_leaves(splats: Splats) -> Splats:
+    """A copy whose tensors want gradients."""
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in float_tensors(splats).items()}
+    return dataclasses.replace(splats, **leaves)
+
+
+def as_doubles(splats: Splats) -> dict[str, Tensor]:
+    """Double precision copies that want gradients, as the reference takes them."""
+    return {name: t.detach().double().requires_grad_() for name, t in float_tensors(splats).items()}
+
+
+def gradients(splats: Splats) -> dict[str, Tensor]:
+    return {name: t.grad for name, t in float_tensors(splats).items()}
+
+
+def chosen(splats: Splats, index: Tensor) -> Splats:
+    """The Gaussians of an index or mask."""
+    named = {name: getattr(splats, name) for name in Splats.tensor_names()}
+    return dataclasses.replace(splats, **{name: t[index].contiguous() for name, t in named.items() if t is not None})
+
+
+def random_like(tensors: Iterable[Tensor], seed: int = 11) -> list[Tensor]:
+    """A random cotangent for each tensor."""
+    g = generator(seed)
+    return [torch.randn(t.shape, generator=g) for t in tensors]
+
+
+def pulled(values: Iterable[Tensor], cotangents: Iterable[Tensor]) -> Tensor:
+    """The scalar whose gradient is the cotangents pulled back."""
+    return sum((v * c).sum() for v, c in zip(values, cotangents, strict=True))
+
+
+def error(actual: Tensor, expected: Tensor) -> float:
+    """Largest absolute difference."""
+    assert actual.shape == expected.shape
+    return (actual - expected).abs().max().item()
+
+
+def relative_error(actual: Tensor, expected: Tensor) -> float:
+    """Length of the difference relative to the length of what is expected, which must not be zero."""
+    assert actual.shape == expected.shape
+    assert expected.norm() > 0
+    return ((actual - expected).norm() / expected.norm()).item()

@@ -1,0 +1,109 @@
+"""The rules that keep the packages apart, read from the sources."""
+
+import ast
+from pathlib import Path
+
+import jaxtyping
+import pytest
+import torch
+
+from warpgs.ops.covariance import covariance
+
+ROOT = Path(__file__).parent.parent
+ORDER = [{"config"}, {"kernels"}, {"ops"}, {"cameras", "scene"}, {"render"}, {"bench", "cli"}]
+"""A module may import from its own group and from those before it."""
+
+LONGEST_FILE = 400
+
+FILES = sorted([*(ROOT / "kernels").rglob("*.py"), *(ROOT / "warpgs").rglob("*.py")])
+PATHS = pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+
+
+def module_name(path: Path) -> list[str]:
+    """['warpgs', 'ops', 'tape'] of a source file; kernels are installed inside the package."""
+    parts = list(path.relative_to(ROOT).with_suffix("").parts)
+    return parts if parts[0] == "warpgs" else ["warpgs", *parts]
+
+
+def imports(path: Path) -> list[str]:
+    """Absolute names of everything that a file imports."""
+    package = module_name(path)[:-1]
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*start, *([node.module] if node.module else [])])
+            names += [f"{origin}.{alias.name}" for alias in node.names]
+    return names
+
+
+def group(parts: list[str]) -> int | None:
+    if len(parts) < 2:
+        return None
+    name = parts[1].split("_")[0]  # bench_report goes with bench
+    return next((k for k, names in enumerate(ORDER) if name in names), None)
+
+
+def test_every_module_has_its_place_in_the_order():
+    assert FILES
+    assert [str(p) for p in FILES if p.name != "__init__.py" and group(module_name(p)) is None] == []
+
+
+@PATHS
+def test_a_module_imports_only_from_its_left(path):
+    own = group(module_name(path))
+    for name in imports(path):
+        parts = name.split(".")
+        if parts[0] == "warpgs" and own is not None:
+            found = group(parts)
+            assert found is not None, name
+            assert found <= own, name
+
+
+@PATHS
+def test_only_kernels_and_ops_know_warp(path):
+    if module_name(path)[1] not in ("kernels", "ops"):
+        assert not [name for name in imports(path) if name.split(".")[0] == "warp"]
+
+
+@PATHS
+def test_the_package_imports_no_test(path):
+    assert not [name for name in imports(path) if name.split(".")[0] == "tests"]
+
+
+@PATHS
+def test_no_file_is_long(path):
+    assert len(path.read_text().splitlines()) <= LONGEST_FILE
+
+
+def test_annotated_shapes_are_checked_while_tests_run():
+    with pytest.raises(jaxtyping.TypeCheckError):
+        covariance(torch.ones(5, 3), torch.ones(5, 3))
+
+
+def defines_kernels(path: Path) -> bool:
+    decorators = [
+        ast.unparse(decorator)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        for decorator in node.decorator_list
+    ]
+    return any(name.startswith("wp.kernel") for name in decorators)
+
+
+def test_every_file_of_kernels_has_an_op_of_the_same_name():
+    kernels = [p for p in (ROOT / "kernels").glob("*.py") if defines_kernels(p)]
+    ops = {p.stem for p in (ROOT / "warpgs" / "ops").glob("*.py")}
+    assert len(kernels) > 5
+    assert {p.stem.removesuffix("_fwd").removesuffix("_bwd") for p in kernels} <= ops
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if "warpgs" in p.relative_to(ROOT).parts], ids=lambda p: p.stem)
+def test_public_names_have_docstrings(path):
+    tree = ast.parse(path.read_text())
+    assert ast.get_docstring(tree)
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            assert ast.get_docstring(node), node.name

@@ -1,0 +1,90 @@
+"""How a render behaves as a node of torch's autograd: twice, changed in place, freed."""
+
+import gc
+import weakref
+
+import pytest
+import torch
+
+from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
+from warpgs.ops import tape
+from warpgs.render import render
+
+CAMERA = make_camera()
+
+
+def test_going_back_twice_gives_the_same_gradients():
+    splats = as_leaves(make_splats())
+    loss = render(splats, CAMERA).joint.image.square().sum()
+    tensors = list(float_tensors(splats).values())
+    first = torch.autograd.grad(loss, tensors, retain_graph=True)
+    second = torch.autograd.grad(loss, tensors)
+    for a, b in zip(first, second, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_going_back_adds_to_gradients_that_are_there():
+    splats = as_leaves(make_splats())
+    loss = render(splats, CAMERA).joint.image.square().sum()
+    loss.backward(retain_graph=True)
+    once = {name: g.clone() for name, g in gradients(splats).items()}
+    loss.backward()
+    for name, gradient in gradients(splats).items():
+        assert torch.equal(gradient, 2 * once[name])
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
+def test_a_parameter_changed_in_place_before_going_back_is_an_error(name):
+    splats = as_leaves(make_splats())
+    loss = render(splats, CAMERA).joint.image.sum()
+    with torch.no_grad():
+        getattr(splats, name).add_(0.01)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_gradients_go_on_to_what_the_parameters_came_from():
+    splats = make_splats()
+    raw = splats.scales.log().requires_grad_()
+    leaf = as_leaves(splats)
+    render(leaf, CAMERA).joint.image.sum().backward()
+    through = type(splats)(splats.means, splats.quats, raw.exp(), splats.opacities, sh=splats.sh)
+    render(through, CAMERA).joint.image.sum().backward()
+    assert (raw.grad - leaf.scales.grad * leaf.scales.detach()).norm() <= 1e-5 * raw.grad.norm()
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Weak references to every run that is made, while nothing but reference counts frees memory."""
+    seen = []
+    make = tape.Run.__init__
+
+    def made(self, *args, **options):
+        seen.append(weakref.ref(self))
+        make(self, *args, **options)
+
+    monkeypatch.setattr(tape.Run, "__init__", made)
+    gc.collect()
+    gc.disable()
+    yield seen
+    gc.enable()
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_a_render_is_freed_with_its_images(runs, backward):
+    splats = as_leaves(make_splats())
+    for _ in range(3):
+        image = render(splats, CAMERA).joint.image
+        if backward:
+            image.sum().backward()
+        freed = weakref.ref(image)
+        del image
+        assert freed() is None
+    assert len(runs) == 3
+    assert [run() for run in runs] == [None] * 3
+
+
+def test_a_render_without_gradients_keeps_nothing(runs):
+    with torch.no_grad():
+        render(make_splats(), CAMERA)
+    assert [run() for run in runs] == [None]

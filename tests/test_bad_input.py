@@ -1,0 +1,236 @@
+"""What nobody should pass: it is refused by name, or the image and all gradients stay finite."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.scenes import GEOMETRY, as_leaves, chosen, float_tensors, gradients, make_camera, make_splats
+from warpgs.cameras import Camera
+from warpgs.config import RenderSettings
+from warpgs.ops.ssim import ssim
+from warpgs.render import render
+from warpgs.scene.splats import Splats
+
+pytestmark = pytest.mark.usefixtures("contracts_off")
+CAMERA = make_camera()
+TENSORS = [*GEOMETRY, "sh"]
+ODD = torch.arange(60) % 4 == 1
+"""The Gaussians that get the odd values."""
+
+
+def changed(name, value) -> Splats:
+    return dataclasses.replace(make_splats(), **{name: value})
+
+
+def odd(**values) -> Splats:
+    """The random scene with odd values in every fourth Gaussian."""
+    splats = make_splats()
+    for name, value in values.items():
+        tensor = getattr(splats, name).clone()
+        tensor[ODD] = torch.as_tensor(value, dtype=tensor.dtype)
+        splats = dataclasses.replace(splats, **{name: tensor})
+    return splats
+
+
+def drawn(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
+    """The image, after a look at it and at all gradients."""
+    splats = as_leaves(splats)
+    image = render(splats, camera, torch.full((3,), 0.2)).joint.image
+    image.square().sum().backward()
+    assert image.isfinite().all()
+    for name, gradient in gradients(splats).items():
+        assert gradient.isfinite().all(), name
+    return image.detach()
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_a_wrong_number_of_gaussians_is_refused_by_name(name):
+    with pytest.raises(ValueError, match=r"N = \d+"):
+        changed(name, getattr(make_splats(59), name))
+
+
+@pytest.mark.parametrize("name", TENSORS)
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda t: t[..., None],
+        lambda t: t.sum(),
+        lambda t: t.double(),
+        lambda t: t.half(),
+        lambda t: t.int(),
+        lambda t: t.repeat_interleave(2, dim=0)[::2],
+        lambda t: t.tolist(),
+        lambda t: t.numpy(),
+    ],
+    ids=["axis more", "scalar", "double", "half", "int", "not contiguous", "list", "array"],
+)
+def test_a_tensor_that_does_not_fit_is_refused_by_name(name, spoil):
+    with pytest.raises(ValueError, match=f"^{name} must"):
+        changed(name, spoil(getattr(make_splats(), name)))
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales"])
+def test_a_wrong_width_is_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"{name} must have shape"):
+        changed(name, torch.ones(60, 5))
+
+
+@pytest.mark.parametrize("bases", [0, 2, 15, 25])
+def test_harmonics_of_no_degree_are_refused(bases):
+    with pytest.raises(ValueError, match="sh must have shape"):
+        changed("sh", torch.ones(60, bases, 3))
+
+
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_a_degree_that_the_harmonics_do_not_hold_is_refused(degree):
+    with pytest.raises(ValueError, match="sh_degree"):
+        changed("sh_degree", degree)
+
+
+def test_colours_and_harmonics_together_or_neither_are_refused():
+    with pytest.raises(ValueError, match="exactly one of colors and sh"):
+        changed("colors", torch.ones(60, 3))
+    with pytest.raises(ValueError, match="exactly one of colors and sh"):
+        changed("sh", None)
+
+
+def test_colours_without_channels_are_refused():
+    with pytest.raises(ValueError, match="colors must have at least one channel"):
+        make_splats(channels=0)
+
+
+def test_a_branch_that_is_not_boolean_is_refused():
+    with pytest.raises(ValueError, match="is_dynamic must"):
+        changed("is_dynamic", torch.ones(60))
+
+
+def test_a_tensor_on_another_device_is_refused():
+    with pytest.raises(ValueError, match="must be on a CPU or CUDA device"):
+        make_splats().to("meta")
+    with pytest.raises(ValueError, match="quats on meta"):
+        changed("quats", torch.ones(60, 4, device="meta"))
+
+
+@pytest.mark.parametrize("background", [torch.zeros(4), torch.zeros(1, 3), torch.zeros(3).double(), 0.5])
+def test_a_background_that_does_not_fit_is_refused(background):
+    with pytest.raises(ValueError, match="background must"):
+        render(make_splats(), CAMERA, background)
+
+
+@pytest.mark.parametrize(("name", "shape"), [("viewmat", (3, 4)), ("K", (4, 4))])
+def test_a_camera_matrix_that_does_not_fit_is_refused(name, shape):
+    with pytest.raises(ValueError, match=f"{name} must"):
+        dataclasses.replace(CAMERA, **{name: torch.ones(shape)})
+
+
+@pytest.mark.parametrize("name", ["width", "height"])
+@pytest.mark.parametrize("value", [-1, 32769, 12.0, True, None])
+def test_an_image_size_that_makes_no_sense_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        dataclasses.replace(CAMERA, **{name: value})
+
+
+def test_images_of_two_sizes_are_not_compared():
+    with pytest.raises(ValueError, match="target must have shape"):
+        ssim(torch.ones(5, 6, 3), torch.ones(6, 5, 3))
+    with pytest.raises(ValueError, match="mask must be"):
+        ssim(torch.ones(5, 6, 3), torch.ones(5, 6, 3), torch.ones(5, 6))
+
+
+@pytest.mark.parametrize("size", [(0, 0), (0, 7), (7, 0), (1, 1)])
+def test_an_image_without_or_with_one_pixel_can_be_drawn(size):
+    assert drawn(make_splats(), make_camera(*size)).shape == (size[1], size[0], 3)
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_none_or_one_gaussian_can_be_drawn(num):
+    drawn(make_splats(num))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("entry", ["one", "all"])
+@pytest.mark.parametrize("name", TENSORS)
+def test_a_gaussian_that_is_not_finite_leaves_the_image_as_if_it_were_not_there(name, entry, value):
+    splats = make_splats()
+    tensor = getattr(splats, name).clone()
+    (tensor if entry == "all" else tensor.view(60, -1)[:, 0])[ODD] = value
+    image = drawn(dataclasses.replace(splats, **{name: tensor}))
+    assert torch.equal(image, drawn(chosen(splats, ~ODD)))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+@pytest.mark.parametrize("channel", [0, 2])
+def test_a_colour_that_is_not_finite_leaves_the_image_as_if_it_were_not_there(channel, value):
+    splats = make_splats(channels=3)
+    expected = drawn(chosen(splats, ~ODD))
+    splats.colors[ODD, channel] = value
+    assert torch.equal(drawn(splats), expected)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"quats": 0.0},
+        {"means": [0.0, 0.0, -5.0]},
+        {"opacities": 0.0},
+        {"opacities": -0.5},
+        {"opacities": 1.5},
+        {"opacities": 1e30},
+        {"means": 1e30},
+        {"scales": 1e30},
+        {"scales": 1e12},
+    ],
+    ids=str,
+)
+def test_a_gaussian_that_cannot_be_drawn_leaves_the_image_as_if_it_were_not_there(values):
+    assert torch.equal(drawn(odd(**values)), drawn(chosen(make_splats(), ~ODD)))
+
+
+def test_a_gaussian_exactly_at_the_camera_is_not_drawn():
+    center = -CAMERA.viewmat[:3, :3].T @ CAMERA.viewmat[:3, 3]
+    assert torch.equal(drawn(odd(means=center)), drawn(chosen(make_splats(), ~ODD)))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"scales": 0.0},
+        {"scales": 1e-30},
+        {"scales": [0.0, 0.1, 0.1]},
+        {"scales": -0.1},
+        {"scales": [1e-8, 1e-8, 1e3]},
+        {"scales": [1e-8, 1e3, 1e3]},
+        {"scales": [1e3, 1e-8, 0.1]},
+        {"scales": 1e4},
+        {"opacities": 1.0},
+        {"quats": 1e-15},
+        {"quats": 1e15},
+        {"sh": 1e6},
+        {"scales": 1e4, "opacities": 1.0},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("antialias", [False, True])
+def test_extreme_gaussians_leave_image_and_gradients_finite(values, antialias):
+    splats = as_leaves(odd(**values))
+    image = render(splats, CAMERA, settings=RenderSettings(antialias=antialias)).joint.image
+    image.sum().backward()
+    assert image.isfinite().all()
+    for name, gradient in gradients(splats).items():
+        assert gradient.isfinite().all(), name
+    assert gradients(splats)["means"][~ODD].any()
+
+
+def test_gaussians_that_cover_the_image_show_their_colour_everywhere():
+    splats = make_splats(1, channels=3)
+    splats = dataclasses.replace(splats, scales=torch.full((1, 3), 1e4), opacities=torch.ones(1))
+    image = render(splats, CAMERA).joint.image
+    assert (image - 0.999 * splats.colors).abs().max() < 1e-4
+    assert set(float_tensors(splats)) == {*GEOMETRY, "colors"}
+
+
+@pytest.mark.parametrize("name", ["viewmat", "K"])
+def test_a_camera_that_is_not_finite_draws_the_background(name):
+    camera = dataclasses.replace(CAMERA, **{name: torch.full_like(getattr(CAMERA, name), float("nan"))})
+    assert torch.equal(drawn(make_splats(), camera), torch.full((37, 50, 3), 0.2))

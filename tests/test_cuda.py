@@ -1,0 +1,76 @@
+"""The GPU draws what the CPU draws."""
+
+import pytest
+import torch
+
+from tests.scenes import as_leaves, gradients, make_camera, make_splats, pulled, random_like, relative_error
+from warpgs.config import RenderSettings
+from warpgs.ops.ssim import ssim_map
+from warpgs.render import render
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+SETTINGS = [
+    RenderSettings(),
+    RenderSettings(branches=True, statistics=True, absgrad=True),
+    RenderSettings(depth=True, antialias=True),
+]
+
+
+def drawn(device, settings, channels=None):
+    splats = as_leaves(make_splats(200, channels=channels).to(device))
+    camera = make_camera().to(device)
+    behind = torch.linspace(0.1, 0.8, splats.num_channels, device=device)
+    result = render(splats, camera, behind, settings)
+    layers = [layer for layer in (result.joint, result.static, result.dynamic) if layer is not None]
+    outputs = [value for layer in layers for value in layer if value is not None]
+    if settings.depth:  # where hardly anything was drawn, depth divides by next to nothing
+        outputs[-1] = outputs[-1] * layers[0].alpha.detach()
+    pulled(outputs, [c.to(device) for c in random_like(outputs)]).backward()
+    statistics = [result.gradient_norms, *([result.weights] if settings.statistics else [])]
+    return [t.detach().cpu() for t in (*outputs, *statistics, *gradients(splats).values())]
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth"])
+def test_images_and_gradients_are_those_of_the_cpu(settings):
+    for actual, expected in zip(drawn("cuda", settings), drawn("cpu", settings), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_five_channels_are_those_of_the_cpu():
+    for actual, expected in zip(drawn("cuda", SETTINGS[0], 5), drawn("cpu", SETTINGS[0], 5), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_similarity_and_its_gradient_are_those_of_the_cpu():
+    values = []
+    for device in ("cpu", "cuda"):
+        torch.manual_seed(0)
+        image, target = (torch.rand(70, 50, 3).to(device).requires_grad_(k == 0) for k in range(2))
+        similarity = ssim_map(image, target)
+        similarity.square().sum().backward()
+        values.append([similarity.detach().cpu(), image.grad.cpu()])
+    for expected, actual in zip(*values, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_an_empty_scene_is_background():
+    behind = torch.tensor([0.1, 0.2, 0.3], device="cuda")
+    image = render(make_splats(0).to("cuda"), make_camera().to("cuda"), behind).joint.image
+    assert torch.equal(image, behind.expand_as(image))
+
+
+def test_a_render_can_be_captured_and_replayed():
+    splats, camera = make_splats().to("cuda"), make_camera().to("cuda")
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.no_grad(), torch.cuda.stream(stream):
+        for _ in range(3):
+            render(splats, camera)
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        image = render(splats, camera).joint.image
+    splats.means.add_(0.1)
+    graph.replay()
+    torch.cuda.synchronize()
+    assert relative_error(image, render(splats, camera).joint.image) < 1e-6

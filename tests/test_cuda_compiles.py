@@ -1,0 +1,52 @@
+"""Every kernel compiles for CUDA, also on a machine without a GPU."""
+
+import importlib
+
+import pytest
+import warp as wp
+
+from warpgs.kernels.compositing_bwd import make_composite_bwd
+from warpgs.kernels.compositing_fwd import make_composite_fwd
+from warpgs.kernels.rows import make_pack, make_unpack
+from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
+from warpgs.ops.compositing import CUDA_PIXELS
+
+ARCH = 90
+IMAGES = [(1, 1), (1, 3), (3, 3)]
+"""Walked for and written."""
+
+
+def assert_compiles(module, folder):
+    wp.compile_aot_module(module, arch=ARCH, module_dir=folder, use_ptx=True)
+    (ptx,) = folder.glob("*.ptx")
+    assert f".target sm_{ARCH}" in ptx.read_text()
+
+
+@pytest.mark.parametrize("name", ["covariance", "projection", "sh", "tiles"])
+def test_a_module_of_kernels_compiles(name, tmp_path):
+    assert_compiles(importlib.import_module(f"warpgs.kernels.{name}"), tmp_path)
+
+
+@pytest.mark.parametrize("make", [make_pack, make_unpack])
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_rows_compile(make, with_depth, tmp_path):
+    assert_compiles(make(3, with_depth).module, tmp_path)
+
+
+@pytest.mark.parametrize("make", [make_ssim_fwd, make_ssim_bwd])
+@pytest.mark.parametrize("with_mask", [False, True])
+def test_ssim_compiles(make, with_mask, tmp_path):
+    assert_compiles(make(with_mask).module, tmp_path)
+
+
+@pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])
+@pytest.mark.parametrize("flag", [False, True])
+@pytest.mark.parametrize(("images", "outputs"), IMAGES)
+def test_compositing_compiles(make, flag, images, outputs, tmp_path):
+    assert_compiles(make(3, images, outputs, CUDA_PIXELS, flag).module, tmp_path)
+
+
+@pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])
+@pytest.mark.parametrize("channels", [1, 9])
+def test_compositing_compiles_for_other_channels(make, channels, tmp_path):
+    assert_compiles(make(channels, 1, 1, CUDA_PIXELS, False).module, tmp_path)

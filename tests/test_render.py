@@ -1,0 +1,239 @@
+"""The whole render against the float64 reference: images, statistics, gradients."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.reference import projection as reference_projection
+from tests.reference.render import render as reference
+from tests.scenes import (
+    GEOMETRY,
+    HEIGHT,
+    WIDTH,
+    as_doubles,
+    as_leaves,
+    chosen,
+    error,
+    float_tensors,
+    gradients,
+    make_camera,
+    make_splats,
+    pulled,
+    random_like,
+    relative_error,
+)
+from warpgs.config import RenderSettings
+from warpgs.render import render
+
+CAMERA = make_camera()
+EVERYTHING = RenderSettings(branches=True, statistics=True)
+
+
+def background(channels=3):
+    return torch.linspace(0.1, 0.8, channels)
+
+
+def outputs(rendering):
+    layers = [layer for layer in (rendering.joint, rendering.static, rendering.dynamic) if layer is not None]
+    return [layer.image for layer in layers] + [layer.alpha for layer in layers]
+
+
+def reference_outputs(splats, behind, branches=True, antialias=False):
+    masks = (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,)
+    doubles = as_doubles(splats)
+    results = [reference(doubles, CAMERA, behind, drawn=mask, antialias=antialias) for mask in masks]
+    return doubles, [r[0] for r in results] + [r[1] for r in results], results[0][2]
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("channels", [None, 3])
+def test_images_statistics_and_gradients_are_those_of_the_reference(channels, antialias):
+    splats = as_leaves(make_splats(channels=channels))
+    behind, behind64 = background().requires_grad_(), background().double().requires_grad_()
+    result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, antialias=antialias))
+    doubles, expected, weights = reference_outputs(splats, behind64, antialias=antialias)
+    for actual, wanted in zip(outputs(result), expected, strict=True):
+        assert error(actual, wanted) < 2e-6
+    assert relative_error(result.weights, weights.sum((1, 2))) < 2e-6
+    assert torch.equal(result.contributed, weights.sum((1, 2)) > 0)
+    cotangents = random_like(expected)
+    pulled(outputs(result), cotangents).backward()
+    pulled(expected, cotangents).backward()
+    for name, gradient in gradients(splats).items():
+        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
+    assert relative_error(behind.grad, behind64.grad) < 1e-5
+
+
+def test_the_joint_image_is_the_same_with_and_without_branches():
+    splats = make_splats()
+    alone, together = render(splats, CAMERA), render(splats, CAMERA, settings=EVERYTHING)
+    assert error(alone.joint.image, together.joint.image) < 1e-6
+    assert alone.static is None
+    assert alone.weights is None
+
+
+def smooth_splats():
+    """So wide that each is drawn in every pixel, so faint that none is hidden: no cut-off makes the image jump."""
+    splats = make_splats(12)
+    return dataclasses.replace(splats, scales=10 * splats.scales.clamp(min=0.2), opacities=0.1 + 0.3 * splats.opacities)
+
+
+def test_a_scene_without_cut_offs_draws_every_gaussian_in_every_pixel():
+    _, _, weights = reference_outputs(smooth_splats(), background().double())
+    assert weights.min() > 1e-4
+
+
+@pytest.mark.parametrize("branches", [False, True])
+@pytest.mark.parametrize("name", [*GEOMETRY, "sh"])
+def test_gradients_predict_what_a_small_step_does(name, branches):
+    """Central differences along the gradient; the step is small against the scene, large against float32."""
+    splats = as_leaves(smooth_splats())
+    settings = EVERYTHING if branches else None
+
+    def loss(scene):
+        rendering = render(scene, CAMERA, background(), settings)
+        return sum(value.double().square().sum() for value in outputs(rendering))
+
+    loss(splats).backward()
+    gradient = gradients(splats)[name]
+    value = getattr(splats, name).detach()
+    direction = gradient / gradient.norm()
+    step = 1e-2 * value.norm() / value.numel() ** 0.5
+    sides = [loss(dataclasses.replace(splats, **{name: value + sign * step * direction})) for sign in (1, -1)]
+    slope = ((sides[0] - sides[1]) / (2 * step)).item()
+    assert slope == pytest.approx(gradient.norm().item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("channels", [1, 5])
+def test_any_number_of_channels_can_be_drawn(channels):
+    splats = as_leaves(make_splats(channels=channels))
+    result = render(splats, CAMERA, background(channels))
+    doubles, expected, _ = reference_outputs(splats, background(channels).double(), branches=False)
+    assert error(result.joint.image, expected[0]) < 2e-6
+    cotangents = random_like(expected[:1])
+    pulled([result.joint.image], cotangents).backward()
+    pulled(expected[:1], cotangents).backward()
+    for name, gradient in gradients(splats).items():
+        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
+
+
+def test_depth_is_the_mean_of_what_was_drawn_with_its_gradient():
+    splats = as_leaves(make_splats())
+    result = render(splats, CAMERA, background(), RenderSettings(depth=True)).joint
+    doubles = as_doubles(splats)
+    viewmat = CAMERA.viewmat.double()
+    depths = doubles["means"] @ viewmat[2, :3] + viewmat[2, 3]
+    drawn, alpha, _ = reference({**doubles, "colors": depths[:, None]}, CAMERA, torch.zeros(1, dtype=torch.float64))
+    expected = drawn[..., 0] / alpha.clamp_min(1e-6)
+    empty = alpha == 0
+    assert not result.depth[empty].any()
+    assert relative_error(result.depth, expected) < 1e-5
+    plain = render(splats, CAMERA, background()).joint
+    assert torch.equal(result.image, plain.image)
+    weight = random_like([expected])[0] * alpha.detach()  # smooth, where dividing by alpha is not
+    pulled([result.depth], [weight.float()]).backward()
+    pulled([expected], [weight.float()]).backward()
+    for name in GEOMETRY:
+        assert relative_error(gradients(splats)[name], doubles[name].grad) < 1e-5, name
+
+
+@pytest.mark.parametrize("settings", [RenderSettings(absgrad=True), RenderSettings(absgrad=True, branches=True)])
+def test_gradient_norms_are_those_of_the_screen_space_means(settings, monkeypatch):
+    splats = as_leaves(make_splats())
+    kept = []
+    project = reference_projection.project
+
+    def project_and_keep(*args, **options):
+        means2d, *rest = project(*args, **options)
+        means2d.retain_grad()
+        kept.append(means2d)
+        return means2d, *rest
+
+    monkeypatch.setattr(reference_projection, "project", project_and_keep)
+    result = render(splats, CAMERA, background(), settings)
+    assert not result.gradient_norms.any()
+    _, expected, _ = reference_outputs(splats, background().double(), branches=settings.branches)
+    cotangents = random_like(expected)
+    pulled(outputs(result), cotangents).backward()
+    pulled(expected, cotangents).backward()
+    means2d_gradient = sum(m.grad for m in kept) * torch.tensor([WIDTH / 2, HEIGHT / 2])
+    plain, absolute = result.gradient_norms.unbind(-1)
+    assert relative_error(plain, means2d_gradient.norm(dim=-1)) < 1e-5
+    assert (absolute >= plain * (1 - 1e-5)).all()
+    assert absolute.sum() > 1.1 * plain.sum()
+
+
+def test_the_order_of_the_gaussians_does_not_matter():
+    splats, order = as_leaves(make_splats()), torch.randperm(60)
+    shuffled = as_leaves(chosen(splats, order))
+    images = [render(s, CAMERA).joint.image for s in (splats, shuffled)]
+    assert torch.equal(*images)
+    for image in images:
+        image.square().sum().backward()
+    for name, gradient in gradients(splats).items():
+        assert relative_error(gradients(shuffled)[name], gradient[order]) < 1e-6
+
+
+def test_the_same_input_gives_the_same_bits():
+    splats = make_splats()
+    first, second = (render(splats, CAMERA, background(), EVERYTHING) for _ in range(2))
+    for a, b in zip(outputs(first), outputs(second), strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(first.weights, second.weights)
+
+
+def test_culled_gaussians_leave_the_image_unchanged_and_get_zero_gradients():
+    splats = make_splats()
+    culled = torch.arange(60) % 3 == 0
+    means = torch.where(culled[:, None], torch.tensor([0.0, 0.0, -5.0]), splats.means)
+    some = as_leaves(dataclasses.replace(splats, means=means))
+    image = render(some, CAMERA).joint.image
+    image.sum().backward()
+    assert torch.equal(image, render(chosen(splats, ~culled), CAMERA).joint.image)
+    for gradient in gradients(some).values():
+        assert not gradient[culled].any()
+        assert gradient[~culled].any()
+
+
+@pytest.mark.parametrize("settings", [RenderSettings(), EVERYTHING])
+def test_an_empty_scene_is_background(settings):
+    splats, behind = as_leaves(make_splats(0)), background().requires_grad_()
+    result = render(splats, CAMERA, behind, settings)
+    for layer in (result.joint, result.static, result.dynamic):
+        if layer is not None:
+            assert torch.equal(layer.image, behind.expand(HEIGHT, WIDTH, 3))
+            assert not layer.alpha.any()
+    sum(value.sum() for value in outputs(result)).backward()
+    images = 3 if settings.branches else 1
+    assert torch.equal(behind.grad, torch.full((3,), float(images * WIDTH * HEIGHT)))
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_splats_of_one_branch_leave_the_other_image_background(dynamic):
+    splats = dataclasses.replace(make_splats(), is_dynamic=torch.full((60,), dynamic))
+    result = render(splats, CAMERA, background(), EVERYTHING)
+    full, other = (result.dynamic, result.static) if dynamic else (result.static, result.dynamic)
+    assert torch.equal(full.image, result.joint.image)
+    assert torch.equal(other.image, background().expand(HEIGHT, WIDTH, 3))
+
+
+def test_branches_need_to_know_the_branch():
+    splats = dataclasses.replace(make_splats(), is_dynamic=None)
+    with pytest.raises(ValueError, match="is_dynamic"):
+        render(splats, CAMERA, settings=EVERYTHING)
+
+
+def test_rendering_without_gradients_draws_the_same():
+    splats = as_leaves(make_splats())
+    with torch.no_grad():
+        plain = render(splats, CAMERA).joint.image
+    assert not plain.requires_grad
+    assert torch.equal(plain, render(splats, CAMERA).joint.image)
+
+
+def test_a_degree_of_harmonics_can_be_chosen():
+    splats = dataclasses.replace(make_splats(), sh_degree=1)
+    cut = dataclasses.replace(splats, sh=splats.sh[:, :4].contiguous(), sh_degree=None)
+    assert torch.equal(render(splats, CAMERA).joint.image, render(cut, CAMERA).joint.image)
+    assert set(float_tensors(splats)) == {*GEOMETRY, "sh"}

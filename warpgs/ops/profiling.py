@@ -1,0 +1,74 @@
+"""Times of kernels: CUDA events on a GPU, wall time on CPU."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+
+@dataclass
+class KernelTime:
+    """One launch seen by ``profile``: start and duration in milliseconds."""
+
+    name: str
+    start_ms: float
+    duration_ms: float
+
+
+@dataclass
+class Profile:
+    """What ``profile`` gathers; ``times`` waits for the device."""
+
+    _origin: float = field(default_factory=time.perf_counter)
+    _first_event: Any = None
+    _entries: list[tuple[str, Any, Any]] = field(default_factory=list)
+
+    def times(self) -> list[KernelTime]:
+        if self._first_event is not None:
+            torch.cuda.synchronize()
+        result = []
+        for name, begin, end in self._entries:
+            if isinstance(begin, float):
+                result.append(KernelTime(name, (begin - self._origin) * 1e3, (end - begin) * 1e3))
+            else:
+                result.append(KernelTime(name, self._first_event.elapsed_time(begin), begin.elapsed_time(end)))
+        return result
+
+    @contextlib.contextmanager
+    def span(self, name: str, device: torch.device) -> Iterator[None]:
+        if device.type == "cuda":
+            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            begin.record()
+            self._first_event = self._first_event or begin
+            yield
+            end.record()
+            self._entries.append((name, begin, end))
+        else:
+            start = time.perf_counter()
+            yield
+            self._entries.append((name, start, time.perf_counter()))
+
+
+_active_profile: Profile | None = None
+_NOTHING = contextlib.nullcontext()
+
+
+@contextlib.contextmanager
+def profile() -> Iterator[Profile]:
+    """Times every kernel launched inside: CUDA events on a GPU, wall time on CPU."""
+    global _active_profile
+    if _active_profile is not None:
+        raise RuntimeError("a profile is already being taken")
+    _active_profile = Profile()
+    try:
+        yield _active_profile
+    finally:
+        _active_profile = None
+
+
+def span(name: str, device: torch.device) -> contextlib.AbstractContextManager[None]:
+    """Times what runs inside, if a profile is being taken."""
+    return _NOTHING if _active_profile is None else _active_profile.span(name, device)
