@@ -6,7 +6,9 @@ import jaxtyping
 
 # The kernels lie outside this folder and are left out: Warp reads their annotations itself.
 PACKAGE = Path(__file__).parent.parent / "warpgs"
-CHECKED = [f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if not path.stem.startswith("__")]
+CHECKED = [
+    f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if path.stem not in ("__init__", "__pycache__", "kernels")
+]
 jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
 
 import pytest  # noqa: E402
