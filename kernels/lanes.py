@@ -16,9 +16,6 @@ WARP_COLUMNS, WARP_ROWS = 8, 4
 BLOCK_DIM = 128
 """Threads of a block for every kernel that uses the stage; the stage is sized by it."""
 
-STAGE_PARTS = 3
-"""vec4 values that one slot of the stage holds."""
-
 
 def native(cuda: str, cpu: str) -> str:
     """A native snippet that differs between CUDA and CPU."""
@@ -103,8 +100,8 @@ def lane_sum_before(x: int, lane: int) -> int:
 def lane_sync(): ...
 
 
-# The stage: 32 slots of STAGE_PARTS vec4 for each lane group, in shared memory. The address is handed around as an
-# integer because a shared array is only visible in the function that declares it.
+# The stage: 32 slots of three vec4 for each of the four lane groups of a block, in shared memory. The address is
+# handed around as an integer because a shared array is only visible in the function that declares it.
 @wp.func_native(
     native(
         "__shared__ float4 stage[4 * 32 * 3]; return (unsigned long long)(stage + (threadIdx.x >> 5) * 96);",
@@ -144,10 +141,6 @@ def span_end(high: float, size: int) -> int:
 
 @wp.func_native("return exp2f(x);")
 def exp2(x: float) -> float: ...
-
-
-@wp.func_native("return log2f(x);")
-def log2(x: float) -> float: ...
 
 
 # Sums of K values over 32 lanes at little more than one shuffle a value instead of five: at each of the five steps a

@@ -5,13 +5,11 @@ from typing import NamedTuple
 from jaxtyping import Float, Int32
 from torch import Tensor, int32
 
+from warpgs.config import RenderSettings
 from warpgs.kernels import projection as kernels
 
 from .contracts import check_image_size, check_same_device, check_tensor
 from .tape import Run, differentiable
-
-NEAR = 0.01
-"""Default near plane, in scene units."""
 
 
 class Projection(NamedTuple):
@@ -100,7 +98,7 @@ def project(
     K: Float[Tensor, "3 3"],
     size: tuple[int, int],
     *,
-    near: float = NEAR,
+    near: float = RenderSettings.near,
     antialias: bool = False,
 ) -> Projection:
     """Projects Gaussians into a pinhole camera; differentiable in means, quats, scales and opacities.
