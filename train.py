@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -17,14 +18,14 @@ from warpgs.scene.builtin import builtin_camera, builtin_splats
 
 @dataclass(frozen=True)
 class PreviewConfig:
-    """Renders the built-in scene: joint, static and dynamic image and depth, side by side."""
+    """Renders the built-in scene: joint, static and dynamic image and depth, two by two."""
 
     out: Path = Path("runs/builtin")
     """Folder for the pictures."""
     frames: int = 8
     """Moments to render, spread over the scene's time."""
-    device: str = "cuda" if torch.cuda.is_available() else "cpu"
-    """Where to render: cpu or cuda."""
+    device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
+    """Where to render; CUDA if there is a GPU."""
 
 
 def contact_sheet(rendering: Rendering) -> np.ndarray:
@@ -49,7 +50,7 @@ def main(config: PreviewConfig) -> None:
     """Renders the scene at each moment and writes one contact sheet a moment."""
     if config.frames < 1:
         raise ValueError(f"--frames must be at least 1, got {config.frames}")
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
+    if config.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
     config.out.mkdir(parents=True, exist_ok=True)
     print("The trainer does not exist yet: rendering the built-in scene instead.")
@@ -70,4 +71,8 @@ if __name__ == "__main__":
     try:
         main(tyro.cli(PreviewConfig))
     except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        sys.exit(130)
