@@ -33,13 +33,20 @@ def test_an_unknown_option_is_an_error(tmp_path):
 
 
 def test_ctrl_c_stops_without_a_traceback(tmp_path):
-    with subprocess.Popen(
-        [*TRAIN, "--frames", "100000", "--out", str(tmp_path)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-    ) as run:
+    # A job in the background ignores SIGINT and so would what it starts: the handler is put back as a terminal has it.
+    program = (
+        "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    command = [TRAIN[0], "-c", program, *TRAIN[1:], "--frames", "100000", "--out", str(tmp_path)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
         while not (tmp_path / "001.png").exists():
             assert run.poll() is None
             time.sleep(0.05)
         run.send_signal(signal.SIGINT)
-        stderr = run.stderr.read().decode()
-        assert run.wait(timeout=60) == 130
+        try:
+            _, stderr = run.communicate(timeout=60)
+        finally:
+            run.kill()
+    assert run.returncode == 130
     assert "Traceback" not in stderr
