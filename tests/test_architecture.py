@@ -10,7 +10,18 @@ import torch
 from warpgs.ops.covariance import covariance
 
 ROOT = Path(__file__).parent.parent
-ORDER = [{"config"}, {"kernels"}, {"ops"}, {"cameras", "scene"}, {"render"}, {"bench", "cli"}]
+ORDER = [
+    {"config"},
+    {"kernels"},
+    {"ops"},
+    {"cameras", "scene", "fields"},
+    {"data", "render"},
+    {"losses", "metrics", "lpips", "pictures", "optim", "densify", "prune", "depth", "views", "initialize"},
+    {"stages", "checkpoint", "logbook", "interrupt"},
+    {"evaluate", "bench"},
+    {"trainer", "runs"},
+    {"cli"},
+]
 """A module may import from its own group and from those before it."""
 
 LONGEST_FILE = 400

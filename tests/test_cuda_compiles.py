@@ -22,7 +22,7 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-@pytest.mark.parametrize("name", ["covariance", "projection", "sh", "tiles"])
+@pytest.mark.parametrize("name", ["covariance", "projection", "raytrace", "sh", "tiles"])
 def test_a_module_of_kernels_compiles(name, tmp_path):
     assert_compiles(importlib.import_module(f"warpgs.kernels.{name}"), tmp_path)
 

@@ -1,5 +1,7 @@
 """python train.py, as a user starts it."""
 
+import csv
+import json
 import signal
 import subprocess
 import sys
@@ -7,42 +9,137 @@ import time
 from pathlib import Path
 
 import cv2
+import pytest
 
-TRAIN = [sys.executable, str(Path(__file__).parent.parent / "train.py"), "--device", "cpu"]
+from warpgs import checkpoint
+from warpgs.data.synthetic import BuiltinScene, builtin_capture
 
-
-def test_the_built_in_scene_is_rendered_and_said_to_be_all_there_is(tmp_path):
-    run = subprocess.run([*TRAIN, "--frames", "1", "--out", str(tmp_path)], capture_output=True, text=True, check=True)
-    sheet = cv2.imread(str(tmp_path / "000.png"))
-    assert "trainer does not exist yet" in run.stdout
-    assert sheet.shape == (540, 960, 3)
-    assert sheet[:270].std() > 20  # the joint and the static image show something
-    assert abs(sheet[:270, :480].astype(int) - sheet[:270, 480:]).max() > 50  # and the ring is in one only
+SCRIPT = str(Path(__file__).parent.parent / "train.py")
+SMALL = BuiltinScene(width=64, height=36, num_frames=6, num_samples=2, num_points=400)
+QUICK = ["--preset", "quick", "--device", "cpu"]
 
 
-def test_a_wrong_value_is_one_line_and_exit_code_2(tmp_path):
-    run = subprocess.run([*TRAIN, "--frames", "0", "--out", str(tmp_path)], capture_output=True, text=True, check=False)
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return builtin_capture(tmp_path_factory.mktemp("cache"), SMALL, quiet=True)
+
+
+def train(*arguments):
+    return subprocess.run([sys.executable, SCRIPT, *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def finished(data, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return train("--data", data, *QUICK, "--iterations", 40, "--out", folder), folder
+
+
+def test_a_run_ends_with_its_figures_for_people(finished):
+    run, _ = finished
+    assert run.returncode == 0, run.stderr
+    assert "PSNR" in run.stdout
+    assert "LPIPS not measured" in run.stdout
+
+
+def test_a_run_leaves_its_metrics(finished):
+    metrics = json.loads((finished[1] / "metrics.json").read_text())
+    wanted = (
+        "psnr ssim lpips psnr_static psnr_dynamic flicker fps train_seconds num_static num_dynamic iterations commit"
+    )
+    assert set(wanted.split()) <= set(metrics)
+    assert metrics["iterations"] == 40
+    assert metrics["lpips"] is None
+    assert metrics["psnr"] > 10
+
+
+def test_a_run_leaves_metrics_of_every_view(finished):
+    with open(finished[1] / "views.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == ["right_000000", "right_000002", "right_000004"]
+    assert rows[0]["lpips"] == ""
+    assert float(rows[0]["psnr"]) > 10
+
+
+def test_a_run_leaves_pictures_a_video_and_events(finished):
+    folder = finished[1]
+    sheet = cv2.imread(str(folder / "pictures/right_000002.png"))
+    assert sheet.shape[1] == 5 * SMALL.width
+    video = cv2.VideoCapture(str(folder / "time.mp4"))
+    assert video.read()[0]
+    assert list((folder / "events").glob("events*"))
+
+
+def test_a_run_keeps_its_resolved_config(finished):
+    config = json.loads((finished[1] / "config.json").read_text())
+    schedule = config["schedule"]
+    assert schedule["pretrain"] + schedule["stage1"] + schedule["stage2"] == 40
+    assert config["device"] == "cpu"
+
+
+def test_a_finished_run_can_be_evaluated_again(finished):
+    folder = finished[1]
+    before = (folder / "views.csv").read_text()
+    program = "import sys; from warpgs.cli import main; sys.exit(main(sys.argv[1:]))"
+    run = subprocess.run(
+        [sys.executable, "-c", program, "eval", str(folder)], capture_output=True, text=True, check=True
+    )
+    assert "PSNR" in run.stdout
+    assert (folder / "views.csv").read_text() == before
+
+
+def refused(*arguments):
+    run = train(*arguments)
     assert run.returncode == 2
-    assert "--frames must be at least 1, got 0" in run.stderr
-    assert "Traceback" not in run.stderr
+    assert "Traceback" not in run.stderr + run.stdout
+    return run.stderr + run.stdout
 
 
-def test_an_unknown_option_is_an_error(tmp_path):
-    run = subprocess.run([*TRAIN, "--bogus", "1"], capture_output=True, text=True, check=False)
-    assert run.returncode == 2
+def test_a_folder_that_is_no_capture_is_one_line_and_exit_code_2(tmp_path):
+    text = refused("--data", tmp_path, *QUICK)
+    assert "dataset.json is missing" in text
+    assert len([line for line in text.splitlines() if line.startswith("error:")]) == 1
 
 
-def test_ctrl_c_stops_without_a_traceback(tmp_path):
+def test_a_damaged_picture_is_one_line_that_names_it(tmp_path):
+    data = builtin_capture(tmp_path, SMALL, quiet=True)
+    path = data / "rgb/1x/left_000003.png"
+    path.write_bytes(path.read_bytes()[:100])
+    assert "left_000003.png" in refused("--data", data, *QUICK, "--iterations", 40, "--out", tmp_path / "run")
+
+
+def test_an_existing_run_is_not_overwritten(data, finished):
+    assert "is not empty" in refused("--data", data, *QUICK, "--out", finished[1])
+
+
+def test_an_unknown_option_is_an_error():
+    assert "bogus" in refused("--bogus", 1)
+
+
+def test_resuming_takes_no_other_options(finished):
+    assert "leave other options out" in refused("--resume", finished[1], "--seed", 3)
+
+
+def test_resuming_what_is_no_run_is_one_line(tmp_path):
+    assert "is no run folder" in refused("--resume", tmp_path)
+
+
+def test_too_few_iterations_are_refused(data):
+    assert "--iterations must be at least 3" in refused("--data", data, *QUICK, "--iterations", 1)
+
+
+def test_ctrl_c_keeps_what_was_done_and_says_how_to_go_on(data, tmp_path):
     # A job in the background ignores SIGINT and so would what it starts: the handler is put back as a terminal has it.
     program = (
         "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
     )
-    command = [TRAIN[0], "-c", program, *TRAIN[1:], "--frames", "100000", "--out", str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
-        while not (tmp_path / "001.png").exists():
+    folder = tmp_path / "run"
+    options = ["--data", str(data), *QUICK, "--iterations", "100000", "--out", str(folder)]
+    with subprocess.Popen([sys.executable, "-c", program, SCRIPT, *options], stderr=subprocess.PIPE, text=True) as run:
+        while not checkpoint.saved(folder):
             assert run.poll() is None
             time.sleep(0.05)
+        time.sleep(2.0)
         run.send_signal(signal.SIGINT)
         try:
             _, stderr = run.communicate(timeout=60)
@@ -50,3 +147,6 @@ def test_ctrl_c_stops_without_a_traceback(tmp_path):
             run.kill()
     assert run.returncode == 130
     assert "Traceback" not in stderr
+    assert f"--resume {folder}" in stderr
+    facts = checkpoint.load(checkpoint.saved(folder)[-1]).facts
+    assert facts["iteration"] > 0

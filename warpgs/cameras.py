@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from .ops.contracts import check_image_size, check_same_device, check_tensor
@@ -40,6 +40,33 @@ class Camera:
 
     def to(self, device: torch.device | str) -> "Camera":
         return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """Centre of the camera in the world."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def project(
+        self, points: Float[Tensor, "P 3"]
+    ) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
+        """Row and column of the pixel that each point falls on, its depth, and whether the camera sees that place.
+
+        Rows and columns of points outside are clamped into the image.
+        """
+        viewed = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        depth = viewed[:, 2]
+        pixels = (viewed @ self.K.T)[:, :2] / depth[:, None].clamp_min(1e-6)
+        x, y = pixels.floor().unbind(1)
+        inside = (depth > 1e-6) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, inside
+
+    def unproject(
+        self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
+    ) -> Float[Tensor, "P 3"]:
+        """Points in the world at a depth behind the centres of pixels."""
+        pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(depth)], 1)
+        viewed = (pixels @ torch.linalg.inv(self.K).T) * depth[:, None]
+        return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
     @staticmethod
     def looking_at(

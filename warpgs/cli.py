@@ -2,12 +2,30 @@
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 import tyro
 
+from . import runs
 from .bench import Bench
 
-COMMANDS: dict[str, Callable[..., Bench]] = {"bench": Bench}
+
+@dataclass(frozen=True)
+class Eval:
+    """Evaluates a run's last iterate; writes metrics.json, views.csv, pictures and a video into its folder."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    """Run folder."""
+    lpips: Path | None = None
+    """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
+
+    def run(self) -> None:
+        print(runs.evaluate_run(self.run_folder, lpips=self.lpips))
+
+
+COMMANDS: dict[str, Callable[..., Bench | Eval]] = {"bench": Bench, "eval": Eval}
 """Each command is a dataclass of its options with a method ``run``."""
 
 

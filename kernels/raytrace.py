@@ -1,0 +1,212 @@
+"""Ray tracing of a few simple bodies with soft shadows, for the built-in scene.
+
+A body is a unit shape in its own space, x_body = A x_world + b. A ray o + t d becomes (A o + b) + t (A d) there, with
+the same t. Unit shapes: the sphere |x| = 1; the cube max |x_i| = 1, seen from outside or from inside (a room); the
+torus around z, of radii 1 and TUBE, which is found by marching along its distance
+
+    f(x) = |(|x_xy| − 1, x_z)| − TUBE
+
+in steps of f (A is a rotation and a scale then). A normal n_body turns into Aᵀ n_body. Light comes from a disc: every
+sample of a pixel looks at its own point of it. Shading is Lambert's and Blinn's, over a hemispherical ambient light.
+"""
+
+import warp as wp
+
+SPHERE = wp.constant(0)
+CUBE = wp.constant(1)
+TORUS = wp.constant(2)
+
+TUBE = wp.constant(0.3)
+MARCH_STEPS = wp.constant(160)
+MARCH_CLOSE = wp.constant(2.0e-4)
+FAR = wp.constant(1.0e6)
+SHADOW_OFFSET = wp.constant(1.0e-3)
+"""Start of shadow rays above their surface [world units], so that it does not shade itself."""
+
+AMBIENT_UP = wp.constant(0.42)
+AMBIENT_DOWN = wp.constant(0.24)
+DIFFUSE = wp.constant(0.72)
+SHINE = wp.constant(0.18)
+GLOSS = wp.constant(40.0)
+
+
+@wp.func
+def torus_distance(p: wp.vec3) -> float:
+    around = wp.sqrt(p[0] * p[0] + p[1] * p[1]) - 1.0
+    return wp.sqrt(around * around + p[2] * p[2]) - TUBE
+
+
+@wp.func
+def hit_sphere(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+    a = wp.dot(d, d)
+    b = wp.dot(o, d)
+    root = b * b - a * (wp.dot(o, o) - 1.0)
+    if root < 0.0:
+        return FAR
+    t = (-b - wp.sqrt(root)) / a
+    if t > nearest:
+        return t
+    return FAR
+
+
+@wp.func
+def hit_cube(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+    enter = -FAR
+    leave = FAR
+    for axis in range(3):
+        if wp.abs(d[axis]) > 1.0e-9:
+            a = (-1.0 - o[axis]) / d[axis]
+            b = (1.0 - o[axis]) / d[axis]
+            enter = wp.max(enter, wp.min(a, b))
+            leave = wp.min(leave, wp.max(a, b))
+        elif wp.abs(o[axis]) > 1.0:
+            return FAR
+    if enter > leave:
+        return FAR
+    if enter > nearest:
+        return enter
+    if leave > nearest:
+        return leave
+    return FAR
+
+
+@wp.func
+def hit_torus(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+    # Only the part of the ray inside the ball around the torus is marched.
+    a = wp.dot(d, d)
+    b = wp.dot(o, d)
+    root = b * b - a * (wp.dot(o, o) - (1.0 + TUBE) * (1.0 + TUBE))
+    if root < 0.0:
+        return FAR
+    t = wp.max((-b - wp.sqrt(root)) / a, nearest)
+    leave = (-b + wp.sqrt(root)) / a
+    speed = wp.sqrt(a)
+    for _step in range(MARCH_STEPS):
+        if t > leave:
+            return FAR
+        distance = torus_distance(o + t * d)
+        if distance < MARCH_CLOSE:
+            return t
+        t += distance / speed
+    return FAR
+
+
+@wp.func
+def into_body(bodies: wp.array3d[float], body: int, p: wp.vec3, w: float) -> wp.vec3:
+    """A p + w b of a body."""
+    x = bodies[body, 0, 0] * p[0] + bodies[body, 0, 1] * p[1] + bodies[body, 0, 2] * p[2] + bodies[body, 0, 3] * w
+    y = bodies[body, 1, 0] * p[0] + bodies[body, 1, 1] * p[1] + bodies[body, 1, 2] * p[2] + bodies[body, 1, 3] * w
+    z = bodies[body, 2, 0] * p[0] + bodies[body, 2, 1] * p[1] + bodies[body, 2, 2] * p[2] + bodies[body, 2, 3] * w
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def hit_body(kind: int, o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+    if kind == SPHERE:
+        return hit_sphere(o, d, nearest)
+    if kind == CUBE:
+        return hit_cube(o, d, nearest)
+    return hit_torus(o, d, nearest)
+
+
+@wp.func
+def body_normal(kind: int, p: wp.vec3) -> wp.vec3:
+    """Outward direction, of any length, at a point of a unit shape."""
+    if kind == SPHERE:
+        return p
+    if kind == CUBE:
+        x = wp.abs(p[0])
+        y = wp.abs(p[1])
+        z = wp.abs(p[2])
+        if x > y and x > z:
+            return wp.vec3(p[0], 0.0, 0.0)
+        if y > z:
+            return wp.vec3(0.0, p[1], 0.0)
+        return wp.vec3(0.0, 0.0, p[2])
+    around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+    return wp.vec3(p[0] - p[0] / around, p[1] - p[1] / around, p[2])
+
+
+@wp.func
+def soft_checks(p: wp.vec3, frequency: float) -> float:
+    """Chequers in [0, 1] with soft borders, of unit wavelength over 1 / frequency."""
+    wave = wp.sin(frequency * p[0] + 0.4) * wp.sin(frequency * p[1] + 0.9) * wp.sin(frequency * p[2] + 1.3)
+    return 0.5 + 0.5 * wave / (wp.abs(wave) + 0.06)
+
+
+@wp.kernel(enable_backward=False)
+def raytrace_fwd(
+    first: int,
+    kinds: wp.array[int],
+    bodies: wp.array3d[float],
+    colors: wp.array2d[wp.vec3],
+    frequencies: wp.array[float],
+    lamp: wp.array2d[float],
+    samples: wp.array[wp.vec4],
+    viewmat: wp.array2d[float],
+    K: wp.array2d[float],
+    width: int,
+    image: wp.array[wp.vec3],
+    depth: wp.array[float],
+    hits: wp.array[int],
+):
+    pixel = first + wp.tid()
+    column = float(pixel % width)
+    row = float(pixel / width)
+    right = wp.vec3(viewmat[0, 0], viewmat[0, 1], viewmat[0, 2])
+    down = wp.vec3(viewmat[1, 0], viewmat[1, 1], viewmat[1, 2])
+    forward = wp.vec3(viewmat[2, 0], viewmat[2, 1], viewmat[2, 2])
+    origin = -(right * viewmat[0, 3] + down * viewmat[1, 3] + forward * viewmat[2, 3])
+    total = wp.vec3(0.0)
+    num_samples = samples.shape[0]
+    # Sample −1 goes through the pixel's centre and gives depth and body; the others give the colour.
+    for index in range(-1, num_samples):
+        sample = wp.vec4(0.5, 0.5, 0.0, 0.0)
+        if index >= 0:
+            sample = samples[index]
+        u = (column + sample[0] - K[0, 2]) / K[0, 0]
+        v = (row + sample[1] - K[1, 2]) / K[1, 1]
+        direction = right * u + down * v + forward  # so that t is the depth
+        nearest = float(FAR)
+        body = int(-1)
+        for k in range(kinds.shape[0]):
+            t = hit_body(kinds[k], into_body(bodies, k, origin, 1.0), into_body(bodies, k, direction, 0.0), 0.0)
+            if t < nearest:
+                nearest = t
+                body = k
+        if index < 0:
+            depth[pixel] = nearest
+            hits[pixel] = body
+        elif body >= 0:
+            point = origin + nearest * direction
+            local = into_body(bodies, body, point, 1.0)
+            n = body_normal(kinds[body], local)
+            normal = wp.normalize(
+                wp.vec3(
+                    bodies[body, 0, 0] * n[0] + bodies[body, 1, 0] * n[1] + bodies[body, 2, 0] * n[2],
+                    bodies[body, 0, 1] * n[0] + bodies[body, 1, 1] * n[1] + bodies[body, 2, 1] * n[2],
+                    bodies[body, 0, 2] * n[0] + bodies[body, 1, 2] * n[1] + bodies[body, 2, 2] * n[2],
+                )
+            )
+            view = -wp.normalize(direction)
+            if wp.dot(normal, view) < 0.0:
+                normal = -normal  # a room is seen from inside
+            source = wp.vec3(
+                lamp[0, 0] + sample[2] * lamp[1, 0] + sample[3] * lamp[2, 0],
+                lamp[0, 1] + sample[2] * lamp[1, 1] + sample[3] * lamp[2, 1],
+                lamp[0, 2] + sample[2] * lamp[1, 2] + sample[3] * lamp[2, 2],
+            )
+            start = point + SHADOW_OFFSET * normal
+            to_light = source - start
+            lit = float(1.0)
+            for k in range(kinds.shape[0]):
+                if hit_body(kinds[k], into_body(bodies, k, start, 1.0), into_body(bodies, k, to_light, 0.0), 0.0) < 1.0:
+                    lit = 0.0
+            light = wp.normalize(to_light)
+            lit = lit * wp.max(wp.dot(normal, light), 0.0)
+            checks = soft_checks(local, frequencies[body])
+            color = checks * colors[body, 0] + (1.0 - checks) * colors[body, 1]
+            ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normal[2])
+            gloss = wp.pow(wp.max(wp.dot(normal, wp.normalize(light + view)), 0.0), GLOSS)
+            total += (ambient + DIFFUSE * lit) * color + wp.vec3(SHINE * gloss * lit)
+    image[pixel] = total / float(num_samples)

@@ -1,0 +1,168 @@
+"""Pictures are read whole or refused in words."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data.captures import SIZE, moving_block, picture, write_array, write_png
+from warpgs.data import images
+from warpgs.data.files import read_array
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_png(tmp_path / "a.png", picture("a"))
+    return tmp_path / "a.png"
+
+
+def jpeg(path):
+    smooth = cv2.resize(np.random.default_rng(0).integers(0, 256, (3, 5, 3), dtype=np.uint8), SIZE)
+    path.write_bytes(cv2.imencode(".jpg", smooth[..., ::-1])[1].tobytes())
+    return smooth
+
+
+def test_a_picture_comes_back_as_rgb(path):
+    assert np.array_equal(images.read_image(path, SIZE), picture("a"))
+
+
+def test_a_jpeg_is_read(tmp_path):
+    smooth = jpeg(tmp_path / "a.jpg")
+    assert abs(images.read_image(tmp_path / "a.jpg", SIZE).astype(int) - smooth).mean() < 8
+
+
+def test_a_grey_picture_has_three_equal_channels(tmp_path):
+    write_png(tmp_path / "a.png", moving_block())
+    assert np.array_equal(images.read_image(tmp_path / "a.png", SIZE)[..., 1], moving_block())
+
+
+def test_sixteen_bits_become_eight(tmp_path):
+    write_png(tmp_path / "a.png", picture("a").astype(np.uint16) * 256 + 7)
+    assert np.array_equal(images.read_image(tmp_path / "a.png", SIZE), picture("a"))
+
+
+def test_transparent_pixels_are_filled_from_around(tmp_path):
+    pixels = np.full((SIZE[1], SIZE[0], 4), 200, np.uint8)
+    pixels[..., 3] = 255
+    pixels[5:8, 5:8] = 0
+    write_png(tmp_path / "a.png", pixels)
+    assert np.abs(images.read_image(tmp_path / "a.png", SIZE).astype(int) - 200).max() <= 1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+def test_a_truncated_png_is_refused_by_name(path, share, capfd):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=r"a\.png is (truncated|no PNG)"):
+        images.read_image(path, SIZE)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_png_with_one_wrong_byte_is_refused_without_noise(path, capfd):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.png is damaged"):
+        images.read_image(path, SIZE)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_truncated_jpeg_is_refused_by_name(tmp_path, capfd):
+    path = tmp_path / "a.jpg"
+    jpeg(path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"a\.jpg is truncated"):
+        images.read_image(path, SIZE)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("size", [(20_000, 10), (10, 2**31), (0, 5)])
+def test_a_png_that_claims_an_absurd_size_is_refused_before_it_is_decoded(tmp_path, size):
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IEND", b""))
+    with pytest.raises(ValueError, match=f"claims {size[0]}×{size[1]}"):
+        images.decode(tmp_path / "a.png")
+
+
+def test_a_missing_picture_is_refused_by_name(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.png is missing"):
+        images.read_image(tmp_path / "none.png", SIZE)
+
+
+def test_a_text_file_is_no_picture(tmp_path):
+    (tmp_path / "a.png").write_text("<html>not found</html>")
+    with pytest.raises(ValueError, match="no PNG or JPEG"):
+        images.read_image(tmp_path / "a.png", SIZE)
+
+
+@pytest.mark.parametrize("read", [images.read_image, images.read_mask])
+def test_a_picture_or_mask_of_another_size_is_refused_with_both_sizes(path, read):
+    with pytest.raises(ValueError, match=r"a\.png: the .* is 40×24, expected 41×24"):
+        read(path, (41, 24))
+
+
+def test_dark_is_false_in_a_mask(tmp_path):
+    write_png(tmp_path / "m.png", moving_block())
+    assert np.array_equal(images.read_mask(tmp_path / "m.png", SIZE), moving_block() == 255)
+
+
+def test_a_mask_of_zeros_and_ones_is_read_as_it_is_meant(tmp_path):
+    write_png(tmp_path / "m.png", moving_block() // 255)
+    assert np.array_equal(images.read_mask(tmp_path / "m.png", SIZE), moving_block() == 255)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_depth_pictures_of_both_depths_are_scaled_to_one(tmp_path, dtype):
+    values = np.linspace(0, np.iinfo(dtype).max, SIZE[0] * SIZE[1]).astype(dtype).reshape(SIZE[1], SIZE[0])
+    write_png(tmp_path / "d.png", values)
+    depth = images.read_depth(tmp_path / "d.png", SIZE)
+    assert depth.dtype == np.float32
+    assert np.allclose(depth, values / np.iinfo(dtype).max)
+
+
+def test_smooth_depth_of_half_the_size_is_resized_without_steps(tmp_path):
+    ramp = np.tile(np.linspace(0.2, 0.8, SIZE[0] // 2, dtype=np.float32), (SIZE[1] // 2, 1))
+    write_array(tmp_path / "d.npy", ramp)
+    depth = images.read_depth(tmp_path / "d.npy", SIZE)
+    assert depth.shape == (SIZE[1], SIZE[0])
+    assert np.ptp(np.diff(depth[0, 1:-1])) < 1e-3
+
+
+def test_depth_with_holes_is_resized_without_new_values(tmp_path):
+    values = np.full((SIZE[1] // 2, SIZE[0] // 2), 2.0, np.float32)
+    values[3:6, 4:9] = 0
+    values[8, 8] = np.inf
+    write_array(tmp_path / "d.npy", values)
+    depth = images.read_depth(tmp_path / "d.npy", SIZE)
+    assert set(np.unique(depth[~np.isnan(depth)])) == {0.0, 2.0}
+    assert np.isnan(depth).sum() == 4
+
+
+def test_coloured_depth_is_refused(path):
+    with pytest.raises(ValueError, match="one plane"):
+        images.read_depth(path, SIZE)
+
+
+def test_a_header_that_claims_more_than_the_file_holds_is_refused(tmp_path):
+    write_array(tmp_path / "p.npy", np.zeros((4, 3), np.float32))
+    data = (tmp_path / "p.npy").read_bytes().replace(b"(4, 3), }" + b" " * 9, b"(4000000000, 3), }")
+    (tmp_path / "p.npy").write_bytes(data)
+    with pytest.raises(ValueError, match=r"p\.npy is damaged"):
+        read_array(tmp_path / "p.npy", 10**12)
+
+
+def test_too_large_an_array_is_refused(tmp_path):
+    write_array(tmp_path / "p.npy", np.zeros((4, 3)))
+    with pytest.raises(ValueError, match="holds 12 numbers, more than 11"):
+        read_array(tmp_path / "p.npy", 11)
+
+
+def test_an_array_of_objects_is_never_unpickled(tmp_path):
+    np.save(tmp_path / "p.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match="no \\.npy file of numbers"):
+        read_array(tmp_path / "p.npy", 10)

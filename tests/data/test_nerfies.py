@@ -1,0 +1,280 @@
+"""The three layouts, read as the real datasets have them."""
+
+import json
+import shutil
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests.data import captures
+from tests.data.captures import CENTER, SCALE, SIZE, edit_json, picture, write_array, write_capture, write_json
+from warpgs.config import MaskPerturbation
+from warpgs.data.nerfies import load_capture, recognise
+
+KINDS = pytest.mark.parametrize("kind", ["nerfds", "hypernerf", "iphone"])
+
+
+@pytest.fixture
+def root(tmp_path):
+    return write_capture(tmp_path / "toy")
+
+
+@pytest.fixture
+def iphone(tmp_path):
+    return write_capture(tmp_path / "toy", "iphone")
+
+
+@pytest.fixture
+def hypernerf(tmp_path):
+    return write_capture(tmp_path / "toy", "hypernerf")
+
+
+@KINDS
+def test_each_layout_is_recognised_from_its_files(tmp_path, kind):
+    assert recognise(write_capture(tmp_path / "vrig-misleading", kind)) == kind
+
+
+@KINDS
+def test_each_layout_is_read_whole(tmp_path, kind):
+    scene = load_capture(write_capture(tmp_path / "toy", kind))
+    train, val = captures.ids_of(kind)
+    assert (scene.train, scene.val) == (tuple(train), tuple(val))
+    size = (SIZE[0] // captures.FACTORS[kind], SIZE[1] // captures.FACTORS[kind])
+    for name in (*train, *val):
+        frame = scene.frame(name)
+        assert frame.camera.size == size
+        assert np.array_equal(frame.image.numpy(), picture(name, size))
+        assert (frame.static_mask is not None) == (kind == "nerfds")
+        assert (frame.inverse_depth is not None) == (kind == "iphone" and name in train)
+        assert (frame.covisible is not None) == (kind == "iphone" and name in val)
+
+
+def test_dychecks_additions_do_not_turn_hypernerf_into_iphone(hypernerf):
+    write_json(hypernerf / "splits/train_mono.json", {"frame_names": []})
+    write_json(hypernerf / "extra.json", {})
+    (hypernerf / "covisible/2x/val_mono").mkdir(parents=True)
+    assert recognise(hypernerf) == "hypernerf"
+
+
+def test_an_iphone_capture_that_was_never_split_is_recognised_by_its_depth(iphone):
+    shutil.rmtree(iphone / "splits")
+    shutil.rmtree(iphone / "covisible")
+    assert recognise(iphone) == "iphone"
+
+
+def test_without_any_split_camera_0_of_an_iphone_capture_trains(iphone):
+    shutil.rmtree(iphone / "splits")
+    edit_json(iphone / "dataset.json", train_ids=None, val_ids=None)
+    scene = load_capture(iphone)
+    assert (list(scene.train), list(scene.val)) == captures.ids_of("iphone")
+
+
+def test_a_single_camera_iphone_capture_has_no_evaluation_frames(iphone):
+    write_json(iphone / "splits/val.json", {"frame_names": []})
+    assert load_capture(iphone).val == ()
+
+
+@KINDS
+def test_a_point_falls_where_the_files_camera_model_says(tmp_path, kind):
+    root = write_capture(tmp_path / "toy", kind)
+    name, factor = captures.ids_of(kind)[0][2], captures.FACTORS[kind]
+    edit_json(root / f"camera/{name}.json", pixel_aspect_ratio=1.25)
+    facts = json.loads((root / f"camera/{name}.json").read_text())
+    world = np.array([0.4, -0.3, 1.0])
+    x, y, z = np.array(facts["orientation"]) @ (world - facts["position"])
+    u = facts["focal_length"] * x / z + facts["principal_point"][0]
+    v = 1.25 * facts["focal_length"] * y / z + facts["principal_point"][1]
+    camera = load_capture(root).cameras[name]
+    scene = torch.tensor((world - CENTER) * SCALE, dtype=torch.float32)
+    viewed = camera.viewmat[:3, :3] @ scene + camera.viewmat[:3, 3]
+    pixel = camera.K @ viewed / viewed[2]
+    assert viewed[2] == pytest.approx(SCALE * z, rel=1e-5)
+    assert torch.allclose(pixel, torch.tensor([u / factor, v / factor, 1.0], dtype=torch.float32), atol=1e-4)
+
+
+def test_a_pixel_centre_has_the_ray_that_nerfies_casts_through_it(root):
+    """Nerfies casts the ray of pixel (column, row) through (column + 0.5, row + 0.5) of the file's coordinates."""
+    name = captures.ids_of("nerfds")[0][1]
+    facts = json.loads((root / f"camera/{name}.json").read_text())
+    local = (np.array([7.5, 3.5]) - facts["principal_point"]) / facts["focal_length"]
+    world = np.array(facts["orientation"]).T @ (2.0 * np.array([*local, 1.0])) + facts["position"]
+    ours = load_capture(root).cameras[name].unproject(torch.tensor([3]), torch.tensor([7]), torch.tensor([2.0 * SCALE]))
+    assert torch.allclose(ours[0], torch.tensor((world - CENTER) * SCALE, dtype=torch.float32), atol=1e-5)
+
+
+def test_odd_sizes_are_rounded_as_nerfies_does(hypernerf):
+    for path in (hypernerf / "camera").iterdir():
+        edit_json(path, image_size=[39, 23])
+    assert {camera.size for camera in load_capture(hypernerf).cameras.values()} == {(20, 12)}
+
+
+def test_old_camera_files_may_call_the_tangential_distortion_tangential(root):
+    path = root / "camera/left_000000.json"
+    edit_json(path, tangential_distortion=None, tangential=[0.02, 0.01])
+    scene = load_capture(root)
+    assert not np.array_equal(scene.frame("left_000000").image.numpy(), picture("left_000000"))
+
+
+def test_three_tangential_zeros_are_two(root):
+    edit_json(root / "camera/left_000000.json", tangential_distortion=[0.0, 0.0, 0.0])
+    assert len(load_capture(root).train) == 4
+
+
+def test_a_distorted_frame_is_straightened_with_all_its_parts(root):
+    edit_json(root / "camera/left_000000.json", radial_distortion=[0.8, 0.0, 0.0])
+    scene = load_capture(root)
+    bent, straight = scene.frame("left_000000"), scene.frame("left_000001")
+    assert bent.camera.K[0, 0] > straight.camera.K[0, 0]
+    assert torch.equal(bent.camera.K[:2, 2], straight.camera.K[:2, 2])
+    assert bent.static_mask.dtype == torch.bool
+    assert not torch.equal(bent.static_mask, straight.static_mask)
+
+
+def test_iphone_depth_says_nothing_where_the_sensor_saw_nothing_or_too_far(iphone):
+    path = iphone / "depth/2x/0_00000.npy"
+    depth = np.load(path)
+    depth[0, 0], depth[0, 1], depth[0, 2] = 0.0, 3.0, np.nan
+    write_array(path, depth)
+    inverse = load_capture(iphone).frame("0_00000").inverse_depth
+    assert inverse[0, :3].isnan().all()
+    assert inverse.isnan().sum() == 3
+    assert inverse[5, 5] == pytest.approx(1.0 / (2.0 * SCALE))
+
+
+def test_depth_of_the_full_size_serves_any_factor(hypernerf):
+    name = captures.ids_of("hypernerf")[0][0]
+    captures.write_png(hypernerf / f"depth/1x/{name}.png", np.full((SIZE[1], SIZE[0]), 51, np.uint8))
+    inverse = load_capture(hypernerf).frame(name).inverse_depth
+    assert inverse.shape == (SIZE[1] // 2, SIZE[0] // 2)
+    assert torch.allclose(inverse, torch.tensor(0.2))
+
+
+def test_an_evaluation_frame_may_lack_its_mask(root):
+    (root / "resized_mask/1x/right_000000.png.png").unlink()
+    assert load_capture(root).frame("right_000000").static_mask is None
+
+
+def test_masks_in_a_folder_called_mask_are_found(root):
+    (root / "resized_mask").rename(root / "mask")
+    assert not load_capture(root, "nerfds").frame("left_000000").static_mask[5, 5]
+
+
+def test_only_training_masks_are_perturbed(root):
+    scene = load_capture(root, perturbation=MaskPerturbation(dilate=2))
+    truth = torch.from_numpy(captures.moving_block() == 255)
+    assert scene.frame("left_000000").static_mask.sum() < truth.sum()
+    assert torch.equal(scene.frame("right_000000").static_mask, truth)
+
+
+def test_opening_a_capture_reads_no_picture(root):
+    for path in (root / "rgb/1x").iterdir():
+        path.write_bytes(b"")
+    assert len(load_capture(root).train) == 4
+
+
+def test_a_capture_without_points_opens(root):
+    (root / "points.npy").unlink()
+    assert load_capture(root).points.shape == (0, 3)
+
+
+def test_points_of_a_colmap_model_come_with_colours_when_there_is_no_points_file(root):
+    pycolmap = pytest.importorskip("pycolmap")
+    (root / "points.npy").unlink()
+    model = pycolmap.Reconstruction()
+    xyz = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    for k, point in enumerate(xyz):
+        model.add_point3D(point, pycolmap.Track(), np.array([10 * k, 20, 30], np.uint8))
+    (root / "sparse/0").mkdir(parents=True)
+    model.write(str(root / "sparse/0"))
+    scene = load_capture(root)
+    assert np.allclose(scene.points.numpy(), (xyz - CENTER) * SCALE)
+    assert scene.point_colors.tolist() == [[0, 20, 30], [10, 20, 30]]
+
+
+def test_a_single_moment_is_time_zero(tmp_path):
+    root = write_capture(tmp_path / "toy")
+    edit_json(root / "dataset.json", train_ids=["left_000000"], val_ids=["right_000000"])
+    assert [camera.time for camera in load_capture(root).cameras.values()] == [0.0, 0.0]
+
+
+def test_the_image_of_a_straightened_capture_agrees_with_opencv(root):
+    """Where no zoom is needed, OpenCV's own undistortion is what we do, with its pixel centres."""
+    name, k1 = "left_000000", -0.4
+    edit_json(root / f"camera/{name}.json", radial_distortion=[k1, 0.0, 0.0])
+    frame = load_capture(root).frame(name)
+    K = frame.camera.K.double().numpy()
+    K[:2, 2] -= 0.5
+    theirs = cv2.undistort(picture(name), K, np.array([k1, 0.0, 0.0, 0.0, 0.0]))
+    assert np.abs(frame.image.numpy().astype(int) - theirs).max() <= 12  # OpenCV rounds positions to 1/32 pixel
+
+
+def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_half_way(hypernerf):
+    ids = [name for pair in zip(*captures.ids_of("hypernerf"), strict=False) for name in pair]
+    for name in captures.ids_of("hypernerf")[0][2:]:
+        ids.append(name)
+    edit_json(hypernerf / "dataset.json", ids=ids, train_ids=ids, val_ids=[])
+    scene = load_capture(hypernerf)
+    assert (scene.train, scene.val) == ((ids[0], ids[4]), (ids[2],))
+
+
+def test_time_is_the_time_id_over_the_largest_of_training_and_evaluation(root):
+    metadata = json.loads((root / "metadata.json").read_text())
+    metadata["right_000002"]["time_id"] = 12
+    metadata["left_000001"]["warp_id"] = 7
+    write_json(root / "metadata.json", metadata)
+    times = {name: camera.time for name, camera in load_capture(root).cameras.items()}
+    assert (times["left_000000"], times["left_000001"], times["right_000002"]) == (0.0, 1 / 12, 1.0)
+
+
+def test_time_is_the_warp_id_where_there_is_no_time_id(iphone):
+    assert load_capture(iphone).cameras["1_00002"].time == pytest.approx(2 / 3)
+
+
+def test_points_come_in_scene_units(root):
+    expected = (np.arange(30).reshape(10, 3) - CENTER) * SCALE
+    assert np.allclose(load_capture(root).points.numpy(), expected, atol=1e-6)
+
+
+def test_the_covisible_mask_is_true_where_the_file_is_bright(iphone):
+    frame = load_capture(iphone).frame("1_00000")
+    assert np.array_equal(frame.covisible.numpy(), captures.moving_block((SIZE[0] // 2, SIZE[1] // 2)) == 255)
+
+
+ARCHIVE = Path(__file__).parents[3] / "shared/data/studio_a.tar"
+
+
+def one_frame(root, name):
+    """A frame of the path-traced capture, whose pictures are packed as .webp, as a capture of its own."""
+    with tarfile.open(ARCHIVE) as tar:
+        for member in tar:
+            path = Path(*Path(member.name).parts[1:])
+            if not member.isfile() or path.name.split(".")[0] not in (name, "scene", "dataset", "metadata", "points"):
+                continue
+            data = tar.extractfile(member).read()
+            folder = path.parent if path.parts[0] == "camera" or len(path.parts) == 1 else path.parent / "1x"
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            if path.suffix == ".webp":
+                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+                captures.write_png(root / folder / f"{name}.png", image[..., ::-1])
+            else:
+                (root / folder / path.name).write_bytes(data)
+    edit_json(root / "dataset.json", train_ids=[name], val_ids=[])
+    return root
+
+
+@pytest.mark.skipif(not ARCHIVE.exists(), reason="the path-traced capture is not on this machine")
+def test_a_real_captures_points_lie_at_the_depth_that_its_frame_shows(tmp_path):
+    """Up to a scale and an offset of inverse depth, and but for points that other surfaces hide: so by ranks."""
+    scene = load_capture(one_frame(tmp_path, "left_000040"))
+    frame = scene.frame("left_000040")
+    row, column, depth, inside = frame.camera.project(scene.points)
+    seen = inside & frame.static_mask[row, column]
+    pairs = torch.stack([frame.inverse_depth[row, column], 1.0 / depth])[:, seen]
+    ranks = pairs.argsort(1).argsort(1).double()
+    assert seen.sum() > 1000
+    assert 0.8 < frame.static_mask.float().mean() < 0.99
+    assert torch.corrcoef(ranks)[0, 1] > 0.9

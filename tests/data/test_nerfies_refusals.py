@@ -1,0 +1,139 @@
+"""What is no capture is refused in one line that names the file and what was expected."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.data.captures import edit_json, write_array, write_capture, write_json
+from warpgs.config import MaskPerturbation
+from warpgs.data.nerfies import load_capture
+
+
+@pytest.fixture
+def root(tmp_path):
+    return write_capture(tmp_path / "toy")
+
+
+def read_all(root, **options):
+    """Opens a capture and reads every frame."""
+    scene = load_capture(root, **options)
+    for name in (*scene.train, *scene.val):
+        scene.frame(name)
+
+
+def refused(root, match, **options):
+    """The capture is refused at the door, or when its frames are read, in one line."""
+    with pytest.raises(ValueError, match=match) as caught:
+        read_all(root, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_kind_given_wins_over_the_files(root):
+    shutil.copytree(root / "rgb/1x", root / "rgb/2x")
+    refused(root, r"resized_mask.2x is missing", dataset="hypernerf")
+
+
+def test_a_damaged_colmap_model_is_refused(root):
+    (root / "points.npy").unlink()
+    (root / "sparse/0").mkdir(parents=True)
+    refused(root, r"sparse.0 is no COLMAP model")
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), np.zeros(3), np.full((4, 3), np.nan)])
+def test_points_that_are_none_are_refused(root, points):
+    write_array(root / "points.npy", points)
+    refused(root, r"points\.npy must hold finite points")
+
+
+BAD_CAMERAS = [
+    ({"orientation": [[1, 0], [0, 1]]}, "orientation"),
+    ({"orientation": np.diag([1, 1, -1]).tolist()}, "not a rotation"),
+    ({"position": [0, float("nan"), 0]}, "position"),
+    ({"position": "far"}, "position"),
+    ({"focal_length": None}, "no focal_length"),
+    ({"focal_length": -5}, "focal_length"),
+    ({"focal_length": 10**400}, "focal_length"),
+    ({"principal_point": [1]}, "principal_point"),
+    ({"skew": 0.1}, "skew"),
+    ({"radial_distortion": [1, 2, 3, 4]}, "radial_distortion"),
+    ({"radial_distortion": [-500, 0, 0]}, "too strong"),
+    ({"radial_distortion": {"k1": 1}}, "radial_distortion"),
+    ({"image_size": [10**9, 10]}, "image_size"),
+    ({"image_size": [0, 10]}, "image_size"),
+]
+
+
+@pytest.mark.parametrize(("changes", "said"), BAD_CAMERAS, ids=[str(k) for k in range(len(BAD_CAMERAS))])
+def test_a_bad_camera_is_refused_by_file_and_field(root, changes, said):
+    edit_json(root / "camera/right_000002.json", **changes)
+    refused(root, rf"right_000002\.json.*{said}")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "[" * 100_000, '{"a": ' + "9" * 5000 + "}", "\udcff"])
+@pytest.mark.parametrize("name", ["dataset.json", "metadata.json", "scene.json", "camera/left_000000.json"])
+def test_bad_json_is_refused_by_file(root, name, text):
+    (root / name).write_bytes(text.encode(errors="surrogateescape"))
+    refused(root, rf"{name} (is not valid JSON|must hold a JSON object)")
+
+
+@pytest.mark.parametrize("path", ["metadata.json", "scene.json", "camera/left_000000.json", "rgb/1x/left_000003.png"])
+def test_a_missing_file_is_refused_by_name(root, path):
+    (root / path).unlink()
+    refused(root, rf"{path} is missing")
+
+
+def test_a_missing_mask_of_a_training_frame_is_refused_at_the_door(root):
+    (root / "resized_mask/1x/left_000001.png.png").unlink()
+    with pytest.raises(ValueError, match=r"left_000001\.png\.png is missing: every training frame"):
+        load_capture(root)
+
+
+@pytest.mark.parametrize("folder", ["", "nowhere", "rgb", "scene.json"])
+def test_a_wrong_folder_is_told_what_a_capture_has(root, folder):
+    refused(root.parent if folder == "" else root / folder, "dataset.json is missing: a capture has .*camera")
+
+
+def test_a_missing_size_is_told_which_sizes_there_are(root):
+    refused(root, r"rgb.4x is missing: .* has 1x", factor=4)
+
+
+@pytest.mark.usefixtures("contracts_off")
+def test_an_unknown_dataset_is_refused_with_the_known_ones(root):
+    refused(root, "unknown dataset 'blender', expected one of nerfds, hypernerf, iphone", dataset="blender")
+
+
+def test_a_factor_below_one_is_refused(root):
+    refused(root, "factor must be at least 1, got 0", factor=0)
+
+
+def test_a_bad_perturbation_is_refused_at_the_door(root):
+    with pytest.raises(ValueError, match="erode"):
+        load_capture(root, perturbation=MaskPerturbation(erode=-1))
+
+
+@pytest.mark.parametrize("ids", [[], "left", [1, 2], ["../up"], ["left_000000"] * 2, ["right_000000"], [""]])
+def test_bad_training_ids_are_refused(root, ids):
+    edit_json(root / "dataset.json", train_ids=ids)
+    refused(root, r"dataset\.json")
+
+
+@pytest.mark.parametrize("step", [None, -1, float("nan"), "first", True])
+def test_a_frame_without_a_time_is_refused(root, step):
+    metadata = json.loads((root / "metadata.json").read_text())
+    metadata["left_000001"] = {"time_id": step}
+    write_json(root / "metadata.json", metadata)
+    refused(root, r"metadata\.json has no time_id or warp_id for frame left_000001")
+
+
+@pytest.mark.parametrize("scene", [{}, {"center": [0, 0]}, {"scale": 0}, {"scale": float("inf")}, {"scale": None}])
+def test_bad_scene_units_are_refused(root, scene):
+    write_json(root / "scene.json", scene and {"center": [0, 0, 0], "scale": 1.0, **scene})
+    refused(root, r"scene\.json must have")
+
+
+def test_a_truncated_picture_is_refused_when_it_is_read(root):
+    path = root / "rgb/1x/left_000001.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    refused(root, r"left_000001\.png is truncated")

@@ -1,0 +1,59 @@
+import pytest
+import torch
+
+from tests.reference.raytrace import raytrace as reference
+from warpgs.data.synthetic import BuiltinScene, _as_tensors, _camera, _lamp, _moving_bodies, _samples, _static_bodies
+from warpgs.ops.raytrace import raytrace
+
+CPU = torch.device("cpu")
+SCENE = BuiltinScene(width=37, height=21, num_samples=3)
+
+
+def inputs(time=0.3):
+    camera = _camera(time, SCENE, 0.1)
+    bodies = _as_tensors([*_static_bodies(), *_moving_bodies(time)], CPU)
+    return bodies, _lamp(CPU), _samples(3, CPU), camera.viewmat, camera.K, camera.size
+
+
+@pytest.fixture(scope="module")
+def pair():
+    bodies, *rest, size = inputs()
+    wide = [t.double() if t.is_floating_point() else t for t in (*bodies, *rest)]
+    return raytrace(bodies, *rest, size), reference(*wide, size)
+
+
+def test_depth_is_that_of_the_reference(pair):
+    ours, (_, depth, body) = pair
+    same = ours.bodies == body
+    assert same.float().mean() > 0.99  # rays that graze an edge may fall on either side
+    assert torch.allclose(ours.depth[same].double(), depth[same], rtol=2e-3)
+    assert (ours.depth[same].double() / depth[same] - 1).abs().median() < 1e-6
+
+
+def test_colours_are_those_of_the_reference(pair):
+    ours, (image, _, _) = pair
+    error = (ours.image.double() - image).abs().amax(-1)
+    assert error.median() < 1e-5
+    assert (error > 1e-2).float().mean() < 0.02  # samples that graze an edge or a shadow's border
+
+
+def test_every_pixel_of_a_closed_room_hits_something(pair):
+    assert bool((pair[0].bodies >= 0).all())
+
+
+def test_a_lamp_behind_the_walls_leaves_ambient_light_only():
+    bodies, lamp, *rest = inputs()
+    lit, dark = (
+        raytrace(bodies, lamp, *rest),
+        raytrace(bodies, lamp + torch.tensor([[0.0, 0.0, 50.0]] + 2 * [[0.0] * 3]), *rest),
+    )
+    assert float(dark.image.max()) < 0.42 * 0.95
+    assert float(lit.image.mean()) > 1.3 * float(dark.image.mean())
+
+
+def test_wrong_shapes_are_refused_in_words(contracts_off):
+    bodies, lamp, *rest = inputs()
+    with pytest.raises(ValueError, match="lamp"):
+        raytrace(bodies, lamp[:2], *rest)
+    with pytest.raises(ValueError, match="frequencies"):
+        raytrace(bodies._replace(frequencies=bodies.frequencies[:1]), lamp, *rest)

@@ -1,0 +1,87 @@
+"""Ray tracing in plain torch, any dtype: every ray against every body, one sample at a time."""
+
+import torch
+from torch import Tensor
+
+TUBE = 0.3
+FAR = 1e6
+
+
+def hit(kind: int, o: Tensor, d: Tensor) -> Tensor:
+    """Smallest t > 0 at which each ray meets a unit shape; FAR where it does not."""
+    far = torch.full_like(o[:, 0], FAR)
+    a, b = (d * d).sum(1), (o * d).sum(1)
+    if kind == 0:
+        root = b * b - a * ((o * o).sum(1) - 1)
+        t = (-b - root.clamp_min(0).sqrt()) / a
+        return torch.where((root >= 0) & (t > 0), t, far)
+    if kind == 1:
+        low, high = (-1 - o) / d, (1 - o) / d
+        enter, leave = torch.minimum(low, high).amax(1), torch.maximum(low, high).amin(1)
+        t = torch.where(enter > 0, enter, leave)
+        return torch.where((enter <= leave) & (t > 0), t, far)
+    t = torch.zeros_like(far)
+    for _ in range(400):
+        p = o + t[:, None] * d
+        distance = ((p[:, :2].norm(dim=1) - 1) ** 2 + p[:, 2] ** 2).sqrt() - TUBE
+        t = torch.where(distance < 1e-5, t, t + distance / a.sqrt())
+    return torch.where((distance < 1e-4) & (t < 100), t, far)
+
+
+def normal(kind: int, p: Tensor) -> Tensor:
+    if kind == 0:
+        return p
+    if kind == 1:
+        return p * torch.nn.functional.one_hot(p.abs().argmax(1), 3)
+    around = p[:, :2].norm(dim=1, keepdim=True)
+    return torch.cat([p[:, :2] - p[:, :2] / around, p[:, 2:]], 1)
+
+
+def nearest(kinds: Tensor, bodies: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    ts = [hit(int(k), o @ m[:, :3].T + m[:, 3], d @ m[:, :3].T) for k, m in zip(kinds, bodies, strict=True)]
+    t, body = torch.stack(ts).min(0)
+    return t, torch.where(t < FAR, body, -1)
+
+
+def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size):
+    """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace."""
+    width, height = size
+    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([column, row], -1).reshape(-1, 2).to(viewmat.dtype)
+    R, origin = viewmat[:3, :3], -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+    def rays(offset: Tensor) -> tuple[Tensor, Tensor]:
+        slopes = (pixels + offset - K[:2, 2]) / torch.stack([K[0, 0], K[1, 1]])
+        d = torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1) @ R
+        return origin.expand_as(d), d
+
+    total = torch.zeros(len(pixels), 3, dtype=viewmat.dtype)
+    for sample in samples:
+        o, d = rays(sample[:2])
+        t, body = nearest(kinds, bodies, o, d)
+        p = o + t[:, None] * d
+        m = bodies[body]
+        local = (m[:, :, :3] @ p[:, :, None])[:, :, 0] + m[:, :, 3]
+        n = torch.zeros_like(p)
+        for k in range(len(kinds)):
+            chosen = body == k
+            n[chosen] = normal(int(kinds[k]), local[chosen]) @ bodies[k][:, :3]
+        n = torch.nn.functional.normalize(n, dim=1)
+        view = -torch.nn.functional.normalize(d, dim=1)
+        n = torch.where((n * view).sum(1, keepdim=True) < 0, -n, n)
+        start = p + 1e-3 * n
+        to_light = lamp[0] + sample[2] * lamp[1] + sample[3] * lamp[2] - start
+        blocked, _ = nearest(kinds, bodies, start, to_light)
+        light = torch.nn.functional.normalize(to_light, dim=1)
+        lit = (blocked >= 1) * (n * light).sum(1).clamp_min(0)
+        angle = frequencies[body][:, None] * local + torch.tensor([0.4, 0.9, 1.3], dtype=p.dtype)
+        wave = angle.sin().prod(1)
+        checks = (0.5 + 0.5 * wave / (wave.abs() + 0.06))[:, None]
+        color = checks * colors[body, 0] + (1 - checks) * colors[body, 1]
+        ambient = 0.24 + (0.42 - 0.24) * (0.5 + 0.5 * n[:, 2])
+        half = torch.nn.functional.normalize(light + view, dim=1)
+        gloss = 0.18 * (n * half).sum(1).clamp_min(0) ** 40 * lit
+        total += torch.where((body >= 0)[:, None], (ambient + 0.72 * lit)[:, None] * color + gloss[:, None], 0.0)
+    t, body = nearest(kinds, bodies, *rays(torch.full((2,), 0.5, dtype=viewmat.dtype)))
+    image = total / len(samples)
+    return image.reshape(height, width, 3), t.reshape(height, width), body.reshape(height, width)

@@ -1,0 +1,107 @@
+"""Checkpoints: safetensors files, written so that a crash at any moment leaves a whole one behind."""
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from .config import ModelConfig
+from .scene.split import SplitScene
+
+VERSION = 1
+FOLDER = "checkpoints"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What is read back.
+
+    Attributes:
+        tensors: By name, on the CPU; those of the scene begin with "scene.".
+        facts: Iteration and other plain values.
+    """
+
+    tensors: dict[str, Tensor]
+    facts: dict[str, Any]
+
+
+def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
+    """Writes a checkpoint beside its place and moves it there, so that no half-written file ever has its name.
+
+    Raises:
+        OSError: If it can't be written; the message names the file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    try:
+        save_file(plain, partial, metadata={"format": "warpgs", "version": str(VERSION), "facts": json.dumps(facts)})
+        with open(partial, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except (OSError, SafetensorError) as error:
+        partial.unlink(missing_ok=True)
+        raise OSError(f"{path} could not be written: {error}") from error
+
+
+def load(path: Path) -> Checkpoint:
+    """Reads a checkpoint; never executes anything of it.
+
+    Raises:
+        ValueError: If it is missing, damaged or not one of ours; the message names the file.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") != "warpgs":
+                raise ValueError(f"{path} is not a checkpoint of warpgs")
+            if metadata.get("version") != str(VERSION):
+                raise ValueError(f"{path} has version {metadata.get('version')}, this program reads {VERSION}")
+            facts = json.loads(metadata["facts"])
+            return Checkpoint({name: file.get_tensor(name) for name in file.keys()}, facts)  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise ValueError(f"{path} does not exist") from error
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def path_of(run: Path, iteration: int) -> Path:
+    """Where a run keeps the checkpoint of an iteration."""
+    return run / FOLDER / f"{iteration:07d}.safetensors"
+
+
+def saved(run: Path) -> list[Path]:
+    """The checkpoints of a run folder, oldest first."""
+    return sorted((run / FOLDER).glob("*.safetensors"))
+
+
+def keep_newest(run: Path, count: int) -> None:
+    """Deletes all but the ``count`` newest checkpoints."""
+    for path in saved(run)[: -max(1, count)]:
+        path.unlink()
+
+
+def load_scene(checkpoint: Checkpoint, config: ModelConfig, origin: Path) -> SplitScene:
+    """The scene of a checkpoint.
+
+    Raises:
+        ValueError: If tensors are missing or of other shapes than the config says; the message names ``origin``.
+    """
+    state = {
+        name.removeprefix("scene."): tensor for name, tensor in checkpoint.tensors.items() if name.startswith("scene.")
+    }
+    try:
+        scene = SplitScene.empty(len(state["static.means"]), len(state["dynamic.means"]), config)
+        scene.load_state_dict(state)
+    except (KeyError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"{origin} does not hold a scene of this run's config: {reason}") from error
+    if not all(bool(torch.isfinite(tensor).all()) for tensor in state.values()):
+        raise ValueError(f"{origin} holds values that are not finite")
+    return scene

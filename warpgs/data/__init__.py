@@ -1,0 +1,1 @@
+"""Captures: what a camera filmed, with poses, masks and depth."""

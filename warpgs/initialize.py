@@ -1,0 +1,107 @@
+"""Where training begins: the first Gaussians of both branches, and monocular depth in scene units."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from . import depth
+from .config import RenderSettings, TrainConfig
+from .data.capture import Capture
+from .render import render
+from .scene import init
+from .scene.gaussians import Gaussians
+from .scene.split import SplitScene
+from .views import Views
+
+COLOR_VIEWS = 12
+"""Training views from which points without colours take theirs."""
+
+
+def first_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
+    """Static Gaussians at the sparse points (anywhere in the scene's box if there are none) and no dynamic ones yet."""
+    center, half_size = init.scene_box(capture.points)
+    static = Gaussians.empty(0)
+    if config.assume != "dynamic":
+        static = init.from_points(*_colored_points(config, capture, generator))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return SplitScene(static, Gaussians.empty(0), config.model, center, half_size)
+
+
+def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    points, colors, most = capture.points, capture.point_colors, config.model.max_static_points
+    if len(points) == 0:
+        points, colors = _anywhere(*init.scene_box(points), most, generator), None
+    chosen = init.subsample(points, most, generator)
+    points = points[chosen]
+    if colors is not None:
+        return points, colors[chosen].float() / 255.0
+    frames = [capture.frame(name) for name in capture.train[:: max(1, len(capture.train) // COLOR_VIEWS)]]
+    everywhere = [torch.ones(frame.image.shape[:2], dtype=torch.bool) for frame in frames]
+    masks = [e if f.static_mask is None else f.static_mask for f, e in zip(frames, everywhere, strict=True)]
+    seen = [(frame.camera, frame.image, mask) for frame, mask in zip(frames, masks, strict=True)]
+    return points, init.color_points(points, seen)
+
+
+def dynamic_gaussians(
+    config: TrainConfig,
+    capture: Capture,
+    views: Views,
+    alignments: Float[Tensor, "T 2"],
+    scene: SplitScene,
+    generator: torch.Generator,
+) -> Gaussians:
+    """Dynamic Gaussians at moving pixels lifted by aligned depth; without depth, anywhere in the scene's box."""
+    most = config.model.dynamic_points
+    if config.assume == "static":
+        return Gaussians.empty(0)
+    if config.assume == "dynamic" and len(capture.points):
+        return init.from_points(*_colored_points(config, capture, generator))
+    lifted = [_lift(views, index, alignments[index]) for index in range(len(views))]
+    positions, colors = (torch.cat(values) for values in zip(*lifted, strict=True))
+    if len(positions) == 0:
+        trunk = scene.deformation.trunk
+        positions = _anywhere(trunk.center.cpu(), trunk.half_size.cpu(), most, generator)
+        return init.from_points(positions, torch.full_like(positions, 0.5))
+    chosen = init.subsample(positions, most, generator)
+    return init.from_points(positions[chosen], colors[chosen])
+
+
+def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    return center + half_size * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
+
+
+def _lift(views: Views, index: int, alignment: Tensor) -> tuple[Tensor, Tensor]:
+    view = views[index]
+    if view.inverse_depth is None:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    metric = depth.metric_depth(view.inverse_depth, alignment)
+    points, colors = init.lift(metric, ~view.static_mask, view.image, view.camera)
+    return points.cpu(), colors.cpu()
+
+
+def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:
+    """Scale and offset of each view's inverse depth against the sparse points; NaN where that can't be told."""
+    alignments = torch.full((len(views), 2), torch.nan, device=views.device)
+    points = capture.points.to(views.device)
+    for index in range(len(views)):
+        view = views[index]
+        if view.inverse_depth is not None:
+            alignments[index] = depth.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
+    return alignments
+
+
+@torch.no_grad()
+def align_to_rendering(
+    alignments: Float[Tensor, "T 2"], views: Views, scene: SplitScene, sh_degree: int
+) -> Float[Tensor, "T 2"]:
+    """The same against the depth rendered so far; views where that can't be told keep their alignment."""
+    splats = scene.static_splats(sh_degree)
+    found = alignments.clone()
+    for index in range(len(views)):
+        view = views[index]
+        if view.inverse_depth is not None:
+            layer = render(splats, view.camera, settings=RenderSettings(depth=True)).joint
+            assert layer.depth is not None
+            found[index] = depth.align_to_rendering(view.inverse_depth, view.static_mask, layer.depth, layer.alpha)
+    return torch.where(found.isfinite(), found, alignments)

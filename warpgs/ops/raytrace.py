@@ -1,0 +1,90 @@
+"""Pictures of simple bodies (kernels/raytrace.py)."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from warpgs.kernels import raytrace as kernels
+
+from .contracts import check_image_size, check_same_device, check_tensor
+from .tape import Run, differentiable
+
+SPHERE, CUBE, TORUS = 0, 1, 2
+"""Unit shapes; the torus lies around z and has radii 1 and 0.3."""
+
+
+class Bodies(NamedTuple):
+    """Bodies, each a unit shape in its own space.
+
+    Attributes:
+        kinds: [B] SPHERE, CUBE or TORUS.
+        body_from_world: [B, 3, 4]; for a torus, a rotation, one scale and a shift.
+        colors: [B, 2, 3] the two colours of its chequers.
+        frequencies: [B] of its chequers, in its own space.
+    """
+
+    kinds: Int32[Tensor, " B"]
+    body_from_world: Float[Tensor, "B 3 4"]
+    colors: Float[Tensor, "B 2 3"]
+    frequencies: Float[Tensor, " B"]
+
+
+class Picture(NamedTuple):
+    """A ray-traced picture.
+
+    Attributes:
+        image: [H, W, 3], not clamped.
+        depth: [H, W] along the camera's axis, through the centres of the pixels.
+        bodies: [H, W] the body seen there, −1 for none.
+    """
+
+    image: Float[Tensor, "H W 3"]
+    depth: Float[Tensor, "H W"]
+    bodies: Int32[Tensor, "H W"]
+
+
+def raytrace(
+    bodies: Bodies,
+    lamp: Float[Tensor, "3 3"],
+    samples: Float[Tensor, "S 4"],
+    viewmat: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+    size: tuple[int, int],
+) -> Picture:
+    """A picture of bodies in the light of a lamp; not differentiable.
+
+    Args:
+        bodies: What there is.
+        lamp: [3, 3] its centre and two half axes.
+        samples: [S, 4] place in the pixel, in [0, 1]², and on the lamp, in [-1, 1]², of every sample of a pixel.
+        viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
+        K: [3, 3] intrinsics [px] with pixel centres at +0.5.
+        size: (width, height) [px].
+
+    Raises:
+        ValueError: On a wrong shape, dtype, device or size.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("kinds", bodies.kinds, ("B",), sizes, (torch.int32,))
+    check_tensor("body_from_world", bodies.body_from_world, ("B", 3, 4), sizes)
+    check_tensor("colors", bodies.colors, ("B", 2, 3), sizes)
+    check_tensor("frequencies", bodies.frequencies, ("B",), sizes)
+    check_tensor("lamp", lamp, (3, 3), sizes)
+    check_tensor("samples", samples, ("S", 4), sizes)
+    check_tensor("viewmat", viewmat, (4, 4), sizes)
+    check_tensor("K", K, (3, 3), sizes)
+    check_same_device({**bodies._asdict(), "lamp": lamp, "samples": samples, "viewmat": viewmat, "K": K})
+    check_image_size(*size)
+    width, height = size
+
+    def op(run: Run, *inputs: Tensor) -> tuple[Tensor, ...]:
+        image, depth = run.empty(height, width, 3), run.empty(height, width)
+        hits = run.empty(height, width, dtype=torch.int32)
+        outputs = (image.view(-1, 3), depth.view(-1), hits.view(-1))
+        run.launch(kernels.raytrace_fwd, width * height, *inputs, width, *outputs, work=len(samples))
+        return image, depth, hits
+
+    with torch.no_grad():
+        return Picture(*differentiable(op, *bodies, lamp, samples, viewmat, K))

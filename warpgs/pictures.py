@@ -1,0 +1,103 @@
+"""Pictures and videos for people to look at."""
+
+import os
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from .render import Rendering
+
+ERROR_RANGE = 0.25
+"""Mean absolute error that has the brightest colour."""
+
+CAPTION_HEIGHT = 18
+VIDEO_RATE = 24.0
+
+
+def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit RGB of an image in [0, 1]."""
+    return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+
+
+def error_picture(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Mean absolute error in colours, dark where there is none."""
+    error = (image - truth).abs().mean(-1).div(ERROR_RANGE)
+    level = (error.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
+def comparison(truth: Float[Tensor, "H W 3"], rendering: Rendering) -> UInt8[np.ndarray, "H2 W5 3"]:
+    """truth | joint | static | dynamic | error, side by side under their names."""
+    assert rendering.static is not None
+    assert rendering.dynamic is not None
+    pictures = {
+        "truth": to_bytes(truth),
+        "joint": to_bytes(rendering.joint.image),
+        "static": to_bytes(rendering.static.image),
+        "dynamic": to_bytes(rendering.dynamic.image),
+        f"error (0 to {ERROR_RANGE})": error_picture(rendering.joint.image.clamp(0, 1), truth),
+    }
+    return np.concatenate([_captioned(name, picture) for name, picture in pictures.items()], axis=1)
+
+
+def _captioned(name: str, picture: np.ndarray) -> np.ndarray:
+    bar = np.zeros((CAPTION_HEIGHT, picture.shape[1], 3), np.uint8)
+    cv2.putText(bar, name, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (235, 235, 235), 1, cv2.LINE_AA)
+    return np.concatenate([bar, picture])
+
+
+def write_png(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
+    """Writes an RGB picture.
+
+    Raises:
+        OSError: If it can't be written; the message names the file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    whole, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    if not whole:
+        raise OSError(f"{path} could not be encoded")
+    partial = path.with_suffix(".partial")
+    try:
+        partial.write_bytes(data.tobytes())
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
+
+
+class Video:
+    """An MP4 file, written frame by frame; used as a context, and removed again if that ends with an error."""
+
+    def __init__(self, path: Path, rate: float = VIDEO_RATE) -> None:
+        self.path, self.rate = path, rate
+        self._writer: cv2.VideoWriter | None = None
+
+    def __enter__(self) -> "Video":
+        return self
+
+    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+        """Adds an RGB frame of the size of the first.
+
+        Raises:
+            OSError: If no video can be written there.
+        """
+        height, width = image.shape[0] & ~1, image.shape[1] & ~1  # video codecs want even sizes
+        if self._writer is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            self._writer = cv2.VideoWriter(str(self.path), code, self.rate, (width, height))
+            if not self._writer.isOpened():
+                raise OSError(f"{self.path} could not be opened as a video")
+        self._writer.write(cv2.cvtColor(image[:height, :width], cv2.COLOR_RGB2BGR))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._writer is not None:
+            self._writer.release()
+        if error is not None:
+            self.path.unlink(missing_ok=True)

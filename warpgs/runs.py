@@ -1,0 +1,208 @@
+"""Run folders: config.json, checkpoints/, metrics.json, views.csv, events/, pictures/."""
+
+import dataclasses
+import json
+import subprocess
+import typing
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from . import checkpoint, pictures
+from .cameras import Camera
+from .config import RenderSettings, TrainConfig
+from .data.capture import Capture, Frame
+from .data.nerfies import load_capture
+from .data.synthetic import builtin_capture
+from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_text, write_views
+from .lpips import find
+from .render import Rendering, render
+from .scene.split import SplitScene
+
+PICTURES = 6
+"""Evaluation views to draw, spread over the capture."""
+
+VIDEO_FRAMES = 120
+"""Frames of the video over time, at most."""
+
+
+def resolve(config: TrainConfig) -> TrainConfig:
+    """The config with its device chosen.
+
+    Raises:
+        ValueError: If CUDA is asked for and there is none.
+    """
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
+    return dataclasses.replace(config, device=config.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+
+
+def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
+    """The capture of a config; without one, the built-in scene, made if need be."""
+    root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
+    return load_capture(root, config.dataset, factor=config.factor, perturbation=config.masks)
+
+
+def create(config: TrainConfig, capture: Capture) -> Path:
+    """Makes the run folder and writes its config.json.
+
+    Raises:
+        ValueError: If the folder asked for exists already and holds something.
+    """
+    folder = config.out
+    if folder is None:
+        stem = Path("runs") / f"{capture.name}-{config.preset}"
+        folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and is not empty: go on with --resume {folder}, or choose another --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=config.data and config.data.resolve()))
+    write_text(folder / "config.json", json.dumps(plain, indent=2, default=str) + "\n")
+    return folder
+
+
+def load_config(folder: Path) -> TrainConfig:
+    """The config of a run.
+
+    Raises:
+        ValueError: If the folder is no run, or its config has unknown or ill-typed fields.
+    """
+    path = folder / "config.json"
+    try:
+        values = json.loads(path.read_text())
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ValueError(f"{folder} is no run folder: it has no config.json") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    return dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
+
+
+def _from_plain(kind: Any, values: Any, path: Path) -> Any:
+    """A (nested) dataclass of what JSON kept of it."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected an object for {kind.__name__}, got {values!r}")
+    hints = typing.get_type_hints(kind)
+    if unknown := sorted(set(values) - set(hints)):
+        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}")
+    parts = {}
+    for name, value in values.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            value = _from_plain(hint, value, path)
+        elif Path in typing.get_args(hint) and value is not None:
+            value = Path(value)
+        elif not _fits(value, hint):
+            raise ValueError(f"{path}: {name} can't be {value!r}")
+        parts[name] = value
+    return kind(**parts)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    if typing.get_origin(hint) is typing.Literal:
+        return value in typing.get_args(hint)
+    if choices := typing.get_args(hint):
+        return any(_fits(value, choice) for choice in choices)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is hint
+
+
+def newest_scene(folder: Path, config: TrainConfig) -> tuple[SplitScene, dict[str, Any]]:
+    """The scene of a run's newest checkpoint, and what the checkpoint says of itself.
+
+    Raises:
+        ValueError: If there is no checkpoint or it is damaged.
+    """
+    saved = checkpoint.saved(folder)
+    if not saved:
+        raise ValueError(f"{folder} has no checkpoint yet")
+    loaded = checkpoint.load(saved[-1])
+    return checkpoint.load_scene(loaded, config.model, saved[-1]), loaded.facts
+
+
+def renderer(scene: SplitScene, config: TrainConfig, facts: dict[str, Any]) -> RenderAt:
+    """Renders a scene as the stage that it was trained to does."""
+
+    def render_at(camera: Camera, branches: bool) -> Rendering:
+        time = torch.tensor([camera.time], device=camera.viewmat.device)
+        with torch.no_grad():
+            splats = scene.splats(time, bool(facts["moving"]), bool(facts["relit"]), int(facts["sh_degree"]))
+            settings = RenderSettings(branches=branches, antialias=config.antialias)
+            return render(splats, camera, settings=settings)
+
+    return render_at
+
+
+def evaluate_run(folder: Path, capture: Capture | None = None, lpips: Path | None = None, quiet: bool = False) -> str:
+    """Evaluates the last iterate of a run: metrics.json, views.csv, pictures and a video; returns a text for people.
+
+    Raises:
+        ValueError: If the run, its capture or the weights of LPIPS can't be used.
+        OSError: If something can't be written.
+    """
+    config = load_config(folder)
+    if not torch.cuda.is_available():
+        config = dataclasses.replace(config, device="cpu")
+    device = torch.device(config.device or "cpu")
+    capture = capture or open_capture(config, quiet)
+    scene, facts = newest_scene(folder, config)
+    render_at = renderer(scene.to(device), config, facts)
+    network = find(lpips or config.lpips)
+    chosen = {round(k * (len(capture.val) - 1) / max(1, PICTURES - 1)) for k in range(PICTURES)}
+
+    def draw(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
+        if index in chosen:
+            path = folder / "pictures" / f"{frame.name}.png"
+            pictures.write_png(path, pictures.comparison(truth, rendering))
+
+    evaluation = evaluate(render_at, capture, device, network and network.to(device), draw, quiet)
+    _write_video(folder / "time.mp4", render_at, capture, device)
+    counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
+    run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
+    totals = {"iterations": run.pop("iteration"), **run, **counts, "commit": _commit()}
+    write_json(folder / "metrics.json", {**evaluation.summary(), **totals})
+    write_views(folder / "views.csv", evaluation)
+    return _report(evaluation, counts)
+
+
+def _write_video(path: Path, render_at: RenderAt, capture: Capture, device: torch.device) -> None:
+    """The middle evaluation camera over time: joint | static | dynamic."""
+    camera = capture.cameras[capture.val[len(capture.val) // 2]].to(device)
+    with pictures.Video(path) as video:
+        for k in range(VIDEO_FRAMES):
+            rendering = render_at(dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1)), True)
+            layers = (rendering.joint, rendering.static, rendering.dynamic)
+            images = [layer.image for layer in layers if layer is not None]
+            video.add(pictures.to_bytes(torch.cat(images, 1)))
+
+
+def _report(evaluation: Evaluation, counts: dict[str, int]) -> str:
+    values = evaluation.summary()
+
+    def show(name: str, digits: int) -> str:
+        value = values[name]
+        return "not measured" if value is None else f"{value:.{digits}f}"
+
+    lpips = f"LPIPS ({evaluation.lpips_net}) {show('lpips', 4)}"
+    if evaluation.lpips_net is None:
+        lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
+    lines = [
+        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
+        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, "
+        f"flicker {show('flicker', 5)}, {show('fps', 1)} frames/s",
+        f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians",
+    ]
+    if values["masked_psnr"] is not None:
+        lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")
+    return "\n".join(lines)
+
+
+def _commit() -> str | None:
+    """The commit of the program where it runs from a checkout."""
+    source = Path(__file__).parent
+    try:
+        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=source, capture_output=True, text=True)
+    except OSError:
+        return None
+    return done.stdout.strip() or None

@@ -1,0 +1,88 @@
+"""Gaussians as the optimizer holds them."""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+NUM_BASES = 16
+"""Spherical harmonics up to degree 3."""
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 · coefficient."""
+
+
+class Gaussians(nn.Module):
+    """N Gaussians in raw form: unconstrained values, activated where they are used.
+
+    Attributes:
+        means: [N, 3] positions.
+        quats: [N, 4] rotations (w, x, y, z), not normalised.
+        log_scales: [N, 3] logarithms of the standard deviations.
+        logit_opacities: [N] logits of the opacities.
+        sh_dc: [N, 1, 3] constant coefficients of the colour.
+        sh_rest: [N, 15, 3] the other coefficients, degrees 1 to 3.
+    """
+
+    def __init__(
+        self,
+        means: Float[Tensor, "N 3"],
+        quats: Float[Tensor, "N 4"],
+        log_scales: Float[Tensor, "N 3"],
+        logit_opacities: Float[Tensor, " N"],
+        sh_dc: Float[Tensor, "N 1 3"],
+        sh_rest: Float[Tensor, "N 15 3"],
+    ) -> None:
+        super().__init__()
+        self.means = nn.Parameter(means)
+        self.quats = nn.Parameter(quats)
+        self.log_scales = nn.Parameter(log_scales)
+        self.logit_opacities = nn.Parameter(logit_opacities)
+        self.sh_dc = nn.Parameter(sh_dc)
+        self.sh_rest = nn.Parameter(sh_rest)
+
+    @staticmethod
+    def from_points(
+        points: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], scales: Float[Tensor, " N"], opacity: float
+    ) -> "Gaussians":
+        """Round Gaussians at points, of standard deviations ``scales``, colours in [0, 1] and one opacity."""
+        N = points.shape[0]
+        quats = points.new_zeros(N, 4)
+        quats[:, 0] = 1.0
+        return Gaussians(
+            points.clone(),
+            quats,
+            scales.log()[:, None].repeat(1, 3),
+            torch.logit(torch.full_like(scales, opacity)),
+            ((colors - 0.5) / SH_C0)[:, None, :],
+            points.new_zeros(N, NUM_BASES - 1, 3),
+        )
+
+    @staticmethod
+    def empty(num: int) -> "Gaussians":
+        """``num`` Gaussians of no particular value, to load others into."""
+        return Gaussians.from_points(torch.zeros(num, 3), torch.zeros(num, 3), torch.ones(num), 0.5)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def opacities(self) -> Float[Tensor, " N"]:
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def scales(self) -> Float[Tensor, "N 3"]:
+        return self.log_scales.exp()
+
+    @property
+    def sh(self) -> Float[Tensor, "N 16 3"]:
+        return torch.cat([self.sh_dc, self.sh_rest], 1)
+
+    @torch.no_grad()
+    def gather(self, parents: Int64[Tensor, " M"]) -> None:
+        """Replaces the Gaussians by copies of ``parents``: the one way in which their number changes.
+
+        Gradients are dropped; an optimizer follows by ``optim.gather``.
+        """
+        for parameter in self.parameters():
+            parameter.data = parameter.data[parents]
+            parameter.grad = None
