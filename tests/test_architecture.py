@@ -18,6 +18,7 @@ ORDER = [
     {"data", "render"},
     {"losses", "metrics", "lpips", "pictures", "optim", "densify", "prune", "depth", "views", "initialize"},
     {"stages", "checkpoint", "logbook", "interrupt"},
+    {"step"},
     {"evaluate", "bench"},
     {"trainer", "runs"},
     {"cli"},

@@ -194,6 +194,8 @@ class TrainConfig:
     """Opacity compensation for the low-pass filter (Mip-Splatting)."""
     tf32: bool = True
     """On CUDA, multiply matrices of the networks in TF32."""
+    graph: bool = True
+    """On CUDA, replay iterations as CUDA graphs."""
     masks: MaskPerturbation = field(default_factory=MaskPerturbation)
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
@@ -216,15 +218,15 @@ PRESETS: dict[str, TrainConfig] = {
         preset="fast",
         schedule=Schedule(
             pretrain=1_000,
-            stage1=7_000,
-            stage2=7_000,
+            stage1=4_000,
+            stage2=10_000,
             realign_at=500,
             densify_from=300,
-            densify_until=5_000,
+            densify_until=3_500,
             reset_every=2_500,
             prune_every=2_000,
             deform_from=500,
-            noise_until=5_000,
+            noise_until=3_500,
             sh_degree_every=500,
         ),
         checkpoint_every=2_500,

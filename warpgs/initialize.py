@@ -73,8 +73,6 @@ def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Ge
 
 def _lift(views: Views, index: int, alignment: Tensor) -> tuple[Tensor, Tensor]:
     view = views[index]
-    if view.inverse_depth is None:
-        return torch.zeros(0, 3), torch.zeros(0, 3)
     metric = depth.metric_depth(view.inverse_depth, alignment)
     points, colors = init.lift(metric, ~view.static_mask, view.image, view.camera)
     return points.cpu(), colors.cpu()
@@ -86,8 +84,7 @@ def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:
     points = capture.points.to(views.device)
     for index in range(len(views)):
         view = views[index]
-        if view.inverse_depth is not None:
-            alignments[index] = depth.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
+        alignments[index] = depth.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
     return alignments
 
 
@@ -100,8 +97,7 @@ def align_to_rendering(
     found = alignments.clone()
     for index in range(len(views)):
         view = views[index]
-        if view.inverse_depth is not None:
-            layer = render(splats, view.camera, settings=RenderSettings(depth=True)).joint
-            assert layer.depth is not None
-            found[index] = depth.align_to_rendering(view.inverse_depth, view.static_mask, layer.depth, layer.alpha)
+        layer = render(splats, view.camera, settings=RenderSettings(depth=True)).joint
+        assert layer.depth is not None
+        found[index] = depth.align_to_rendering(view.inverse_depth, view.static_mask, layer.depth, layer.alpha)
     return torch.where(found.isfinite(), found, alignments)

@@ -1,11 +1,11 @@
 """The one Adam over Gaussians and networks, and its learning rates."""
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from .config import OptimConfig
-from .scene.gaussians import Gaussians
+from .scene.gaussians import PARAMETERS, Gaussians
 from .scene.split import SplitScene
 
 BETAS = (0.9, 0.999)
@@ -16,51 +16,57 @@ MEANS_DECAY = 0.01
 """Rate of positions at the end of a run, relative to its start (3DGS)."""
 
 
-def make_optimizer(scene: SplitScene) -> torch.optim.Adam:
-    """Adam with one named group for each Gaussian parameter of each branch and one for each network."""
-    groups = [
-        {"name": f"{branch}.{name}", "params": [parameter], "lr": 0.0}
-        for branch, gaussians in (("static", scene.static), ("dynamic", scene.dynamic))
-        for name, parameter in gaussians.named_parameters()
-    ]
-    groups += [
-        {"name": name, "params": list(network.parameters()), "lr": 0.0}
-        for name, network in (("deformation", scene.deformation), ("appearance", scene.appearance))
-    ]
-    return torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+GROUPS = (
+    *(f"{branch}.{name}" for branch in ("static", "dynamic") for name in PARAMETERS),
+    "deformation",
+    "appearance",
+)
+"""Names of the parameter groups: each Gaussian parameter of each branch, and each network."""
 
 
-def set_learning_rates(
-    optimizer: torch.optim.Adam, config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float]
-) -> None:
-    """Sets every group's rate.
+def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> torch.optim.Adam:
+    """Adam with the groups of ``GROUPS``.
 
     Args:
-        optimizer: From ``make_optimizer``.
+        scene: What is trained.
+        rates: Learning rate of each group, on the scene's device; the optimizer reads it anew in every step.
+    """
+    parameters = dict(scene.named_parameters())
+    groups = [
+        {
+            "name": name,
+            "params": [p for n, p in parameters.items() if n == name or n.startswith(f"{name}.")],
+            "lr": rate,
+        }
+        for name, rate in zip(GROUPS, rates.unbind(), strict=True)
+    ]
+    return torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True, capturable=rates.is_cuda)
+
+
+def learning_rates(
+    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float]
+) -> list[float]:
+    """Learning rate of each group of ``GROUPS``.
+
+    Args:
         config: Rates.
         extent: Of the capture [scene units]; scales the rate of positions.
         progress: Share of the run done, in [0, 1].
         network_progress: The same for each network, over the iterations in which it is trained.
     """
-    for group in optimizer.param_groups:
-        name = group["name"]
-        if name in network_progress:
-            group["lr"] = exponential(config.networks, config.networks_end, network_progress[name])
-            continue
-        kind = name.split(".")[1]
-        if kind == "means":
-            group["lr"] = exponential(config.means, MEANS_DECAY * config.means, progress) * extent
-        else:
-            group["lr"] = _RATES[kind](config)
-
-
-_RATES = {
-    "quats": lambda config: config.quats,
-    "log_scales": lambda config: config.scales,
-    "logit_opacities": lambda config: config.opacities,
-    "sh_dc": lambda config: config.sh_dc,
-    "sh_rest": lambda config: config.sh_rest,
-}
+    gaussians = [
+        exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
+        config.quats,
+        config.scales,
+        config.opacities,
+        config.sh_dc,
+        config.sh_rest,
+    ]
+    networks = [
+        exponential(config.networks, config.networks_end, network_progress[name])
+        for name in ("deformation", "appearance")
+    ]
+    return [*gaussians, *gaussians, *networks]
 
 
 def exponential(start: float, end: float, progress: float) -> float:

@@ -6,20 +6,18 @@ import time
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from . import checkpoint, depth, initialize, losses, optim
-from .config import RenderSettings, TrainConfig
+from . import checkpoint, initialize
+from .config import TrainConfig
 from .data.capture import Capture
-from .densify import GradientStatistics, densify, reset_opacities
+from .densify import densify, reset_opacities
 from .interrupt import Interrupt
 from .logbook import Logbook, Status
 from .prune import prune_invisible
-from .render import Rendering, render
 from .scene.split import SplitScene
 from .stages import Moment, Protocol
-from .views import View, Views
+from .step import TERMS, Draw, Step
+from .views import Views
 
 LOOK_EVERY = 50
 """Iterations between looks at the loss: reading it waits for the device."""
@@ -50,8 +48,8 @@ class Trainer:
         self.device = torch.device(config.device or "cpu")
         if self.device.type == "cuda" and config.tf32:
             torch.set_float32_matmul_precision("high")
-        self.views = Views(capture, capture.train, self.device, config.resident_bytes, config.assume)
-        self.protocol = Protocol(config, has_depth=self.views[0].inverse_depth is not None)
+        self.views = Views(capture, self.device, config.resident_bytes, config.assume)
+        self.protocol = Protocol(config, has_depth=self.views.has_depth)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
@@ -62,12 +60,7 @@ class Trainer:
     def _begin_with(self, scene: SplitScene) -> None:
         """Takes a scene on, with a fresh optimizer."""
         self.scene = scene.to(self.device)
-        self.optimizer = optim.make_optimizer(self.scene)
-        self._forget_gradients()
-        self._sums: dict[str, Tensor] = {}
-
-    def _forget_gradients(self) -> None:
-        self.statistics = GradientStatistics(len(self.scene.static) + len(self.scene.dynamic), self.device)
+        self.step = Step(self.config, self.scene, self.views, self.alignments, self.capture.extent)
 
     # The algorithm ----------------------------------------------------------------------------------------------------
 
@@ -86,7 +79,7 @@ class Trainer:
             if self.iteration == self.protocol.stage1.start:
                 self._add_dynamic()
             moment = self.protocol.at(self.iteration)
-            self.step(moment)
+            self.step(moment, self._draw(moment))
             self._adapt(moment, logbook)
             self.iteration += 1
             at_checkpoint = self.iteration % self.config.checkpoint_every == 0
@@ -101,82 +94,28 @@ class Trainer:
                 return False
         return True
 
-    def step(self, moment: Moment) -> None:
-        """One view: render the three images, compare each with its share of the truth, go downhill."""
-        index = self._view_index()
-        view = self.views[index]
-        self._choose_trained(moment)
-        noise = self._time_noise(moment.noise)
-        splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, noise)
-        settings = RenderSettings(branches=True, depth=moment.depth_weight > 0, antialias=self.config.antialias)
-        rendering = render(splats, view.camera, settings=settings)
-        terms = self._loss_terms(moment, view, rendering, self.alignments[index])
-        torch.stack(list(terms.values())).sum().backward()
-        optim.set_learning_rates(
-            self.optimizer, self.config.optim, self.capture.extent, moment.progress, moment.network_progress
-        )
-        self.optimizer.step()
-        self.optimizer.zero_grad()
-        self.statistics.observe(rendering.gradient_norms, rendering.radii)
-        self._note(terms, rendering, view)
-
-    def _loss_terms(
-        self, moment: Moment, view: View, rendering: Rendering, alignment: Float[Tensor, "2"]
-    ) -> dict[str, Tensor]:
-        """Paper Eq. 15: static, dynamic and depth loss; in stage II also the joint image against the whole truth."""
-        weights = self.config.loss
-        static, dynamic = rendering.static, rendering.dynamic
-        assert static is not None
-        assert dynamic is not None
-        truth, mask = view.image, view.static_mask
-        terms = {"static": weights.static * losses.static_loss(static.image, truth, mask, weights.ssim)}
-        if moment.stage.name != "pretrain":
-            background = self._dynamic_background()
-            image = dynamic.image + (1.0 - dynamic.alpha)[..., None] * background
-            terms["dynamic"] = weights.dynamic * losses.dynamic_loss(image, truth, mask, weights.ssim, background)
-        if moment.joint:
-            terms["joint"] = weights.joint * losses.image_loss(rendering.joint.image, truth, weights.ssim)
-        if moment.depth_weight > 0 and view.inverse_depth is not None:
-            target = depth.metric_depth(view.inverse_depth, alignment)
-            branches = [("depth", static, mask, moment.depth_weight)]
-            if weights.depth_dynamic > 0 and moment.stage.name != "pretrain":
-                branches.append(("depth_dynamic", dynamic, ~mask, weights.depth_dynamic * moment.depth_weight))
-            for name, layer, region, weight in branches:
-                assert layer.depth is not None
-                terms[name] = weight * losses.depth_loss(layer.depth, layer.alpha, target, region)
-        return terms
-
-    def _choose_trained(self, moment: Moment) -> None:
-        """Which parameters this stage trains; the others get no gradient and stay."""
-        in_stage2 = moment.stage.name == "stage2"
-        for name, parameter in self.scene.static.named_parameters():
-            is_geometry = name in ("means", "quats", "log_scales")
-            stays = self.config.static_geometry if is_geometry else self.config.static_appearance or not moment.relit
-            parameter.requires_grad_(stays or not in_stage2)
-        self.scene.deformation.requires_grad_(moment.moving)
-        self.scene.appearance.requires_grad_(moment.relit)
-
     def _adapt(self, moment: Moment, logbook: Logbook) -> None:
         """Changes depth alignment and the set of Gaussians where the schedule says so."""
         scene, config = self.scene, self.config.densify
         if moment.realign:
-            self.alignments = initialize.align_to_rendering(self.alignments, self.views, scene, moment.sh_degree)
+            # In place: the iterations' graph reads them.
+            self.alignments.copy_(initialize.align_to_rendering(self.alignments, self.views, scene, moment.sh_degree))
         if moment.densify:
-            means = self.statistics.mean().split([len(scene.static), len(scene.dynamic)])
+            means = self.step.statistics.mean().split([len(scene.static), len(scene.dynamic)])
             generator = self._generator("densify")
             for gaussians, gradients in zip((scene.static, scene.dynamic), means, strict=True):
                 room = config.max_gaussians - len(scene.static) - len(scene.dynamic)
                 extent, large = self.capture.extent, moment.remove_large
-                densify(gaussians, self.optimizer, gradients, extent, config, room, large, generator)
+                densify(gaussians, self.step.optimizer, gradients, extent, config, room, large, generator)
         if moment.prune:
             cameras = [self.capture.cameras[name].to(self.device) for name in self.capture.train]
-            removed = prune_invisible(scene, self.optimizer, cameras, moment.sh_degree, config.visibility)
+            removed = prune_invisible(scene, self.step.optimizer, cameras, moment.sh_degree, config.visibility)
             logbook.say(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
         if moment.reset:
             for gaussians in (scene.static, scene.dynamic):
-                reset_opacities(gaussians, self.optimizer)
+                reset_opacities(gaussians, self.step.optimizer)
         if moment.densify or moment.prune:
-            self._forget_gradients()
+            self.step.resized()
 
     def _add_dynamic(self) -> None:
         """The dynamic Gaussians come with stage I, when depth is aligned."""
@@ -196,50 +135,30 @@ class Trainer:
             int.from_bytes(hashlib.blake2b(words.encode(), digest_size=7).digest(), "big")
         )
 
-    def _view_index(self) -> int:
-        """The view of this iteration: every epoch takes each once, in a new order."""
+    def _draw(self, moment: Moment) -> Draw:
+        """The view of this iteration (every epoch takes each once, in a new order), noise on time and background."""
         epoch, place = divmod(self.iteration, len(self.views))
         if self._order[:2] != (epoch, self.rollbacks):
             order = torch.randperm(len(self.views), generator=self._generator("views", epoch))
             self._order = (epoch, self.rollbacks, order.tolist())
-        return self._order[2][place]
-
-    def _time_noise(self, deviation: float) -> Float[Tensor, "1"] | None:
-        """Noise on time, ``deviation`` in frame intervals (Deformable-3DGS, annealed smoothing)."""
-        if deviation <= 0.0:
-            return None
-        noise = torch.randn(1, generator=self._generator("time")) * (deviation / len(self.views))
-        return noise.to(self.device, non_blocking=True)
-
-    def _dynamic_background(self) -> Float[Tensor, "3"]:
-        """What lies behind the dynamic image: black as in the paper, or a new colour each iteration."""
-        if self.config.loss.dynamic_background == "black":
-            return torch.zeros(3, device=self.device)
-        return torch.rand(3, generator=self._generator("background")).to(self.device, non_blocking=True)
+        generator = self._generator("draw")
+        noise = moment.noise / len(self.views) * torch.randn(1, generator=generator).item()
+        is_random = self.config.loss.dynamic_background == "random"
+        background = torch.rand(3, generator=generator) if is_random else torch.zeros(3)
+        return Draw(self._order[2][place], noise, background)
 
     # Looking, saving, going back --------------------------------------------------------------------------------------
 
-    @torch.no_grad()
-    def _note(self, terms: dict[str, Tensor], rendering: Rendering, view: View) -> None:
-        """Adds to the sums since the last look, without waiting for the device."""
-        error = (rendering.joint.image.clamp(0, 1) - view.image).square().mean()
-        values = {**terms, "psnr": -10.0 * error.log10(), "steps": torch.ones_like(error)}
-        for name, value in values.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value.detach()
-
     def _look(self, moment: Moment, logbook: Logbook) -> bool:
         """Shows the means since the last look; false if the loss was not finite."""
-        names = list(self._sums)
-        sums = dict(zip(names, torch.stack([self._sums[name] for name in names]).tolist(), strict=True))
-        steps = sums.pop("steps")
-        means = {name: value / steps for name, value in sums.items()}
-        psnr = means.pop("psnr")
-        self._sums = {}
+        *sums, psnr, steps = self.step.sums.tolist()
+        self.step.sums.zero_()
+        means = {name: value / steps for name, value in zip(TERMS, sums, strict=True)}
         loss = sum(means.values())
         if not math.isfinite(loss):
             return False
         num_static, num_dynamic = len(self.scene.static), len(self.scene.dynamic)
-        logbook.show(Status(self.iteration, moment.stage.name, loss, psnr, means, num_static, num_dynamic))
+        logbook.show(Status(self.iteration, moment.stage.name, loss, psnr / steps, means, num_static, num_dynamic))
         return True
 
     def _roll_back(self, logbook: Logbook) -> None:
@@ -262,9 +181,9 @@ class Trainer:
         """Writes a checkpoint of everything that training goes on from."""
         tensors = {f"scene.{name}": tensor for name, tensor in self.scene.state_dict().items()}
         for name, parameter in self.scene.named_parameters():
-            for part, value in self.optimizer.state.get(parameter, {}).items():
+            for part, value in self.step.optimizer.state.get(parameter, {}).items():
                 tensors[f"adam.{part}.{name}"] = value
-        tensors["gradients.total"], tensors["gradients.count"] = self.statistics.total, self.statistics.count
+        tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
         tensors["alignments"] = self.alignments
         moment = self.protocol.at(max(0, self.iteration - 1))
         facts = {
@@ -286,6 +205,7 @@ class Trainer:
             ValueError: If it is damaged or of another config.
         """
         loaded = checkpoint.load(path)
+        self.alignments = loaded.tensors["alignments"].to(self.device)
         self._begin_with(checkpoint.load_scene(loaded, self.config.model, path))
         for name, parameter in self.scene.named_parameters():
             state = {
@@ -294,10 +214,9 @@ class Trainer:
                 if f"adam.{part}.{name}" in loaded.tensors
             }
             if state:
-                self.optimizer.state[parameter] = state
-        self.statistics.total = loaded.tensors["gradients.total"].to(self.device)
-        self.statistics.count = loaded.tensors["gradients.count"].to(self.device)
-        self.alignments = loaded.tensors["alignments"].to(self.device)
+                self.step.optimizer.state[parameter] = state
+        self.step.statistics.total = loaded.tensors["gradients.total"].to(self.device)
+        self.step.statistics.count = loaded.tensors["gradients.count"].to(self.device)
         self.iteration, self.rollbacks = int(loaded.facts["iteration"]), int(loaded.facts["rollbacks"])
         self.seconds, self._started = float(loaded.facts["train_seconds"]), time.monotonic()
 

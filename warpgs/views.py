@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from .cameras import Camera
@@ -14,94 +14,96 @@ class View(NamedTuple):
     """One training view on the device.
 
     Attributes:
-        camera: With its time as a float; ``time`` has it on the device.
+        camera: Its ``time`` is not to be used; the one here is on the device.
         time: [1] moment in [0, 1].
         image: [H, W, 3] in [0, 1].
         static_mask: [H, W] M of the paper, true where static.
-        inverse_depth: [H, W] up to a scale and an offset, NaN where unknown; None without.
+        inverse_depth: [H, W] up to a scale and an offset, NaN where unknown.
     """
 
     camera: Camera
     time: Float[Tensor, "1"]
     image: Float[Tensor, "H W 3"]
     static_mask: Bool[Tensor, "H W"]
-    inverse_depth: Float[Tensor, "H W"] | None
+    inverse_depth: Float[Tensor, "H W"]
 
 
 class _Stored(NamedTuple):
-    """A view as it is kept: bytes for the image, half precision for depth."""
+    """Views as they are kept: bytes for images, half precision for depth. Tensors may have a first axis for views."""
 
-    camera: Camera
+    viewmat: Tensor
+    K: Tensor
     time: Tensor
     image: Tensor
     static_mask: Tensor
-    inverse_depth: Tensor | None
+    inverse_depth: Tensor
 
 
 class Views:
-    """The frames of a capture, kept on the device as bytes as long as they fit into ``resident_bytes``.
+    """The training frames of a capture.
+
+    Frames of one size that fit into ``resident_bytes`` are all kept on the device, as bytes; a view is then picked by
+    an index that is on the device, too, so that picking can be part of a CUDA graph. Otherwise each is read from the
+    capture when it is wanted.
 
     Args:
         capture: Where the frames come from.
-        names: Ids of the frames.
         device: Where views are wanted.
-        resident_bytes: Memory for kept views; the rest is read from the capture each time.
+        resident_bytes: Memory for kept views.
         assume: "masks" as the capture has them, or that all is "static" or "dynamic".
+
+    Attributes:
+        resident: Whether all views are on the device.
+        has_depth: Whether any view has depth; of captures that are not resident, the first.
 
     Raises:
         ValueError: If a frame has no mask where masks are wanted; the message names it.
     """
 
-    def __init__(
-        self,
-        capture: Capture,
-        names: tuple[str, ...],
-        device: torch.device,
-        resident_bytes: int,
-        assume: str = "masks",
-    ) -> None:
-        self.names = names
-        self._capture = capture
+    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int, assume: str = "masks") -> None:
         self.device = device
-        self._free = resident_bytes
-        self._assume = assume
-        self._kept: dict[int, _Stored] = {}
+        self._capture, self._assume = capture, assume
+        first = self._store(capture.frame(capture.train[0]))
+        sizes = {capture.cameras[name].size for name in capture.train}
+        self.resident = len(sizes) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
+        self.has_depth = bool(first.inverse_depth.isfinite().any())
+        if self.resident:
+            stored = [self._store(capture.frame(name)) for name in capture.train]
+            self._all = _Stored(*(torch.stack(tensors).to(device) for tensors in zip(*stored, strict=True)))
+            self.has_depth = bool(self._all.inverse_depth.isfinite().any())
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self._capture.train)
 
     def __getitem__(self, index: int) -> View:
-        stored = self._kept.get(index)
-        if stored is None:
-            stored = self._store(self._capture.frame(self.names[index]))
-            tensors = (stored.image, stored.static_mask, stored.inverse_depth)
-            size = sum(t.numel() * t.element_size() for t in tensors if t is not None)
-            if size <= self._free:
-                self._free -= size
-                self._kept[index] = stored
-        depth = stored.inverse_depth
+        if self.resident:
+            return self._view(_Stored(*(tensors[index] for tensors in self._all)))
+        stored = self._store(self._capture.frame(self._capture.train[index]))
+        return self._view(_Stored(*(tensor.to(self.device) for tensor in stored)))
+
+    def pick(self, index: Int64[Tensor, "1"]) -> View:
+        """The view of an index on the device; all must be resident."""
+        return self._view(_Stored(*(tensors.index_select(0, index)[0] for tensors in self._all)))
+
+    def _view(self, stored: _Stored) -> View:
+        height, width = stored.static_mask.shape
         return View(
-            stored.camera,
+            Camera(stored.viewmat, stored.K, width, height),
             stored.time,
             stored.image.float() / 255.0,
             stored.static_mask,
-            None if depth is None else depth.float(),
+            stored.inverse_depth.float(),
         )
 
     def _store(self, frame: Frame) -> _Stored:
+        camera, size = frame.camera, frame.image.shape[:2]
         mask = frame.static_mask
         if self._assume != "masks":
-            mask = torch.full(frame.image.shape[:2], self._assume == "static")
+            mask = torch.full(size, self._assume == "static")
         elif mask is None:
             raise ValueError(
                 f"{self._capture.name}: frame {frame.name} has no mask of what moves, which training needs; "
                 "give the capture masks, or train with --assume static or --assume dynamic"
             )
-        depth = frame.inverse_depth
-        return _Stored(
-            frame.camera.to(self.device),
-            torch.tensor([frame.camera.time], device=self.device),
-            frame.image.to(self.device),
-            mask.to(self.device),
-            None if depth is None else depth.to(self.device, torch.float16),
-        )
+        depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
+        return _Stored(camera.viewmat, camera.K, torch.tensor([camera.time]), frame.image, mask, depth.half())

@@ -25,12 +25,34 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
     Args:
         step: Works on the current CUDA device without reading anything back from it.
     """
+    outputs: tuple[Tensor, ...] = ()
+
+    def work() -> None:
+        nonlocal outputs
+        outputs = step()
+
     stream = torch.cuda.Stream()
-    warp_stream = wp.stream_from_torch(stream)
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         for _ in range(WARM_UPS):
-            step()
+            work()
+    replay = record(work, stream)
+
+    def replay_outputs() -> tuple[Tensor, ...]:
+        replay()
+        return outputs
+
+    return replay_outputs
+
+
+def record(work: Callable[[], None], stream: torch.cuda.Stream | None = None) -> Callable[[], None]:
+    """Records ``work`` in a CUDA graph without running it, and returns a function that runs it.
+
+    As ``capture``, for work that changes tensors in place and must not be repeated for warming up: it has to have run
+    a few times before.
+    """
+    stream = stream or torch.cuda.Stream()
+    warp_stream = wp.stream_from_torch(stream)
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
     # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
@@ -39,10 +61,5 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
         wp.ScopedStream(warp_stream, sync_enter=False),
         wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
     ):
-        outputs = step()
-
-    def replay() -> tuple[Tensor, ...]:
-        graph.replay()
-        return outputs
-
-    return replay
+        work()
+    return graph.replay

@@ -10,6 +10,8 @@ NUM_BASES = 16
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_C0 · coefficient."""
 
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
+
 
 class Gaussians(nn.Module):
     """N Gaussians in raw form: unconstrained values, activated where they are used.

@@ -1,0 +1,146 @@
+"""One training iteration: render the three images, compare each with its share of the truth, go downhill."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from . import depth, losses, optim
+from .config import RenderSettings, TrainConfig
+from .densify import GradientStatistics
+from .ops.graph import record
+from .render import Rendering, render
+from .scene.split import SplitScene
+from .stages import Moment
+from .views import View, Views
+
+TERMS = ("static", "dynamic", "joint", "depth", "depth_dynamic")
+"""Terms of the loss."""
+
+WARM_UPS = 3
+"""Iterations with one set of Gaussians before one is captured in a CUDA graph: all that is made once is then there."""
+
+
+class Draw(NamedTuple):
+    """What an iteration draws at random.
+
+    Attributes:
+        view: Index of the training view.
+        noise: Added to the time that the deformation network sees.
+        background: [3] colour behind the dynamic image.
+    """
+
+    view: int
+    noise: float
+    background: Float[Tensor, "3"]
+
+
+class Step:
+    """Trains a scene, one view an iteration.
+
+    All that changes between iterations is read from tensors on the device, so that on CUDA an iteration is captured in
+    a graph and replayed until the Gaussians or the stage change. Eager and replayed iterations run the same code.
+
+    Attributes:
+        scene: What is trained.
+        optimizer: Its Adam.
+        statistics: Screen-space gradients since the last densification.
+        sums: [7] sums since the last look: each term of ``TERMS``, PSNR of the joint image, iterations.
+    """
+
+    def __init__(self, config: TrainConfig, scene: SplitScene, views: Views, alignments: Tensor, extent: float) -> None:
+        self.config, self.scene, self.views, self.extent = config, scene, views, extent
+        device = views.device
+        self.alignments = alignments
+        self.sums = torch.zeros(len(TERMS) + 2, device=device)
+        self._index = torch.zeros(1, dtype=torch.int64, device=device)
+        num_rates = len(optim.GROUPS)
+        self._numbers = torch.zeros(5 + num_rates, device=device)
+        self._noise, self._depth_weight = self._numbers[0:1], self._numbers[1]
+        self._background, self._rates = self._numbers[2:5], self._numbers[5:]
+        self.optimizer = optim.make_optimizer(scene, self._rates)
+        self.resized()
+
+    def resized(self) -> None:
+        """To be called when the Gaussians have changed: forgets gradients, and the graph that knew the old ones."""
+        num = len(self.scene.static) + len(self.scene.dynamic)
+        self.statistics = GradientStatistics(num, self.views.device)
+        self._replay: Callable[[], None] | None = None
+        self._kind: tuple[object, ...] | None = None
+        self._warm = 0
+
+    def __call__(self, moment: Moment, draw: Draw) -> None:
+        """Runs the iteration of a moment of the schedule."""
+        rates = optim.learning_rates(self.config.optim, self.extent, moment.progress, moment.network_progress)
+        numbers = [draw.noise, moment.depth_weight, *draw.background.tolist(), *rates]
+        self._numbers.copy_(torch.tensor(numbers), non_blocking=True)
+        self._index.fill_(draw.view)
+        if not (self.config.graph and self.views.resident and self.views.device.type == "cuda"):
+            self._run(moment, self.views[draw.view])
+            return
+        kind = (moment.stage.name, moment.moving, moment.relit, moment.sh_degree, moment.depth_weight > 0)
+        if kind != self._kind:
+            self._kind, self._warm, self._replay = kind, 0, None
+        if self._replay is None and self._warm == WARM_UPS:
+            self._replay = record(lambda: self._run(moment, self.views.pick(self._index)))
+        if self._replay is not None:
+            self._replay()
+        else:
+            self._warm += 1
+            self._run(moment, self.views.pick(self._index))
+
+    def _run(self, moment: Moment, view: View) -> None:
+        self._choose_trained(moment)
+        splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, self._noise)
+        settings = RenderSettings(branches=True, depth=moment.depth_weight > 0, antialias=self.config.antialias)
+        rendering = render(splats, view.camera, settings=settings)
+        terms = self._loss_terms(moment, view, rendering)
+        torch.stack(list(terms.values())).sum().backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.statistics.observe(rendering.gradient_norms, rendering.radii)
+        self._note(terms, rendering, view)
+
+    def _loss_terms(self, moment: Moment, view: View, rendering: Rendering) -> dict[str, Tensor]:
+        """Paper Eq. 15: static, dynamic and depth loss; in stage II also the joint image against the whole truth."""
+        weights = self.config.loss
+        static, dynamic = rendering.static, rendering.dynamic
+        assert static is not None
+        assert dynamic is not None
+        truth, mask = view.image, view.static_mask
+        terms = {"static": weights.static * losses.static_loss(static.image, truth, mask, weights.ssim)}
+        branches = [("depth", static, mask, 1.0)]
+        if moment.stage.name != "pretrain":
+            image = dynamic.image + (1.0 - dynamic.alpha)[..., None] * self._background
+            terms["dynamic"] = weights.dynamic * losses.dynamic_loss(image, truth, mask, weights.ssim, self._background)
+            branches.append(("depth_dynamic", dynamic, ~mask, weights.depth_dynamic))
+        if moment.joint:
+            terms["joint"] = weights.joint * losses.image_loss(rendering.joint.image, truth, weights.ssim)
+        if moment.depth_weight > 0:
+            target = depth.metric_depth(view.inverse_depth, self.alignments.index_select(0, self._index)[0])
+            for name, layer, region, weight in branches:
+                if weight > 0:
+                    assert layer.depth is not None
+                    loss = losses.depth_loss(layer.depth, layer.alpha, target, region)
+                    terms[name] = weight * self._depth_weight * loss
+        return terms
+
+    def _choose_trained(self, moment: Moment) -> None:
+        """Which parameters this stage trains; the others get no gradient and stay."""
+        in_stage2 = moment.stage.name == "stage2"
+        for name, parameter in self.scene.static.named_parameters():
+            is_geometry = name in ("means", "quats", "log_scales")
+            stays = self.config.static_geometry if is_geometry else self.config.static_appearance or not moment.relit
+            parameter.requires_grad_(stays or not in_stage2)
+        self.scene.deformation.requires_grad_(moment.moving)
+        self.scene.appearance.requires_grad_(moment.relit)
+
+    @torch.no_grad()
+    def _note(self, terms: dict[str, Tensor], rendering: Rendering, view: View) -> None:
+        """Adds to the sums since the last look, without waiting for the device."""
+        error = (rendering.joint.image.clamp(0, 1) - view.image).square().mean()
+        nothing = torch.zeros_like(error)
+        values = [terms.get(name, nothing) for name in TERMS]
+        self.sums += torch.stack([*values, -10.0 * error.log10(), nothing + 1.0])
