@@ -6,8 +6,14 @@ torus around z, of radii 1 and TUBE, which is found by marching along its distan
 
     f(x) = |(|x_xy| − 1, x_z)| − TUBE
 
-in steps of f (A is a rotation and a scale then). A normal n_body turns into Aᵀ n_body. Light comes from a disc: every
-sample of a pixel looks at its own point of it. Shading is Lambert's and Blinn's, over a hemispherical ambient light.
+in steps of f (A is a rotation and a scale then). A normal n_body turns into Aᵀ n_body. Shading is Lambert's and
+Blinn's, over a hemispherical ambient light.
+
+Light comes from a parallelogram: every sample of a pixel looks at its own point of it, at (2u − 1, 2v − 1) half axes.
+Pixels share their samples, which would show as rings in soft shadows; so (u, v) is shifted, modulo 1, from pixel to
+pixel by interleaved gradient noise (Jimenez 2014), whose values differ as much as they can between neighbours:
+
+    noise(x, y) = frac(52.9829189 · frac(0.06711056 x + 0.00583715 y)).
 """
 
 import warp as wp
@@ -37,20 +43,21 @@ def torus_distance(p: wp.vec3) -> float:
 
 
 @wp.func
-def hit_sphere(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+def hit_sphere(o: wp.vec3, d: wp.vec3) -> float:
+    """Smallest t > 0 of a hit from outside, FAR without one; so for every shape."""
     a = wp.dot(d, d)
     b = wp.dot(o, d)
     root = b * b - a * (wp.dot(o, o) - 1.0)
     if root < 0.0:
         return FAR
     t = (-b - wp.sqrt(root)) / a
-    if t > nearest:
+    if t > 0.0:
         return t
     return FAR
 
 
 @wp.func
-def hit_cube(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+def hit_cube(o: wp.vec3, d: wp.vec3) -> float:
     enter = -FAR
     leave = FAR
     for axis in range(3):
@@ -63,22 +70,22 @@ def hit_cube(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
             return FAR
     if enter > leave:
         return FAR
-    if enter > nearest:
+    if enter > 0.0:
         return enter
-    if leave > nearest:
+    if leave > 0.0:
         return leave
     return FAR
 
 
 @wp.func
-def hit_torus(o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+def hit_torus(o: wp.vec3, d: wp.vec3) -> float:
     # Only the part of the ray inside the ball around the torus is marched.
     a = wp.dot(d, d)
     b = wp.dot(o, d)
     root = b * b - a * (wp.dot(o, o) - (1.0 + TUBE) * (1.0 + TUBE))
     if root < 0.0:
         return FAR
-    t = wp.max((-b - wp.sqrt(root)) / a, nearest)
+    t = wp.max((-b - wp.sqrt(root)) / a, 0.0)
     leave = (-b + wp.sqrt(root)) / a
     speed = wp.sqrt(a)
     for _step in range(MARCH_STEPS):
@@ -101,12 +108,12 @@ def into_body(bodies: wp.array3d[float], body: int, p: wp.vec3, w: float) -> wp.
 
 
 @wp.func
-def hit_body(kind: int, o: wp.vec3, d: wp.vec3, nearest: float) -> float:
+def hit_body(kind: int, o: wp.vec3, d: wp.vec3) -> float:
     if kind == SPHERE:
-        return hit_sphere(o, d, nearest)
+        return hit_sphere(o, d)
     if kind == CUBE:
-        return hit_cube(o, d, nearest)
-    return hit_torus(o, d, nearest)
+        return hit_cube(o, d)
+    return hit_torus(o, d)
 
 
 @wp.func
@@ -134,6 +141,81 @@ def soft_checks(p: wp.vec3, frequency: float) -> float:
     return 0.5 + 0.5 * wave / (wp.abs(wave) + 0.06)
 
 
+@wp.func
+def noise(x: float, y: float) -> float:
+    inner = 0.06711056 * x + 0.00583715 * y
+    outer = 52.9829189 * (inner - wp.floor(inner))
+    return outer - wp.floor(outer)
+
+
+@wp.func
+def lamp_point(lamp: wp.array2d[float], u: float, v: float) -> wp.vec3:
+    """Point of the lamp at (u, v), of which the fractions count."""
+    a = 2.0 * (u - wp.floor(u)) - 1.0
+    b = 2.0 * (v - wp.floor(v)) - 1.0
+    center = wp.vec3(lamp[0, 0], lamp[0, 1], lamp[0, 2])
+    return center + a * wp.vec3(lamp[1, 0], lamp[1, 1], lamp[1, 2]) + b * wp.vec3(lamp[2, 0], lamp[2, 1], lamp[2, 2])
+
+
+@wp.func
+def nearest_body(kinds: wp.array[int], bodies: wp.array3d[float], o: wp.vec3, d: wp.vec3):
+    """(t, body) of the first hit; (FAR, −1) without one."""
+    nearest = float(FAR)
+    body = int(-1)
+    for k in range(kinds.shape[0]):
+        t = hit_body(kinds[k], into_body(bodies, k, o, 1.0), into_body(bodies, k, d, 0.0))
+        if t < nearest:
+            nearest = t
+            body = k
+    return nearest, body
+
+
+@wp.func
+def is_blocked(kinds: wp.array[int], bodies: wp.array3d[float], start: wp.vec3, to_light: wp.vec3) -> bool:
+    for k in range(kinds.shape[0]):
+        if hit_body(kinds[k], into_body(bodies, k, start, 1.0), into_body(bodies, k, to_light, 0.0)) < 1.0:
+            return True
+    return False
+
+
+@wp.func
+def world_normal(bodies: wp.array3d[float], body: int, n: wp.vec3) -> wp.vec3:
+    """Aᵀ n of a body, of length 1."""
+    x = bodies[body, 0, 0] * n[0] + bodies[body, 1, 0] * n[1] + bodies[body, 2, 0] * n[2]
+    y = bodies[body, 0, 1] * n[0] + bodies[body, 1, 1] * n[1] + bodies[body, 2, 1] * n[2]
+    z = bodies[body, 0, 2] * n[0] + bodies[body, 1, 2] * n[1] + bodies[body, 2, 2] * n[2]
+    return wp.normalize(wp.vec3(x, y, z))
+
+
+@wp.func
+def shade(
+    kinds: wp.array[int],
+    bodies: wp.array3d[float],
+    colors: wp.array2d[wp.vec3],
+    frequencies: wp.array[float],
+    body: int,
+    point: wp.vec3,
+    view: wp.vec3,
+    source: wp.vec3,
+) -> wp.vec3:
+    """Colour of a body's point, seen from the direction ``view`` and lit from ``source``."""
+    local = into_body(bodies, body, point, 1.0)
+    normal = world_normal(bodies, body, body_normal(kinds[body], local))
+    if wp.dot(normal, view) < 0.0:
+        normal = -normal  # a room is seen from inside
+    start = point + SHADOW_OFFSET * normal
+    to_light = source - start
+    light = wp.normalize(to_light)
+    lit = wp.max(wp.dot(normal, light), 0.0)
+    if lit > 0.0 and is_blocked(kinds, bodies, start, to_light):
+        lit = 0.0
+    checks = soft_checks(local, frequencies[body])
+    color = checks * colors[body, 0] + (1.0 - checks) * colors[body, 1]
+    ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normal[2])
+    gloss = wp.pow(wp.max(wp.dot(normal, wp.normalize(light + view)), 0.0), GLOSS)
+    return (ambient + DIFFUSE * lit) * color + wp.vec3(SHINE * gloss * lit)
+
+
 @wp.kernel(enable_backward=False)
 def raytrace_fwd(
     first: int,
@@ -157,6 +239,8 @@ def raytrace_fwd(
     down = wp.vec3(viewmat[1, 0], viewmat[1, 1], viewmat[1, 2])
     forward = wp.vec3(viewmat[2, 0], viewmat[2, 1], viewmat[2, 2])
     origin = -(right * viewmat[0, 3] + down * viewmat[1, 3] + forward * viewmat[2, 3])
+    shift_u = noise(column, row)
+    shift_v = noise(row, column)
     total = wp.vec3(0.0)
     num_samples = samples.shape[0]
     # Sample −1 goes through the pixel's centre and gives depth and body; the others give the colour.
@@ -167,46 +251,12 @@ def raytrace_fwd(
         u = (column + sample[0] - K[0, 2]) / K[0, 0]
         v = (row + sample[1] - K[1, 2]) / K[1, 1]
         direction = right * u + down * v + forward  # so that t is the depth
-        nearest = float(FAR)
-        body = int(-1)
-        for k in range(kinds.shape[0]):
-            t = hit_body(kinds[k], into_body(bodies, k, origin, 1.0), into_body(bodies, k, direction, 0.0), 0.0)
-            if t < nearest:
-                nearest = t
-                body = k
+        t, body = nearest_body(kinds, bodies, origin, direction)
         if index < 0:
-            depth[pixel] = nearest
+            depth[pixel] = t
             hits[pixel] = body
         elif body >= 0:
-            point = origin + nearest * direction
-            local = into_body(bodies, body, point, 1.0)
-            n = body_normal(kinds[body], local)
-            normal = wp.normalize(
-                wp.vec3(
-                    bodies[body, 0, 0] * n[0] + bodies[body, 1, 0] * n[1] + bodies[body, 2, 0] * n[2],
-                    bodies[body, 0, 1] * n[0] + bodies[body, 1, 1] * n[1] + bodies[body, 2, 1] * n[2],
-                    bodies[body, 0, 2] * n[0] + bodies[body, 1, 2] * n[1] + bodies[body, 2, 2] * n[2],
-                )
-            )
+            source = lamp_point(lamp, sample[2] + shift_u, sample[3] + shift_v)
             view = -wp.normalize(direction)
-            if wp.dot(normal, view) < 0.0:
-                normal = -normal  # a room is seen from inside
-            source = wp.vec3(
-                lamp[0, 0] + sample[2] * lamp[1, 0] + sample[3] * lamp[2, 0],
-                lamp[0, 1] + sample[2] * lamp[1, 1] + sample[3] * lamp[2, 1],
-                lamp[0, 2] + sample[2] * lamp[1, 2] + sample[3] * lamp[2, 2],
-            )
-            start = point + SHADOW_OFFSET * normal
-            to_light = source - start
-            lit = float(1.0)
-            for k in range(kinds.shape[0]):
-                if hit_body(kinds[k], into_body(bodies, k, start, 1.0), into_body(bodies, k, to_light, 0.0), 0.0) < 1.0:
-                    lit = 0.0
-            light = wp.normalize(to_light)
-            lit = lit * wp.max(wp.dot(normal, light), 0.0)
-            checks = soft_checks(local, frequencies[body])
-            color = checks * colors[body, 0] + (1.0 - checks) * colors[body, 1]
-            ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normal[2])
-            gloss = wp.pow(wp.max(wp.dot(normal, wp.normalize(light + view)), 0.0), GLOSS)
-            total += (ambient + DIFFUSE * lit) * color + wp.vec3(SHINE * gloss * lit)
+            total += shade(kinds, bodies, colors, frequencies, body, origin + t * direction, view, source)
     image[pixel] = total / float(num_samples)

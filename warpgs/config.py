@@ -45,8 +45,9 @@ class ModelConfig:
     """Highest degree of spherical harmonics."""
     appearance_degree: int = 0
     """Highest degree of spherical harmonics that the appearance network changes."""
-    appearance_opacity: bool = True
-    """Whether the appearance network changes opacities, too."""
+    appearance_opacity: bool = False
+    """Whether the appearance network changes opacities, too (paper Eq. 8); off, because seen from one camera at a time
+    they fit shadows by making Gaussians at wrong depths come and go."""
     max_static_points: int = 100_000
     """Static Gaussians to begin with, at most."""
     dynamic_points: int = 20_000

@@ -43,6 +43,10 @@ def nearest(kinds: Tensor, bodies: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor
     return t, torch.where(t < FAR, body, -1)
 
 
+def noise(x: Tensor, y: Tensor) -> Tensor:
+    return (52.9829189 * ((0.06711056 * x + 0.00583715 * y) % 1)) % 1
+
+
 def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size):
     """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace."""
     width, height = size
@@ -55,6 +59,8 @@ def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size
         d = torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1) @ R
         return origin.expand_as(d), d
 
+    column, row = pixels.unbind(1)
+    shift = torch.stack([noise(column, row), noise(row, column)], 1)
     total = torch.zeros(len(pixels), 3, dtype=viewmat.dtype)
     for sample in samples:
         o, d = rays(sample[:2])
@@ -70,7 +76,7 @@ def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size
         view = -torch.nn.functional.normalize(d, dim=1)
         n = torch.where((n * view).sum(1, keepdim=True) < 0, -n, n)
         start = p + 1e-3 * n
-        to_light = lamp[0] + sample[2] * lamp[1] + sample[3] * lamp[2] - start
+        to_light = lamp[0] + (2 * ((sample[2:] + shift) % 1) - 1) @ lamp[1:] - start
         blocked, _ = nearest(kinds, bodies, start, to_light)
         light = torch.nn.functional.normalize(to_light, dim=1)
         lit = (blocked >= 1) * (n * light).sum(1).clamp_min(0)

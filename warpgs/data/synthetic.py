@@ -4,10 +4,12 @@ Ray-traced, and written in the layout of NeRF-DS, so that it takes the same way 
 """
 
 import hashlib
+import io
 import json
 import math
 import os
 import shutil
+import sys
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,7 +32,7 @@ POINT_NOISE = 0.004
 BASELINE = 0.16
 """Distance of the evaluation camera, to the right of the training camera [world units]."""
 
-VERSION = 1
+VERSION = 2
 """To be raised when the pictures change, so that cached ones are made anew."""
 
 
@@ -48,7 +50,7 @@ class BuiltinScene:
     width: int = 240
     height: int = 136
     num_frames: int = 60
-    num_samples: int = 8
+    num_samples: int = 16
     num_points: int = 4000
 
 
@@ -80,13 +82,13 @@ def _turn(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Tensor:
 def _static_bodies() -> list[_Body]:
     straight = _turn()
     return [
-        _Body(CUBE, (0.0, 0.0, 1.2), (3.1, 3.1, 1.9), ((0.62, 0.66, 0.72), (0.74, 0.71, 0.64)), 9.0, straight),
+        _Body(CUBE, (0.0, 0.0, 1.2), (3.1, 3.1, 1.9), ((0.62, 0.66, 0.72), (0.74, 0.71, 0.64)), 8.0, straight),
         _Body(CUBE, (0.0, 0.0, -0.06), (1.55, 1.25, 0.06), ((0.80, 0.72, 0.55), (0.72, 0.62, 0.46)), 7.0, straight),
         _Body(
-            CUBE, (-0.75, 0.62, 0.30), (0.22, 0.22, 0.30), ((0.25, 0.42, 0.72), (0.85, 0.86, 0.80)), 5.0, _turn(z=0.5)
+            CUBE, (-0.75, 0.62, 0.30), (0.22, 0.22, 0.30), ((0.25, 0.42, 0.72), (0.85, 0.86, 0.80)), 4.6, _turn(z=0.5)
         ),
         _Body(
-            CUBE, (0.95, 0.55, 0.17), (0.19, 0.19, 0.17), ((0.30, 0.60, 0.42), (0.82, 0.84, 0.62)), 4.0, _turn(z=-0.3)
+            CUBE, (0.95, 0.55, 0.17), (0.19, 0.19, 0.17), ((0.30, 0.60, 0.42), (0.82, 0.84, 0.62)), 4.6, _turn(z=-0.3)
         ),
         _Body(SPHERE, (0.30, 0.80, 0.22), (0.22, 0.22, 0.22), ((0.72, 0.40, 0.62), (0.80, 0.55, 0.70)), 6.0, straight),
     ]
@@ -97,12 +99,12 @@ def _moving_bodies(time: float) -> list[_Body]:
     turn = 2.0 * math.pi * time
     ring_center = (0.32 + 0.30 * math.sin(turn), -0.12, 0.62 + 0.06 * math.cos(turn))
     squash = 0.22 * math.sin(2.0 * turn)
-    radius = 0.27
+    radius = 0.24
     half_sizes = (radius * (1 + 0.5 * squash), radius * (1 + 0.5 * squash), radius * (1 - squash))
-    ball_center = (-0.62 + 0.28 * math.cos(turn), -0.42 + 0.12 * math.sin(turn), half_sizes[2])
+    ball_center = (-0.52 + 0.26 * math.cos(turn), -0.42 + 0.12 * math.sin(turn), half_sizes[2])
     ring, ball = ((0.86, 0.58, 0.38), (0.70, 0.36, 0.24)), ((0.86, 0.30, 0.24), (0.93, 0.82, 0.50))
     return [
-        _Body(TORUS, ring_center, (0.30, 0.30, 0.30), ring, 4.0, _turn(x=0.9 + turn, z=0.5 * turn), moves=True),
+        _Body(TORUS, ring_center, (0.25, 0.25, 0.25), ring, 4.0, _turn(x=0.9 + turn, z=0.5 * turn), moves=True),
         _Body(SPHERE, ball_center, half_sizes, ball, 5.0, _turn(z=0.7 * math.sin(turn)), moves=True),
     ]
 
@@ -142,7 +144,6 @@ def _samples(count: int, device: torch.device) -> Tensor:
     root = 1.1673039782614187  # the real root of x⁵ = x + 1, for four dimensions
     steps = torch.tensor([root**-k for k in (1, 2, 3, 4)], dtype=torch.float64)
     places = (0.5 + torch.arange(1, count + 1)[:, None] * steps) % 1.0
-    places[:, 2:] = 2.0 * places[:, 2:] - 1.0
     return places.float().contiguous().to(device)
 
 
@@ -154,7 +155,7 @@ def picture(time: float, shift: float, scene: BuiltinScene, device: torch.device
     return raytrace(bodies, lamp, samples, camera.viewmat, camera.K, camera.size), camera
 
 
-def write_builtin(folder: Path, scene: BuiltinScene, device: torch.device, quiet: bool = False) -> None:
+def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.device, quiet: bool = False) -> None:
     """Writes the capture into an empty folder.
 
     Raises:
@@ -163,11 +164,12 @@ def write_builtin(folder: Path, scene: BuiltinScene, device: torch.device, quiet
     """
     if scene.num_frames < 2:
         raise ValueError(f"the built-in scene needs at least 2 frames, got {scene.num_frames}")
+    hidden = quiet or not sys.stdout.isatty()
     num_static = len(_static_bodies())
     jobs = [("left", k, 0.0) for k in range(scene.num_frames)]
     jobs += [("right", k, BASELINE) for k in range(0, scene.num_frames, 2)]
     metadata, points = {}, []
-    for side, k, shift in track(jobs, "making the built-in scene", disable=quiet, transient=True):
+    for side, k, shift in track(jobs, "making the built-in scene", disable=hidden, transient=True):
         name = f"{side}_{k:06d}"
         shot, camera = picture(k / (scene.num_frames - 1), shift, scene, device)
         static = (shot.bodies < num_static).cpu()
@@ -182,8 +184,13 @@ def write_builtin(folder: Path, scene: BuiltinScene, device: torch.device, quiet
     left, right = ([n for n in metadata if n.startswith(side)] for side in ("left", "right"))
     dataset = {"count": len(metadata), "num_exemplars": len(left), "ids": [*metadata], "train_ids": left}
     _write_json(folder / "dataset.json", {**dataset, "val_ids": right})
-    _write_json(folder / "scene.json", {"center": CENTER, "scale": SCALE, "near": 0.05, "far": 4.0})
-    np.save(folder / "points.npy", torch.cat(points)[: scene.num_points].numpy())
+    _write_json(
+        folder / "scene.json",
+        {"center": CENTER, "scale": SCALE, "bbox": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 4.0},
+    )
+    array = io.BytesIO()
+    np.save(array, torch.cat(points)[: scene.num_points].numpy())
+    _write(folder / "points.npy", array.getvalue())
 
 
 def _camera_facts(camera: Camera) -> dict[str, object]:
@@ -221,18 +228,24 @@ def _surface_points(depth: Tensor, static: Tensor, camera: Camera, k: int, scene
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    path.write_bytes(data.tobytes())
+    _write(path, data.tobytes())
 
 
 def _write_json(path: Path, values: object) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(values))
+    _write(path, json.dumps(values).encode())
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    except OSError as error:  # which does not name the file when the disk is full
+        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
 
 
 def builtin_capture(
-    cache: Path | None = None,
+    cache_dir: Path | None = None,
     scene: BuiltinScene | None = None,
     device: torch.device | None = None,
     quiet: bool = False,
@@ -242,25 +255,29 @@ def builtin_capture(
     It is written beside its place and moved there whole, so a capture that was interrupted is never used.
 
     Args:
-        cache: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
+        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
         scene: Its size; the default one if None.
         device: Where to trace; the CPU if None.
-        quiet: Whether to show no progress bar.
+        quiet: Whether to show no progress bar; there is none either where stdout is no terminal.
 
     Raises:
-        OSError: If it can't be written.
+        ValueError: If there are fewer than two frames.
+        OSError: If it can't be written; the message says what.
     """
     scene = scene or BuiltinScene()
-    if cache is None:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
+    if cache_dir is None:
+        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
     key = hashlib.blake2b(json.dumps([VERSION, asdict(scene)]).encode(), digest_size=6).hexdigest()
-    folder = cache / key / "builtin"
+    folder = cache_dir / key / "builtin"
     if folder.is_dir():
         return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix="partial-"))
     try:
-        write_builtin(partial, scene, device or torch.device("cpu"), quiet)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix="partial-"))
+    except OSError as error:
+        raise OSError(f"the built-in scene can't be kept in {folder.parent}: {error.strerror}") from error
+    try:
+        write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet)
         try:
             partial.rename(folder)
         except OSError:

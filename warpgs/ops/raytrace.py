@@ -58,7 +58,8 @@ def raytrace(
     Args:
         bodies: What there is.
         lamp: [3, 3] its centre and two half axes.
-        samples: [S, 4] place in the pixel, in [0, 1]², and on the lamp, in [-1, 1]², of every sample of a pixel.
+        samples: [S, 4] place in the pixel and on the lamp, in [0, 1]⁴, of every sample of a pixel; the place on the
+            lamp is shifted from pixel to pixel.
         viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
         K: [3, 3] intrinsics [px] with pixel centres at +0.5.
         size: (width, height) [px].
