@@ -1,6 +1,10 @@
-import dataclasses
-import os
+import errno
+import json
+import re
+from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -12,9 +16,46 @@ SMALL = BuiltinScene(width=48, height=28, num_frames=4, num_samples=2, num_point
 CPU = torch.device("cpu")
 
 
+NUM_STATIC = len(synthetic._static_bodies())
+
+
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return load_capture(builtin_capture(tmp_path_factory.mktemp("cache"), SMALL, quiet=True))
+def folder(tmp_path_factory):
+    return builtin_capture(tmp_path_factory.mktemp("cache"), SMALL, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def capture(folder):
+    return load_capture(folder)
+
+
+def test_every_frame_has_all_its_files(folder):
+    left, right = [f"left_{k:06d}" for k in range(4)], ["right_000000", "right_000002"]
+    frames = left + right
+    expected = {"dataset.json", "metadata.json", "scene.json", "points.npy"}
+    expected |= {f"camera/{n}.json" for n in frames} | {f"rgb/1x/{n}.png" for n in frames}
+    expected |= {f"resized_mask/1x/{n}.png.png" for n in frames} | {f"depth/1x/{n}.png" for n in left}
+    assert {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()} == expected
+    dataset = json.loads((folder / "dataset.json").read_text())
+    assert dataset["train_ids"] == left
+    assert dataset["val_ids"] == right
+    assert set(dataset["ids"]) == set(json.loads((folder / "metadata.json").read_text())) == set(frames)
+
+
+def test_masks_are_0_exactly_where_a_moving_body_is_at_the_centre_of_a_pixel(folder):
+    shot, _ = picture(1 / 3, 0.0, SMALL, CPU)
+    mask = cv2.imread(str(folder / "resized_mask/1x/left_000001.png.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(mask, np.where(shot.bodies.numpy() >= NUM_STATIC, 0, 255))
+
+
+@pytest.mark.parametrize("name", ["left_000000", "left_000001", "left_000003", "right_000002"])
+def test_the_centre_of_the_ball_is_seen_within_the_mask(capture, name):
+    time = int(name[-1]) / 3
+    ball = synthetic._moving_bodies(time)[1]
+    center = (torch.tensor([ball.center]) - torch.tensor(synthetic.CENTER)) * synthetic.SCALE
+    row, column, _, inside = capture.cameras[name].project(center)
+    assert bool(inside)
+    assert not capture.frame(name).static_mask[row, column]
 
 
 def test_it_loads_as_a_nerfds_capture(capture):
@@ -33,13 +74,28 @@ def test_the_evaluation_camera_is_beside_the_training_camera(capture):
     assert float(distance) == pytest.approx(synthetic.BASELINE * synthetic.SCALE, rel=1e-4)
 
 
-def test_points_lie_on_static_surfaces(capture):
-    shot, _ = picture(0.0, 0.0, SMALL, CPU)
-    row, column, depth, inside = capture.cameras["left_000000"].project(capture.points)
-    seen = shot.depth[row, column] * synthetic.SCALE
-    # Some points were seen from other views only; those that are seen here are at the surface.
-    close = (depth - seen).abs() < 0.02
-    assert (close & inside).sum() > 0.5 * inside.sum()
+def distances(points, body):
+    """Distance of points from a static body's surface; from that of an ellipsoid only if it is a ball."""
+    local = ((points - torch.tensor(body.center)) @ body.turn).abs()
+    half = torch.tensor(body.half_sizes)
+    if body.kind == synthetic.SPHERE:
+        return (local.norm(dim=1) - half[0]).abs()
+    beyond = local - half
+    return (beyond.clamp_min(0).norm(dim=1) + beyond.amax(1).clamp_max(0)).abs()
+
+
+def test_points_lie_on_static_surfaces_up_to_their_noise(folder):
+    points = torch.from_numpy(np.load(folder / "points.npy"))
+    distance = torch.stack([distances(points, body) for body in synthetic._static_bodies()]).amin(0)
+    assert points.shape == (200, 3)
+    assert float(distance.max()) < 5 * synthetic.POINT_NOISE
+
+
+def test_points_are_seen_from_the_training_cameras(capture):
+    seen = [capture.cameras[name].project(capture.points) for name in capture.train]
+    assert all(bool((depth > 0).all()) for _, _, depth, _ in seen)
+    # Noise may push a point from the outermost pixels out of the picture.
+    assert torch.stack([inside for *_, inside in seen]).any(0).float().mean() > 0.97
 
 
 def test_monocular_depth_is_inverse_depth_up_to_scale_and_offset(capture):
@@ -50,19 +106,31 @@ def test_monocular_depth_is_inverse_depth_up_to_scale_and_offset(capture):
     assert torch.corrcoef(together)[0, 1] > 0.9999
 
 
+def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
+    fits = []
+    for k, name in enumerate(capture.train):
+        truth = 1.0 / picture(k / 3, 0.0, SMALL, CPU)[0].depth.flatten()
+        inverse = capture.frame(name).inverse_depth.flatten()
+        fits.append(torch.linalg.lstsq(torch.stack([truth, torch.ones_like(truth)], 1), inverse[:, None]).solution)
+    assert bool((torch.cat(fits, 1).amax(1) - torch.cat(fits, 1).amin(1) > 0.02).all())
+
+
 def test_shadows_move_over_static_pixels():
-    (early, _), (late, _) = (picture(time, 0.0, SMALL, CPU) for time in (0.25, 0.5))
-    fixed = dataclasses.replace(SMALL)
-    camera = synthetic._camera(0.0, fixed, 0.0)
-    shots = []
-    for time in (0.0, 0.4):
-        bodies = synthetic._as_tensors([*synthetic._static_bodies(), *synthetic._moving_bodies(time)], CPU)
-        lamp, samples = synthetic._lamp(CPU), synthetic._samples(4, CPU)
-        shots.append(synthetic.raytrace(bodies, lamp, samples, camera.viewmat, camera.K, camera.size))
-    static = (shots[0].bodies == shots[1].bodies) & (shots[0].bodies < len(synthetic._static_bodies()))
-    change = (shots[0].image - shots[1].image).abs().mean(-1)
+    camera, lamp, samples = synthetic._camera(0.0, SMALL, 0.0), synthetic._lamp(CPU), synthetic._samples(4, CPU)
+    early, late = (
+        synthetic.raytrace(
+            synthetic._as_tensors([*synthetic._static_bodies(), *synthetic._moving_bodies(time)], CPU),
+            lamp,
+            samples,
+            camera.viewmat,
+            camera.K,
+            camera.size,
+        )
+        for time in (0.0, 0.4)
+    )
+    static = (early.bodies == late.bodies) & (early.bodies < NUM_STATIC)
+    change = (early.image - late.image).abs().mean(-1)
     assert (change[static] > 0.1).sum() > 10
-    assert early.image.shape == late.image.shape
 
 
 def test_the_same_bytes_are_written_twice(tmp_path):
@@ -74,7 +142,7 @@ def test_the_same_bytes_are_written_twice(tmp_path):
 
 def test_a_finished_capture_is_not_made_again(tmp_path, monkeypatch):
     folder = builtin_capture(tmp_path, SMALL, quiet=True)
-    monkeypatch.setattr(synthetic, "write_builtin", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(synthetic, "write_builtin_capture", lambda *_: pytest.fail("made again"))
     assert builtin_capture(tmp_path, SMALL, quiet=True) == folder
 
 
@@ -84,15 +152,34 @@ def test_an_interrupted_capture_is_never_used(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(synthetic, "write_builtin", interrupt)
+        patch.setattr(synthetic, "write_builtin_capture", interrupt)
         with pytest.raises(KeyboardInterrupt):
             builtin_capture(tmp_path, SMALL, quiet=True)
     assert list(tmp_path.rglob("dataset.json")) == []
     assert (builtin_capture(tmp_path, SMALL, quiet=True) / "points.npy").exists()
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_that_can_not_be_written_is_an_oserror(tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(OSError, match=str(tmp_path)):
-        builtin_capture(tmp_path / "cache", SMALL, quiet=True)
+def test_another_size_is_another_capture(tmp_path):
+    other = BuiltinScene(**{**vars(SMALL), "num_points": 100})
+    assert builtin_capture(tmp_path, SMALL, quiet=True) != builtin_capture(tmp_path, other, quiet=True)
+
+
+def test_a_cache_that_can_not_be_made_is_told_in_words(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=f"can't be kept in {re.escape(str(tmp_path / 'file'))}"):
+        builtin_capture(tmp_path / "file", SMALL, quiet=True)
+
+
+def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=r"left_000000\.png could not be written: No space left"):
+        builtin_capture(tmp_path, SMALL, quiet=True)
+    assert [p for p in tmp_path.rglob("*") if p.is_file() or p.name.startswith("partial")] == []
+
+
+def test_one_frame_is_refused_in_words(tmp_path):
+    with pytest.raises(ValueError, match="at least 2 frames, got 1"):
+        builtin_capture(tmp_path, BuiltinScene(num_frames=1), quiet=True)
