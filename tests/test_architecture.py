@@ -19,7 +19,7 @@ ORDER = [
     {"losses", "metrics", "lpips", "pictures", "optim", "densify", "prune", "depth", "views", "initialize"},
     {"stages", "checkpoint", "logbook", "interrupt"},
     {"step"},
-    {"evaluate", "bench"},
+    {"evaluate", "bench", "prepare"},
     {"trainer", "runs"},
     {"cli"},
 ]

@@ -7,6 +7,7 @@ import warp as wp
 
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
+from warpgs.kernels.encoding import make_encode
 from warpgs.kernels.rows import make_pack, make_unpack
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
 from warpgs.ops.compositing import CUDA_PIXELS
@@ -22,9 +23,14 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-@pytest.mark.parametrize("name", ["covariance", "projection", "raytrace", "sh", "tiles"])
+@pytest.mark.parametrize("name", ["activation", "adam", "covariance", "projection", "raytrace", "sh", "tiles"])
 def test_a_module_of_kernels_compiles(name, tmp_path):
     assert_compiles(importlib.import_module(f"warpgs.kernels.{name}"), tmp_path)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_the_encoding_compiles(half, tmp_path):
+    assert_compiles(make_encode(half).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_pack, make_unpack])

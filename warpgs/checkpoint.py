@@ -46,8 +46,9 @@ def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
             os.fsync(file.fileno())
         os.replace(partial, path)
     except (OSError, SafetensorError) as error:
-        partial.unlink(missing_ok=True)
         raise OSError(f"{path} could not be written: {error}") from error
+    finally:
+        partial.unlink(missing_ok=True)  # also after Ctrl-C
 
 
 def load(path: Path) -> Checkpoint:
@@ -63,12 +64,23 @@ def load(path: Path) -> Checkpoint:
                 raise ValueError(f"{path} is not a checkpoint of warpgs")
             if metadata.get("version") != str(VERSION):
                 raise ValueError(f"{path} has version {metadata.get('version')}, this program reads {VERSION}")
-            facts = json.loads(metadata["facts"])
-            return Checkpoint({name: file.get_tensor(name) for name in file.keys()}, facts)  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return Checkpoint(_Parts(path, tensors), _Parts(path, json.loads(metadata["facts"])))
     except FileNotFoundError as error:
         raise ValueError(f"{path} does not exist") from error
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
+
+
+class _Parts(dict[str, Any]):
+    """Parts of a file by name; one that it lacks is an error that names the file."""
+
+    def __init__(self, path: Path, parts: dict[str, Any]) -> None:
+        super().__init__(**parts)
+        self._path = path
+
+    def __missing__(self, name: str) -> Any:
+        raise ValueError(f"{self._path} is damaged: it has no {name}")
 
 
 def path_of(run: Path, iteration: int) -> Path:
@@ -82,8 +94,8 @@ def saved(run: Path) -> list[Path]:
 
 
 def keep_newest(run: Path, count: int) -> None:
-    """Deletes all but the ``count`` newest checkpoints."""
-    for path in saved(run)[: -max(1, count)]:
+    """Deletes all but the ``count`` newest checkpoints, and what a killed program left half-written."""
+    for path in [*saved(run)[: -max(1, count)], *(run / FOLDER).glob("*.partial")]:
         path.unlink()
 
 
@@ -97,10 +109,12 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig, origin: Path) -> Spl
         name.removeprefix("scene."): tensor for name, tensor in checkpoint.tensors.items() if name.startswith("scene.")
     }
     try:
-        scene = SplitScene.empty(len(state["static.means"]), len(state["dynamic.means"]), config)
+        # Rows of three: the size of the file bounds their number, whatever shape it claims.
+        static, dynamic = state["static.means"].view(-1, 3), state["dynamic.means"].view(-1, 3)
+        scene = SplitScene.empty(len(static), len(dynamic), config)
         scene.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+        reason = str(error).splitlines()[:2][-1].strip()  # torch has the first detail on the second line
         raise ValueError(f"{origin} does not hold a scene of this run's config: {reason}") from error
     if not all(bool(torch.isfinite(tensor).all()) for tensor in state.values()):
         raise ValueError(f"{origin} holds values that are not finite")

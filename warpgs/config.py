@@ -48,10 +48,19 @@ class ModelConfig:
     appearance_opacity: bool = False
     """Whether the appearance network changes opacities, too (paper Eq. 8); off, because seen from one camera at a time
     they fit shadows by making Gaussians at wrong depths come and go."""
+    half: bool = True
+    """On CUDA, multiply matrices of the networks in half precision, with sums and weights in single precision."""
     max_static_points: int = 100_000
     """Static Gaussians to begin with, at most."""
     dynamic_points: int = 20_000
     """Dynamic Gaussians to begin with."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.appearance_degree <= self.sh_degree <= 3:
+            raise ValueError(
+                "expected 0 <= model.appearance_degree <= model.sh_degree <= 3, "
+                f"got {self.appearance_degree} and {self.sh_degree}"
+            )
 
 
 @dataclass(frozen=True)
@@ -134,6 +143,9 @@ class Schedule:
     """Iterations of stage I between visibility-driven prunings."""
     deform_from: int = 3_000
     """Iteration of stage I from which dynamic Gaussians move."""
+    relight_from: int = 0
+    """Iteration of stage I from which the appearance network changes static Gaussians. In the paper that is stage II;
+    by then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
     noise_until: int = 20_000
     """Iteration of stage I at which the noise on time has died away."""
     sh_degree_every: int = 1_000
@@ -193,8 +205,6 @@ class TrainConfig:
     """Whether stage II still optimises w⁰, the appearance that residuals are added to."""
     antialias: bool = False
     """Opacity compensation for the low-pass filter (Mip-Splatting)."""
-    tf32: bool = True
-    """On CUDA, multiply matrices of the networks in TF32."""
     graph: bool = True
     """On CUDA, replay iterations as CUDA graphs."""
     masks: MaskPerturbation = field(default_factory=MaskPerturbation)
@@ -275,6 +285,9 @@ def scaled(config: TrainConfig) -> TrainConfig:
         raise ValueError(f"--iterations must be at least 3, got {config.iterations}")
     total = schedule.pretrain + schedule.stage1 + schedule.stage2
     factor = config.iterations / total
-    values = {name: max(1, round(value * factor)) for name, value in dataclasses.asdict(schedule).items()}
-    values["stage2"] = config.iterations - values["pretrain"] - values["stage1"]
+    # What is 0 stays 0, what is not stays more; the stage with the most takes what rounding leaves.
+    values = {name: max(min(value, 1), round(value * factor)) for name, value in dataclasses.asdict(schedule).items()}
+    stages = ("pretrain", "stage1", "stage2")
+    longest = max(stages, key=values.__getitem__)
+    values[longest] += config.iterations - sum(values[name] for name in stages)
     return dataclasses.replace(config, schedule=Schedule(**values), iterations=None)

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from . import optim
 from .config import DensifyConfig
+from .ops.adam import Adam
 from .scene.gaussians import Gaussians
 
 RESET_OPACITY = 0.01
@@ -39,7 +40,7 @@ class GradientStatistics:
 @torch.no_grad()
 def densify(
     gaussians: Gaussians,
-    optimizer: torch.optim.Adam,
+    optimizer: Adam,
     gradients: Float[Tensor, " N"],
     extent: float,
     config: DensifyConfig,
@@ -89,7 +90,7 @@ def _scatter_children(gaussians: Gaussians, first: int, generator: torch.Generat
 
 
 @torch.no_grad()
-def reset_opacities(gaussians: Gaussians, optimizer: torch.optim.Adam) -> None:
+def reset_opacities(gaussians: Gaussians, optimizer: Adam) -> None:
     """Lowers all opacities to at most 0.01, so that what is not needed can be removed (3DGS)."""
     highest = torch.logit(torch.tensor(RESET_OPACITY)).item()
     gaussians.logit_opacities.clamp_(max=highest)

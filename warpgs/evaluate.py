@@ -60,8 +60,8 @@ class Evaluation:
 
     Attributes:
         views: One entry a view.
-        flicker: Mean absolute change between consecutive renderings of the static region through the middle
-            evaluation camera, held fixed; None with fewer than two moments. There is no truth of a fixed camera in a
+        flicker: Mean absolute change between consecutive renderings of the static region through the middle camera of
+            the evaluation, held fixed; None with fewer than two moments. There is no truth of a fixed camera in a
             capture of a moving one, so changes that are real (shadows) count too.
         fps: Joint images a second, everything that depends on time included.
         lpips_net: Network of LPIPS; None when it was not measured.
@@ -100,19 +100,16 @@ def evaluate(
 ) -> Evaluation:
     """Compares the scene with every evaluation frame of a capture.
 
+    Without any, flicker and frames a second are measured through its training cameras, and nothing else is.
+
     Args:
         render_at: The scene.
-        capture: With evaluation frames.
+        capture: Where the frames come from.
         device: Where the scene is rendered.
         lpips: On ``device``; not measured if None.
         on_view: Called with each view's number, frame, truth in [0, 1] and rendering.
         quiet: Whether to show no progress bar.
-
-    Raises:
-        ValueError: If the capture has no frames to evaluate on.
     """
-    if not capture.val:
-        raise ValueError(f"{capture.name} has no frames to evaluate on")
     views = []
     for index, name in enumerate(track(capture.val, "evaluating", disable=quiet, transient=True)):
         frame = capture.frame(name)
@@ -121,7 +118,7 @@ def evaluate(
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
-    cameras = [capture.cameras[name].to(device) for name in capture.val]
+    cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
     return Evaluation(
         views, _flicker(render_at, cameras), _frame_rate(render_at, cameras), lpips.net if lpips else None
     )

@@ -20,12 +20,13 @@ COLOR_VIEWS = 12
 def first_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
     """Static Gaussians at the sparse points (anywhere in the scene's box if there are none) and no dynamic ones yet."""
     center, half_size = init.scene_box(capture.points)
-    static = Gaussians.empty(0)
+    degree = config.model.sh_degree
+    static = Gaussians.empty(0, degree)
     if config.assume != "dynamic":
-        static = init.from_points(*_colored_points(config, capture, generator))
+        static = init.from_points(*_colored_points(config, capture, generator), degree)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return SplitScene(static, Gaussians.empty(0), config.model, center, half_size)
+        return SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -52,19 +53,19 @@ def dynamic_gaussians(
     generator: torch.Generator,
 ) -> Gaussians:
     """Dynamic Gaussians at moving pixels lifted by aligned depth; without depth, anywhere in the scene's box."""
-    most = config.model.dynamic_points
+    most, degree = config.model.dynamic_points, config.model.sh_degree
     if config.assume == "static":
-        return Gaussians.empty(0)
+        return Gaussians.empty(0, degree)
     if config.assume == "dynamic" and len(capture.points):
-        return init.from_points(*_colored_points(config, capture, generator))
+        return init.from_points(*_colored_points(config, capture, generator), degree)
     lifted = [_lift(views, index, alignments[index]) for index in range(len(views))]
     positions, colors = (torch.cat(values) for values in zip(*lifted, strict=True))
     if len(positions) == 0:
         trunk = scene.deformation.trunk
         positions = _anywhere(trunk.center.cpu(), trunk.half_size.cpu(), most, generator)
-        return init.from_points(positions, torch.full_like(positions, 0.5))
+        return init.from_points(positions, torch.full_like(positions, 0.5), degree)
     chosen = init.subsample(positions, most, generator)
-    return init.from_points(positions[chosen], colors[chosen])
+    return init.from_points(positions[chosen], colors[chosen], degree)
 
 
 def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Generator) -> Tensor:

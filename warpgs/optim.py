@@ -5,6 +5,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from .config import OptimConfig
+from .ops.adam import Adam
 from .scene.gaussians import PARAMETERS, Gaussians
 from .scene.split import SplitScene
 
@@ -24,7 +25,7 @@ GROUPS = (
 """Names of the parameter groups: each Gaussian parameter of each branch, and each network."""
 
 
-def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> torch.optim.Adam:
+def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> Adam:
     """Adam with the groups of ``GROUPS``.
 
     Args:
@@ -40,7 +41,7 @@ def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> torch.
         }
         for name, rate in zip(GROUPS, rates.unbind(), strict=True)
     ]
-    return torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True, capturable=rates.is_cuda)
+    return Adam(groups, BETAS, EPSILON)
 
 
 def learning_rates(
@@ -76,7 +77,7 @@ def exponential(start: float, end: float, progress: float) -> float:
 
 
 @torch.no_grad()
-def gather(optimizer: torch.optim.Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
+def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
     """Resizes Gaussians and their moments: the first ``num_kept`` keep their parents', the others start at 0."""
     gaussians.gather(parents)
     for parameter in gaussians.parameters():
@@ -89,7 +90,7 @@ def gather(optimizer: torch.optim.Adam, gaussians: Gaussians, parents: Int64[Ten
 
 
 @torch.no_grad()
-def forget(optimizer: torch.optim.Adam, parameter: nn.Parameter) -> None:
+def forget(optimizer: Adam, parameter: nn.Parameter) -> None:
     """Sets the moments of a parameter that was overwritten to 0."""
     state = optimizer.state.get(parameter, {})
     for name in ("exp_avg", "exp_avg_sq"):

@@ -89,9 +89,10 @@ class Video:
         if self._writer is None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(self.path), code, self.rate, (width, height))
-            if not self._writer.isOpened():
+            writer = cv2.VideoWriter(str(self.path), code, self.rate, (width, height))
+            if not writer.isOpened():
                 raise OSError(f"{self.path} could not be opened as a video")
+            self._writer = writer
         self._writer.write(cv2.cvtColor(image[:height, :width], cv2.COLOR_RGB2BGR))
 
     def __exit__(
@@ -99,5 +100,5 @@ class Video:
     ) -> None:
         if self._writer is not None:
             self._writer.release()
-        if error is not None:
-            self.path.unlink(missing_ok=True)
+            if error is not None:
+                self.path.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ from torch import Tensor
 from . import optim
 from .cameras import Camera
 from .config import RenderSettings
+from .ops.adam import Adam
 from .render import render
 from .scene.split import SplitScene
 
@@ -36,7 +37,7 @@ def visibility(scene: SplitScene, cameras: Iterable[Camera], sh_degree: int) -> 
 
 @torch.no_grad()
 def prune_invisible(
-    scene: SplitScene, optimizer: torch.optim.Adam, cameras: Iterable[Camera], sh_degree: int, threshold: float
+    scene: SplitScene, optimizer: Adam, cameras: Iterable[Camera], sh_degree: int, threshold: float
 ) -> int:
     """Removes static Gaussians of V̄ < ``threshold``; returns how many."""
     kept = (visibility(scene, cameras, sh_degree) >= threshold).nonzero()[:, 0]

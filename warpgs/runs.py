@@ -16,7 +16,7 @@ from .data.capture import Capture, Frame
 from .data.nerfies import load_capture
 from .data.synthetic import builtin_capture
 from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_text, write_views
-from .lpips import find
+from .lpips import find, locate
 from .render import Rendering, render
 from .scene.split import SplitScene
 
@@ -31,8 +31,9 @@ def resolve(config: TrainConfig) -> TrainConfig:
     """The config with its device chosen.
 
     Raises:
-        ValueError: If CUDA is asked for and there is none.
+        ValueError: If CUDA is asked for and there is none, or the weights of LPIPS are not where they should be.
     """
+    locate(config.lpips)
     if config.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
     return dataclasses.replace(config, device=config.device or ("cuda" if torch.cuda.is_available() else "cpu"))
@@ -57,7 +58,8 @@ def create(config: TrainConfig, capture: Capture) -> Path:
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not empty: go on with --resume {folder}, or choose another --out")
     folder.mkdir(parents=True, exist_ok=True)
-    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=config.data and config.data.resolve()))
+    data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
+    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
     write_text(folder / "config.json", json.dumps(plain, indent=2, default=str) + "\n")
     return folder
 
@@ -90,11 +92,11 @@ def _from_plain(kind: Any, values: Any, path: Path) -> Any:
         hint = hints[name]
         if dataclasses.is_dataclass(hint):
             value = _from_plain(hint, value, path)
-        elif Path in typing.get_args(hint) and value is not None:
+        elif Path in typing.get_args(hint) and isinstance(value, str):
             value = Path(value)
         elif not _fits(value, hint):
             raise ValueError(f"{path}: {name} can't be {value!r}")
-        parts[name] = value
+        parts[name] = float(value) if hint is float else value
     return kind(**parts)
 
 
@@ -167,8 +169,9 @@ def evaluate_run(folder: Path, capture: Capture | None = None, lpips: Path | Non
 
 
 def _write_video(path: Path, render_at: RenderAt, capture: Capture, device: torch.device) -> None:
-    """The middle evaluation camera over time: joint | static | dynamic."""
-    camera = capture.cameras[capture.val[len(capture.val) // 2]].to(device)
+    """The middle evaluation camera (else training camera) over time: joint | static | dynamic."""
+    names = capture.val or capture.train
+    camera = capture.cameras[names[len(names) // 2]].to(device)
     with pictures.Video(path) as video:
         for k in range(VIDEO_FRAMES):
             rendering = render_at(dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1)), True)
@@ -184,6 +187,10 @@ def _report(evaluation: Evaluation, counts: dict[str, int]) -> str:
         value = values[name]
         return "not measured" if value is None else f"{value:.{digits}f}"
 
+    last_line = f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians"
+    if not evaluation.views:
+        quality = "the capture has no frames to evaluate on: PSNR, SSIM and LPIPS not measured"
+        return f"{quality}\nflicker {show('flicker', 5)}, {show('fps', 1)} frames/s\n{last_line}"
     lpips = f"LPIPS ({evaluation.lpips_net}) {show('lpips', 4)}"
     if evaluation.lpips_net is None:
         lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
@@ -191,7 +198,7 @@ def _report(evaluation: Evaluation, counts: dict[str, int]) -> str:
         f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
         f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, "
         f"flicker {show('flicker', 5)}, {show('fps', 1)} frames/s",
-        f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians",
+        last_line,
     ]
     if values["masked_psnr"] is not None:
         lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")

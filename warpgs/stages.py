@@ -89,16 +89,15 @@ class Protocol:
         done = in_stage1 + 1
         growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
         progress = iteration / self.num_iterations
-        stage2_length = max(1, self.stage2.end - self.stage2.start)
         return Moment(
             stage=stage,
             progress=progress,
             network_progress={
-                "deformation": in_stage1 / (self.num_iterations - self.stage1.start),
-                "appearance": (iteration - self.stage2.start) / stage2_length,
+                "deformation": self._share_since(schedule.deform_from, in_stage1),
+                "appearance": self._share_since(schedule.relight_from, in_stage1),
             },
             moving=in_stage1 >= schedule.deform_from or stage.name == "stage2",
-            relit=stage.name == "stage2" and config.app,
+            relit=config.app and (in_stage1 >= schedule.relight_from or stage.name == "stage2"),
             joint=stage.name == "stage2",
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // schedule.sh_degree_every),
             depth_weight=self._depth_weight(progress),
@@ -107,10 +106,16 @@ class Protocol:
             reset=growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
             prune=stage.name == "stage1"
             and config.vdp
-            and (done % schedule.prune_every == 0 or iteration + 1 == stage.end),
+            and (done % schedule.prune_every == 0 or iteration + 1 == self.stage2.start)
+            and iteration + 1 < self.num_iterations,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
+
+    def _share_since(self, start: int, in_stage1: int) -> float:
+        """Share done of the iterations from one of stage I, or the start of stage II, to the end of the run."""
+        first = min(start, self.stage2.start - self.stage1.start)
+        return max(0.0, (in_stage1 - first) / max(1, self.num_iterations - self.stage1.start - first))
 
     def _depth_weight(self, progress: float) -> float:
         loss = self.config.loss

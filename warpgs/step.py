@@ -20,7 +20,7 @@ TERMS = ("static", "dynamic", "joint", "depth", "depth_dynamic")
 """Terms of the loss."""
 
 WARM_UPS = 3
-"""Iterations with one set of Gaussians before one is captured in a CUDA graph: all that is made once is then there."""
+"""Iterations of one kind before one is captured in a CUDA graph: all that is made once is then there."""
 
 
 class Draw(NamedTuple):
@@ -61,15 +61,17 @@ class Step:
         self._noise, self._depth_weight = self._numbers[0:1], self._numbers[1]
         self._background, self._rates = self._numbers[2:5], self._numbers[5:]
         self.optimizer = optim.make_optimizer(scene, self._rates)
+        self._replay: Callable[[], None] | None = None
+        self._pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        self._kind: tuple[object, ...] | None = None
+        self._warm = 0
         self.resized()
 
     def resized(self) -> None:
         """To be called when the Gaussians have changed: forgets gradients, and the graph that knew the old ones."""
         num = len(self.scene.static) + len(self.scene.dynamic)
         self.statistics = GradientStatistics(num, self.views.device)
-        self._replay: Callable[[], None] | None = None
-        self._kind: tuple[object, ...] | None = None
-        self._warm = 0
+        self._is_recorded = False
 
     def __call__(self, moment: Moment, draw: Draw) -> None:
         """Runs the iteration of a moment of the schedule."""
@@ -82,14 +84,16 @@ class Step:
             return
         kind = (moment.stage.name, moment.moving, moment.relit, moment.sh_degree, moment.depth_weight > 0)
         if kind != self._kind:
-            self._kind, self._warm, self._replay = kind, 0, None
-        if self._replay is None and self._warm == WARM_UPS:
-            self._replay = record(lambda: self._run(moment, self.views.pick(self._index)))
-        if self._replay is not None:
-            self._replay()
-        else:
+            self._kind, self._warm, self._is_recorded = kind, 0, False
+        if self._warm < WARM_UPS:
             self._warm += 1
             self._run(moment, self.views.pick(self._index))
+            return
+        if self._replay is None or not self._is_recorded:
+            # An old graph lives until the new one has taken over its memory.
+            self._replay = record(lambda: self._run(moment, self.views.pick(self._index)), pool=self._pool)
+            self._is_recorded = True
+        self._replay()
 
     def _run(self, moment: Moment, view: View) -> None:
         self._choose_trained(moment)

@@ -46,8 +46,6 @@ class Trainer:
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
         self.config, self.capture, self.run = config, capture, run
         self.device = torch.device(config.device or "cpu")
-        if self.device.type == "cuda" and config.tf32:
-            torch.set_float32_matmul_precision("high")
         self.views = Views(capture, self.device, config.resident_bytes, config.assume)
         self.protocol = Protocol(config, has_depth=self.views.has_depth)
         self.iteration = 0

@@ -5,12 +5,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
+from warpgs.ops.encoding import encode, encoded_size
 
-from .encoding import encode, encoded_size
+from .perceptron import perceptron
 
 
 class Trunk(nn.Module):
-    """[γ(μ), γ(t)] → features: ``depth`` ReLU layers of ``width`` units, the encoding entering again after ``skip``.
+    """[γ(μ), γ(t)] → outputs: ``depth`` ReLU layers of ``width`` units, the encoding entering again after ``skip``.
+
+    The last layer, the head, starts at zero, so that a network starts as "no change".
 
     Attributes:
         center, half_size: [3] box of the scene; positions are normalised by it to about [-1, 1].
@@ -18,34 +21,42 @@ class Trunk(nn.Module):
 
     center: Tensor
     half_size: Tensor
+    no_time: Tensor
+    all_time: Tensor
 
-    def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
+    def __init__(
+        self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"], outputs: int
+    ) -> None:
         super().__init__()
-        self.position_bands, self.time_bands, self.skip = config.position_bands, config.time_bands, config.skip
+        self.position_bands, self.time_bands = config.position_bands, config.time_bands
+        self.skip = config.skip if config.skip < config.depth else 0
+        self.uses_half = config.half
         self.register_buffer("center", center.clone())
         self.register_buffer("half_size", half_size.clone())
+        self.register_buffer("no_time", torch.zeros(1), persistent=False)
+        self.register_buffer("all_time", torch.ones(1), persistent=False)
         encoded = encoded_size(3, config.position_bands) + encoded_size(1, config.time_bands)
         sizes = [encoded] + [config.width + (encoded if k == config.skip else 0) for k in range(1, config.depth)]
         self.layers = nn.ModuleList([nn.Linear(size, config.width) for size in sizes])
+        self.head = nn.Linear(config.width, outputs)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N width"]:
-        position = encode((means - self.center) / self.half_size, self.position_bands)
-        moment = encode(time[:, None], self.time_bands).expand(means.shape[0], -1)
-        encoding = torch.cat([position, moment], 1)
-        features = encoding
-        for index, layer in enumerate(self.layers):
-            if index == self.skip:
-                features = torch.cat([features, encoding], 1)
-            features = layer(features).relu()
-        return features
-
-
-def _zero_head(width: int, outputs: int) -> nn.Linear:
-    """A last layer that starts at zero, so that a network starts as "no change"."""
-    head = nn.Linear(width, outputs)
-    nn.init.zeros_(head.weight)
-    nn.init.zeros_(head.bias)
-    return head
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N outputs"]:
+        """Evaluates the network at N positions and one time. No gradient flows to the positions."""
+        half = self.uses_half and means.is_cuda
+        position = encode(means.detach(), self.position_bands, self.center, self.half_size, half)
+        moment = encode(time[:, None], self.time_bands, self.no_time, self.all_time)[0]
+        weights, biases = [], []
+        for index, layer in enumerate([*self.layers, self.head]):
+            weight, bias = layer.weight, layer.bias
+            if index in (0, self.skip):
+                # Time is the same for all Gaussians: its share of the product is a part of the bias.
+                weight, of_time = weight.split([weight.shape[1] - len(moment), len(moment)], 1)
+                bias = bias + of_time @ moment
+            weights.append(weight)
+            biases.append(bias)
+        return perceptron(position, weights, biases, self.skip)
 
 
 class DeformationField(nn.Module):
@@ -53,18 +64,14 @@ class DeformationField(nn.Module):
 
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.trunk = Trunk(config, center, half_size)
-        self.head = _zero_head(config.width, 10)
+        self.trunk = Trunk(config, center, half_size, outputs=10)
 
-    def forward(
-        self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]
-    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"], Float[Tensor, "N 3"]]:
-        """Offsets of [N, 3] positions, [N, 4] quaternions (to be added to the unit rotation) and [N, 3] log-scales.
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
+        """Offsets: of positions (3), of quaternions, to be added to the unit rotation (4), of log-scales (3).
 
         No gradient flows back to ``means`` from here, as in Deformable-3DGS.
         """
-        offsets = self.head(self.trunk(means.detach(), time))
-        return offsets[:, :3], offsets[:, 3:7], offsets[:, 7:]
+        return self.trunk(means, time)
 
 
 class AppearanceField(nn.Module):
@@ -72,14 +79,15 @@ class AppearanceField(nn.Module):
 
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.trunk = Trunk(config, center, half_size)
         self.changes_opacity = config.appearance_opacity
-        self.head = _zero_head(config.width, 3 * (config.appearance_degree + 1) ** 2 + 1)
+        self.bases = (config.appearance_degree + 1) ** 2
+        self.trunk = Trunk(config, center, half_size, outputs=3 * self.bases + int(self.changes_opacity))
 
     def forward(
         self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]
-    ) -> tuple[Float[Tensor, "N bases 3"], Float[Tensor, " N"]]:
-        """Residuals of the coefficients of the lowest degrees, and of the logits of the opacities."""
-        residuals = self.head(self.trunk(means.detach(), time))
-        logit_residuals = residuals[:, 0] if self.changes_opacity else torch.zeros_like(residuals[:, 0])
-        return residuals[:, 1:].unflatten(1, (-1, 3)), logit_residuals
+    ) -> tuple[Float[Tensor, "N bases 3"], Float[Tensor, " N"] | None]:
+        """Residuals of the coefficients of the lowest degrees, and of the logits of the opacities if they change."""
+        residuals = self.trunk(means, time)
+        if not self.changes_opacity:
+            return residuals.unflatten(1, (self.bases, 3)), None
+        return residuals[:, :-1].unflatten(1, (self.bases, 3)).contiguous(), residuals[:, -1].contiguous()

@@ -63,9 +63,10 @@ def _launch(
 ) -> None:
     """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
     lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    for walked in sorted({1, images}):
-        pixels = CUDA_PIXELS if run.is_cuda else CPU_PIXELS
-        blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
+    pixels = CUDA_PIXELS if run.is_cuda else CPU_PIXELS
+    blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
+
+    def walk(walked: int) -> None:
         run.launch(
             make_kernel(channels, walked, images, pixels, flag),
             tiles.ranges.shape[0] * blocks * lanes,
@@ -74,6 +75,12 @@ def _launch(
             block_dim=BLOCK_DIM,
             work=TILE_SIZE * TILE_SIZE,
         )
+
+    if images == 1:
+        walk(1)
+    else:
+        # Each kernel does its own tiles. The long lists of mixed tiles go first: the others fill in beside them.
+        run.side_by_side(lambda: walk(images), lambda: walk(1))
 
 
 def record_composite(

@@ -1,6 +1,7 @@
 """CUDA graphs: work recorded once and replayed with one launch."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import warp as wp
@@ -45,11 +46,19 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
     return replay_outputs
 
 
-def record(work: Callable[[], None], stream: torch.cuda.Stream | None = None) -> Callable[[], None]:
+def record(
+    work: Callable[[], None], stream: torch.cuda.Stream | None = None, pool: Any | None = None
+) -> Callable[[], None]:
     """Records ``work`` in a CUDA graph without running it, and returns a function that runs it.
 
     As ``capture``, for work that changes tensors in place and must not be repeated for warming up: it has to have run
     a few times before.
+
+    Args:
+        work: Works on the current CUDA device without reading anything back from it.
+        stream: To capture on; a new one by default.
+        pool: From ``torch.cuda.graph_pool_handle()``. Graphs that share one share memory: only one of them may be in
+            use, and a new one takes over what the one before it had, which spares the driver's slow allocation.
     """
     stream = stream or torch.cuda.Stream()
     warp_stream = wp.stream_from_torch(stream)
@@ -57,7 +66,7 @@ def record(work: Callable[[], None], stream: torch.cuda.Stream | None = None) ->
     graph = torch.cuda.CUDAGraph()
     # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
     with (
-        torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+        torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
         wp.ScopedStream(warp_stream, sync_enter=False),
         wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
     ):

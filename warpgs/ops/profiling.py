@@ -69,6 +69,11 @@ def profile() -> Iterator[Profile]:
         _active_profile = None
 
 
+def is_on() -> bool:
+    """Whether a profile is being taken."""
+    return _active_profile is not None
+
+
 def span(name: str, device: torch.device) -> contextlib.AbstractContextManager[None]:
     """Times what runs inside, if a profile is being taken."""
     return _NOTHING if _active_profile is None else _active_profile.span(name, device)

@@ -4,8 +4,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-NUM_BASES = 16
-"""Spherical harmonics up to degree 3."""
+from warpgs.ops.activation import Raw
+
+MAX_SH_DEGREE = 3
+"""Highest degree of spherical harmonics that the kernels know."""
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic: colour = 0.5 + SH_C0 · coefficient."""
@@ -22,7 +24,7 @@ class Gaussians(nn.Module):
         log_scales: [N, 3] logarithms of the standard deviations.
         logit_opacities: [N] logits of the opacities.
         sh_dc: [N, 1, 3] constant coefficients of the colour.
-        sh_rest: [N, 15, 3] the other coefficients, degrees 1 to 3.
+        sh_rest: [N, 0 | 3 | 8 | 15, 3] the other coefficients, of degrees 1 to 0 | 1 | 2 | 3.
     """
 
     def __init__(
@@ -32,7 +34,7 @@ class Gaussians(nn.Module):
         log_scales: Float[Tensor, "N 3"],
         logit_opacities: Float[Tensor, " N"],
         sh_dc: Float[Tensor, "N 1 3"],
-        sh_rest: Float[Tensor, "N 15 3"],
+        sh_rest: Float[Tensor, "N rest 3"],
     ) -> None:
         super().__init__()
         self.means = nn.Parameter(means)
@@ -44,7 +46,11 @@ class Gaussians(nn.Module):
 
     @staticmethod
     def from_points(
-        points: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], scales: Float[Tensor, " N"], opacity: float
+        points: Float[Tensor, "N 3"],
+        colors: Float[Tensor, "N 3"],
+        scales: Float[Tensor, " N"],
+        opacity: float,
+        sh_degree: int = MAX_SH_DEGREE,
     ) -> "Gaussians":
         """Round Gaussians at points, of standard deviations ``scales``, colours in [0, 1] and one opacity."""
         N = points.shape[0]
@@ -56,13 +62,13 @@ class Gaussians(nn.Module):
             scales.log()[:, None].repeat(1, 3),
             torch.logit(torch.full_like(scales, opacity)),
             ((colors - 0.5) / SH_C0)[:, None, :],
-            points.new_zeros(N, NUM_BASES - 1, 3),
+            points.new_zeros(N, (sh_degree + 1) ** 2 - 1, 3),
         )
 
     @staticmethod
-    def empty(num: int) -> "Gaussians":
+    def empty(num: int, sh_degree: int = MAX_SH_DEGREE) -> "Gaussians":
         """``num`` Gaussians of no particular value, to load others into."""
-        return Gaussians.from_points(torch.zeros(num, 3), torch.zeros(num, 3), torch.ones(num), 0.5)
+        return Gaussians.from_points(torch.zeros(num, 3), torch.zeros(num, 3), torch.ones(num), 0.5, sh_degree)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -76,8 +82,12 @@ class Gaussians(nn.Module):
         return self.log_scales.exp()
 
     @property
-    def sh(self) -> Float[Tensor, "N 16 3"]:
+    def sh(self) -> Float[Tensor, "N bases 3"]:
         return torch.cat([self.sh_dc, self.sh_rest], 1)
+
+    def raw(self) -> Raw:
+        """The parameters as the op that activates them wants them."""
+        return Raw(self.means, self.quats, self.log_scales, self.logit_opacities, self.sh_dc, self.sh_rest)
 
     @torch.no_grad()
     def gather(self, parents: Int64[Tensor, " M"]) -> None:

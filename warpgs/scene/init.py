@@ -8,23 +8,26 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 
-from .gaussians import Gaussians
+from .gaussians import MAX_SH_DEGREE, Gaussians
 
 FIRST_OPACITY = 0.1
 NEIGHBOURS = 3
 BOX_MARGIN = 1.2
 
 
-def from_points(points: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> Gaussians:
+def from_points(
+    points: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], sh_degree: int = MAX_SH_DEGREE
+) -> Gaussians:
     """Round Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS)."""
     N = points.shape[0]
     if N <= NEIGHBOURS:
-        return Gaussians.from_points(points, colors, torch.full((N,), 0.01), FIRST_OPACITY)
+        return Gaussians.from_points(points, colors, torch.full((N,), 0.01), FIRST_OPACITY, sh_degree)
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
     # Points at one place would get no size at all, a few far ones the size of the scene.
     typical = scales.median().clamp_min(1e-7)
-    return Gaussians.from_points(points, colors, scales.clamp(1e-3 * typical, 10.0 * typical), FIRST_OPACITY)
+    scales = scales.clamp(1e-3 * typical, 10.0 * typical)
+    return Gaussians.from_points(points, colors, scales, FIRST_OPACITY, sh_degree)
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
 from warpgs.fields.mlp import AppearanceField, DeformationField
+from warpgs.ops.activation import NO_CHANGES, Changes, activate
 
 from .gaussians import Gaussians
 from .splats import Splats
@@ -21,8 +22,6 @@ class SplitScene(nn.Module):
         appearance: MLP_app of Eq. 8.
     """
 
-    no_turn: Tensor
-
     def __init__(
         self,
         static: Gaussians,
@@ -36,13 +35,11 @@ class SplitScene(nn.Module):
         self.dynamic = dynamic
         self.deformation = DeformationField(config, center, half_size)
         self.appearance = AppearanceField(config, center, half_size)
-        # On the device from the start: making it in every step would wait for the device.
-        self.register_buffer("no_turn", torch.tensor([1.0, 0.0, 0.0, 0.0]), persistent=False)
 
     @staticmethod
     def empty(num_static: int, num_dynamic: int, config: ModelConfig) -> "SplitScene":
         """A scene of no particular values, to load a checkpoint into."""
-        static, dynamic = Gaussians.empty(num_static), Gaussians.empty(num_dynamic)
+        static, dynamic = (Gaussians.empty(num, config.sh_degree) for num in (num_static, num_dynamic))
         return SplitScene(static, dynamic, config, torch.zeros(3), torch.ones(3))
 
     def splats(
@@ -50,7 +47,7 @@ class SplitScene(nn.Module):
         time: Float[Tensor, "1"],
         moving: bool = True,
         relit: bool = True,
-        sh_degree: int = 3,
+        sh_degree: int | None = None,
         time_noise: Float[Tensor, "1"] | None = None,
     ) -> Splats:
         """The scene at a moment, static Gaussians first.
@@ -59,55 +56,21 @@ class SplitScene(nn.Module):
             time: Moment in [0, 1].
             moving: Whether the deformation network moves the dynamic Gaussians (paper Eq. 11).
             relit: Whether the appearance network changes the static ones (paper Eq. 8).
-            sh_degree: Highest degree of spherical harmonics in use.
+            sh_degree: Highest degree of spherical harmonics in use; all that there are if None.
             time_noise: Added to the time that the deformation network sees (Deformable-3DGS, annealed smoothing).
         """
         static, dynamic = self.static, self.dynamic
-        sh, logits = static.sh, static.logit_opacities
+        relit_by = moved_by = NO_CHANGES
         if relit and len(static):
-            sh_residual, logit_residual = self.appearance(static.means, time)
-            sh = torch.cat([sh[:, : sh_residual.shape[1]] + sh_residual, sh[:, sh_residual.shape[1] :]], 1)
-            logits = logits + logit_residual
-        moves = moving and len(dynamic) > 0
-        moment = time if time_noise is None else time + time_noise
-        geometry = self._deform(moment) if moves else (dynamic.means, dynamic.quats, dynamic.log_scales)
-        means, quats, log_scales = geometry
-        is_dynamic = torch.arange(len(static) + len(dynamic), device=means.device) >= len(static)
-        return Splats(
-            means=torch.cat([static.means, means]),
-            quats=torch.cat([static.quats, quats]),
-            scales=torch.cat([static.log_scales, log_scales]).exp(),
-            opacities=torch.cat([logits, dynamic.logit_opacities]).sigmoid(),
-            sh=torch.cat([sh, dynamic.sh]),
-            is_dynamic=is_dynamic,
-            sh_degree=sh_degree,
-        )
+            relit_by = Changes(None, *self.appearance(static.means, time))
+        if moving and len(dynamic):
+            moment = time if time_noise is None else time + time_noise
+            moved_by = Changes(self.deformation(dynamic.means, moment))
+        activated = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
+        is_dynamic = torch.arange(len(static) + len(dynamic), device=static.means.device) >= len(static)
+        return Splats(**activated._asdict(), is_dynamic=is_dynamic, sh_degree=sh_degree)
 
-    def static_splats(self, sh_degree: int = 3) -> Splats:
+    def static_splats(self, sh_degree: int | None = None) -> Splats:
         """The static Gaussians alone, with their own appearance w⁰."""
         static = self.static
         return Splats(static.means, static.quats, static.scales, static.opacities, sh=static.sh, sh_degree=sh_degree)
-
-    def _deform(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Paper Eq. 11: μ + δμ, and A Σ Aᵀ with A = R(δr) · R exp(δs) Rᵀ, where Σ = R S² Rᵀ.
-
-        So A R S = R(δr) R exp(δs) S: the rotation is multiplied from the left, the log-scales are added to.
-        """
-        dynamic = self.dynamic
-        shift, turn, stretch = self.deformation(dynamic.means, time)
-        return dynamic.means + shift, multiply(turn + self.no_turn, dynamic.quats), dynamic.log_scales + stretch
-
-
-def multiply(a: Float[Tensor, "N 4"], b: Float[Tensor, "N 4"]) -> Float[Tensor, "N 4"]:
-    """Hamilton product a · b of quaternions (w, x, y, z): first b turns, then a."""
-    aw, ax, ay, az = a.unbind(1)
-    bw, bx, by, bz = b.unbind(1)
-    return torch.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        1,
-    )

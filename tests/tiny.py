@@ -1,0 +1,99 @@
+"""Runs that take less than a second: a small built-in capture and small networks, through all stages."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jaxtyping
+import pytest
+import torch
+from torch import Tensor
+
+from warpgs import checkpoint
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
+from warpgs.data.nerfies import load_capture
+from warpgs.data.synthetic import BuiltinScene, builtin_capture
+from warpgs.interrupt import Interrupt
+from warpgs.logbook import Logbook
+from warpgs.trainer import Trainer
+
+SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
+
+MODEL = ModelConfig(position_bands=2, time_bands=2, depth=2, width=8, skip=1, max_static_points=50, dynamic_points=20)
+
+# Pretraining is iterations 0 to 5, stage I 6 to 21 (growth after 9, 13 and 17, opacities reset after 14, pruned after
+# 11, 17 and 21, moving from 9 on), stage II 22 to 31.
+SCHEDULE = Schedule(
+    pretrain=6,
+    stage1=16,
+    stage2=10,
+    realign_at=3,
+    densify_from=3,
+    densify_until=14,
+    reset_every=9,
+    prune_every=6,
+    deform_from=3,
+    noise_until=10,
+    sh_degree_every=5,
+)
+LENGTH = 32
+
+CONFIG = TrainConfig(
+    preset="quick",
+    device="cpu",
+    model=MODEL,
+    loss=LossConfig(ssim=0.0),
+    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, max_size=1.0),
+    schedule=SCHEDULE,
+    checkpoint_every=7,
+    keep_checkpoints=100,
+)
+
+
+@pytest.fixture(scope="module")
+def quickly():
+    """Without the checks of annotations, and on one thread: both cost more than they bring in runs this small."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+    torch.set_num_threads(threads)
+
+
+def write(folder: Path) -> Path:
+    """The files of the capture."""
+    return builtin_capture(folder, SCENE, quiet=True)
+
+
+def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
+    return Trainer(config, load_capture(data), run)
+
+
+def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
+    with Logbook(trainer.run / "events", trainer.protocol.num_iterations, trainer.iteration) as logbook:
+        return trainer.train(logbook, interrupt)
+
+
+class StopWhen(Interrupt):
+    """Ctrl-C as soon as something is so."""
+
+    def __init__(self, is_so: Callable[[], bool]) -> None:
+        self._is_so = is_so
+
+    @property
+    def wanted(self) -> bool:
+        return self._is_so()
+
+
+def state(run: Path) -> dict[str, Tensor]:
+    """All tensors of a run's newest checkpoint: parameters, moments, statistics."""
+    return checkpoint.load(checkpoint.saved(run)[-1]).tensors
+
+
+def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:
+    """Names of the tensors that only one has, or that are not the same bit for bit."""
+    return sorted(n for n in a.keys() | b.keys() if n not in a or n not in b or bytes_of(a[n]) != bytes_of(b[n]))
+
+
+def bytes_of(tensor: Tensor) -> tuple[tuple[int, ...], str, bytes]:
+    return tuple(tensor.shape), str(tensor.dtype), tensor.contiguous().numpy().tobytes()
