@@ -15,11 +15,20 @@ from warpgs.logbook import Logbook
 from warpgs.trainer import Trainer
 
 
+NO_DEPTH = ": training without depth, and without the pretraining that needs it"
+
+
 def parse(arguments: Sequence[str]) -> TrainConfig:
     """The config of a command line: a preset's defaults, changed by options.
 
     The built-in scene has ``quick`` as its default preset, captures have ``paper``.
+
+    Raises:
+        ValueError: If a run is to be resumed with options of its own.
     """
+    options = {argument.split("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")}
+    if "--resume" in options and (others := sorted(options - {"--resume", "--device", "--help"})):
+        raise ValueError(f"--resume takes everything but --device from the run's config.json: leave out {others[0]}")
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", choices=list(PRESETS))
     first.add_argument("--data")
@@ -33,10 +42,10 @@ def start(config: TrainConfig) -> Trainer:
     if config.resume is None:
         config = scaled(runs.resolve(config))
         capture = runs.open_capture(config)
-        return Trainer(config, capture, runs.create(config, capture))
+        trainer = Trainer(config, capture, runs.new_folder(config, capture))
+        runs.create(trainer.run, config)  # now that nothing has been refused
+        return trainer
     folder, device = config.resume, config.device
-    if dataclasses.replace(config, resume=None, device=None) != PRESETS[config.preset]:
-        raise ValueError("--resume takes everything but --device from the run's config.json: leave other options out")
     config = runs.load_config(folder)
     config = runs.resolve(dataclasses.replace(config, device=device or config.device))
     trainer = Trainer(config, runs.open_capture(config), folder)
@@ -48,25 +57,38 @@ def main(config: TrainConfig) -> int:
     """Trains, then evaluates; Ctrl-C keeps what was done."""
     trainer = start(config)
     folder = trainer.run
-    print(f"{trainer.capture.name}: {len(trainer.views)} views, on {trainer.config.device}, into {folder}")
+    views, aligned = len(trainer.views), trainer.num_aligned
+    print(f"{trainer.capture.name}: {views} views, on {trainer.config.device}, into {folder}")
+    if aligned < views:
+        print(
+            f"depth can be aligned with the sparse points in {aligned} of {views} views" + ("" if aligned else NO_DEPTH)
+        )
     steps = trainer.protocol.num_iterations
     with Interrupt() as interrupt, Logbook(folder / "events", steps, trainer.iteration) as logbook:
         finished = trainer.train(logbook, interrupt)
     if not finished:
         print(f"stopped after iteration {trainer.iteration} of {steps}; go on with --resume {folder}", file=sys.stderr)
         return 130
-    print(runs.evaluate_run(folder, trainer.capture))
+    print(runs.evaluate_run(folder, trainer.capture, device=trainer.config.device))
     print(f"metrics.json, views.csv, pictures/ and time.mp4 are in {folder}")
     return 0
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error is the lack of memory; on the CPU, torch and Warp say so only in words."""
+    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "allocate" in str(error)
 
 
 if __name__ == "__main__":
     try:
         sys.exit(main(parse(sys.argv[1:])))
-    except torch.OutOfMemoryError as error:
-        reason = str(error).splitlines()[0]
-        advice = "the run's last checkpoint is whole; try a smaller --densify.max-gaussians or a larger --factor"
-        print(f"error: out of memory ({reason}); {advice}", file=sys.stderr)
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        advice = (
+            "the run's last checkpoint is whole; start a new run with a smaller --densify.max-gaussians or a larger"
+        )
+        print(f"error: out of memory ({' '.join(str(error).split())[:200]}); {advice} --factor", file=sys.stderr)
         sys.exit(2)
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -261,8 +261,9 @@ def test_rows_of_no_width_make_no_gaussians(tmp_path):
 
 
 def refused(tensors, model=tiny.MODEL):
+    path = checkpoint.Path("here.safetensors")
     with pytest.raises(ValueError, match=r"^here\.safetensors ") as caught:
-        checkpoint.load_scene(checkpoint.Checkpoint(tensors, {}), model, checkpoint.Path("here.safetensors"))
+        checkpoint.load_scene(checkpoint.Checkpoint(path, tensors, {}), model, path)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

@@ -171,3 +171,50 @@ def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tm
     assert script.main(script.parse(["--resume", str(killed)])) == 0
     assert tiny.differences(tiny.state(killed), tiny.state(whole)) == []
     assert (killed / "metrics.json").is_file()
+
+
+# Checkpoints that don't fit -----------------------------------------------------------------------------------------
+
+
+def rewritten(run, change):
+    """The newest checkpoint with its tensors and facts changed."""
+    path = checkpoint.saved(run)[-1]
+    loaded = checkpoint.load(path)
+    tensors, facts = dict(loaded.tensors), dict(loaded.facts)
+    change(tensors, facts)
+    checkpoint.save(path, tensors, facts)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["adam.exp_avg.static.means", "adam.exp_avg_sq.dynamic.sh_dc", "gradients.total", "alignments"]
+)
+def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    path = rewritten(run, lambda tensors, facts: tensors.update({name: tensors[name][:2].clone()}))
+    with pytest.raises(ValueError, match=rf"{path.name} is damaged: expected {name} as "):
+        tiny.trainer(data, run).restore_newest()
+
+
+@pytest.mark.parametrize(("name", "value"), [("iteration", "x"), ("train_seconds", None), ("rollbacks", -1)])
+def test_facts_that_are_no_numbers_are_refused_by_name(data, tmp_path, name, value):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    rewritten(run, lambda tensors, facts: facts.update({name: value}))
+    with pytest.raises(ValueError, match=f"is damaged: {name} can't be"):
+        tiny.trainer(data, run).restore_newest()
+
+
+def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    rewritten(run, lambda tensors, facts: facts["views"].reverse())
+    with pytest.raises(ValueError, match="was trained on other frames than builtin has now"):
+        tiny.trainer(data, run).restore_newest()
+
+
+def test_a_run_that_died_before_its_first_checkpoint_begins_anew(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path / "run")
+    trainer.restore_newest()
+    assert trainer.iteration == 0

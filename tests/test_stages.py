@@ -319,7 +319,7 @@ def test_scaling_twice_is_scaling_once():
 
 @pytest.mark.parametrize("iterations", [2, 0, -5])
 def test_too_few_iterations_are_refused(iterations):
-    with pytest.raises(ValueError, match="--iterations must be at least 3"):
+    with pytest.raises(ValueError, match="iterations must be a number of at least 3"):
         scaled(with_iterations("paper", iterations))
 
 
@@ -329,5 +329,5 @@ def test_too_few_iterations_are_refused(iterations):
 @pytest.mark.parametrize("iterations", [None, 100])
 def test_a_schedule_that_cannot_be_is_refused_by_name(name, value, iterations):
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SHORT, **{name: value}), iterations=iterations)
-    with pytest.raises(ValueError, match=f"schedule.{name} must be positive, got {value}"):
+    with pytest.raises(ValueError, match=f"schedule.{name} must be a number of at least ., got {value}"):
         scaled(config)

@@ -89,23 +89,6 @@ def test_evaluation_frames_are_no_training_views(capture):
     assert len(views_of(capture)) == len(capture.train) < len(capture.train) + len(capture.val)
 
 
-@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
-def test_a_capture_without_depth_has_none(capture, resident_bytes):
-    assert not views_of(without(capture, inverse_depth=None), resident_bytes).has_depth
-
-
-@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
-def test_depth_that_is_unknown_everywhere_is_none(capture, resident_bytes):
-    unknown = torch.full(capture.frame(capture.train[0]).image.shape[:2], torch.nan)
-    assert not views_of(without(capture, inverse_depth=unknown), resident_bytes).has_depth
-
-
-@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
-def test_a_capture_with_depth_has_it(capture, resident_bytes):
-    known = torch.full(capture.frame(capture.train[0]).image.shape[:2], 0.5)
-    assert views_of(without(capture, inverse_depth=known), resident_bytes).has_depth
-
-
 @pytest.mark.parametrize(("assume", "is_static"), [("static", True), ("dynamic", False)])
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])
 def test_what_is_assumed_goes_before_masks(capture, resident_bytes, assume, is_static):

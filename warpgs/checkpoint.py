@@ -1,7 +1,9 @@
 """Checkpoints: safetensors files, written so that a crash at any moment leaves a whole one behind."""
 
 import json
+import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +25,39 @@ class Checkpoint:
     """What is read back.
 
     Attributes:
+        path: Where it was read from.
         tensors: By name, on the CPU; those of the scene begin with "scene.".
         facts: Iteration and other plain values.
     """
 
+    path: Path
     tensors: dict[str, Tensor]
     facts: dict[str, Any]
+
+    def tensor(self, name: str, shape: Sequence[int]) -> Tensor:
+        """A tensor of numbers in single precision.
+
+        Raises:
+            ValueError: If it is missing or of another shape or type.
+        """
+        tensor = self.tensors[name]
+        if tensor.shape != torch.Size(shape) or tensor.dtype != torch.float32:
+            raise ValueError(
+                f"{self.path} is damaged: expected {name} as {list(shape)} numbers in single precision, "
+                f"got {list(tensor.shape)} {tensor.dtype}"
+            )
+        return tensor
+
+    def number(self, name: str) -> float:
+        """A fact that is a number, 0 or more.
+
+        Raises:
+            ValueError: If it is missing or something else.
+        """
+        value = self.facts[name]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+            raise ValueError(f"{self.path} is damaged: {name} can't be {value!r}")
+        return value
 
 
 def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
@@ -65,7 +94,7 @@ def load(path: Path) -> Checkpoint:
             if metadata.get("version") != str(VERSION):
                 raise ValueError(f"{path} has version {metadata.get('version')}, this program reads {VERSION}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Checkpoint(_Parts(path, tensors), _Parts(path, json.loads(metadata["facts"])))
+            return Checkpoint(path, _Parts(path, tensors), _Parts(path, json.loads(metadata["facts"])))
     except FileNotFoundError as error:
         raise ValueError(f"{path} does not exist") from error
     except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:

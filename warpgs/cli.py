@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -20,9 +20,11 @@ class Eval:
     """Run folder."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
+    device: Literal["cuda", "cpu"] | None = None
+    """Where to render; CUDA if there is a GPU."""
 
     def run(self) -> None:
-        print(runs.evaluate_run(self.run_folder, lpips=self.lpips))
+        print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device))
 
 
 COMMANDS: dict[str, Callable[..., Bench | Eval]] = {"bench": Bench, "eval": Eval}

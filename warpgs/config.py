@@ -1,9 +1,10 @@
 """Every default, in one place."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,6 @@ class ModelConfig:
     """Static Gaussians to begin with, at most."""
     dynamic_points: int = 20_000
     """Dynamic Gaussians to begin with."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.appearance_degree <= self.sh_degree <= 3:
-            raise ValueError(
-                "expected 0 <= model.appearance_degree <= model.sh_degree <= 3, "
-                f"got {self.appearance_degree} and {self.sh_degree}"
-            )
 
 
 @dataclass(frozen=True)
@@ -149,7 +143,7 @@ class Schedule:
     noise_until: int = 20_000
     """Iteration of stage I at which the noise on time has died away."""
     sh_degree_every: int = 1_000
-    """Iterations of stage I between the degrees of spherical harmonics, 0 to 3."""
+    """Iterations of stage I between the degrees of spherical harmonics, 0 to ``model.sh_degree``."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +184,7 @@ class TrainConfig:
     """Where to train; CUDA if there is a GPU."""
     seed: int = 0
     dap: bool = True
-    """Depth-aware pretraining."""
+    """Depth-aware pretraining, and the depth loss of the stages after it."""
     vdp: bool = True
     """Visibility-driven pruning."""
     app: bool = True
@@ -269,20 +263,60 @@ PRESETS: dict[str, TrainConfig] = {
 """Named defaults."""
 
 
+LEAST = {
+    "factor": 1,
+    "iterations": 3,
+    "checkpoint_every": 1,
+    "keep_checkpoints": 1,
+    "model.depth": 1,
+    "model.width": 1,
+    "densify.every": 1,
+    "schedule.reset_every": 1,
+    "schedule.prune_every": 1,
+    "schedule.sh_degree_every": 1,
+}
+"""Smallest values of numbers that must not be 0; no number of a config is negative."""
+
+
+def validate(config: TrainConfig) -> None:
+    """Refuses numbers that training would stumble over later.
+
+    Raises:
+        ValueError: If one is out of its range; the message names it.
+    """
+    _check_numbers("", config)
+    model, schedule = config.model, config.schedule
+    if not model.appearance_degree <= model.sh_degree <= 3:
+        raise ValueError(
+            "expected model.appearance_degree <= model.sh_degree <= 3, "
+            f"got {model.appearance_degree} and {model.sh_degree}"
+        )
+    if schedule.stage1 + schedule.stage2 == 0:
+        raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
+    for name in ("networks", "networks_end"):
+        if getattr(config.optim, name) == 0:
+            raise ValueError(f"optim.{name} must be positive, got 0")
+
+
+def _check_numbers(prefix: str, part: Any) -> None:
+    for field_ in dataclasses.fields(part):
+        name, value = prefix + field_.name, getattr(part, field_.name)
+        if dataclasses.is_dataclass(value):
+            _check_numbers(f"{name}.", value)
+        elif isinstance(value, int | float) and not LEAST.get(name, 0) <= value < math.inf:
+            raise ValueError(f"{name} must be a number of at least {LEAST.get(name, 0)}, got {value}")
+
+
 def scaled(config: TrainConfig) -> TrainConfig:
     """The config with every schedule scaled so that the run takes ``config.iterations``, which is then None.
 
     Raises:
-        ValueError: If fewer than 3 iterations are asked for, or a schedule is not positive.
+        ValueError: If a number of the config is out of its range.
     """
+    validate(config)
     schedule = config.schedule
-    for name, value in dataclasses.asdict(schedule).items():
-        if value < 0 or (name.endswith("every") and value < 1):
-            raise ValueError(f"schedule.{name} must be positive, got {value}")
     if config.iterations is None:
         return config
-    if config.iterations < 3:
-        raise ValueError(f"--iterations must be at least 3, got {config.iterations}")
     total = schedule.pretrain + schedule.stage1 + schedule.stage2
     factor = config.iterations / total
     # What is 0 stays 0, what is not stays more; the stage with the most takes what rounding leaves.

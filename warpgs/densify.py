@@ -61,7 +61,7 @@ def densify(
         generator: On the CPU; draws the places of the children of splits.
     """
     sizes = gaussians.scales.max(1).values
-    alive = (gaussians.opacities >= config.min_opacity) & sizes.isfinite()
+    alive = (gaussians.opacities >= config.min_opacity) & sizes.isfinite() & gaussians.means.isfinite().all(1)
     if remove_large:
         alive &= sizes <= config.max_size * extent
     wanted = alive & (gradients > config.gradient)

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from .cameras import Camera
 
-REWEIGHTINGS = 12
-"""Rounds of iteratively reweighted least squares; the fit has settled long before."""
+REWEIGHTINGS = 50
+"""Rounds of iteratively reweighted least squares: with 30 % outliers the fit has settled by then."""
 
 FEWEST_SAMPLES = 16
 """Samples under which a frame is not aligned and its depth not used."""

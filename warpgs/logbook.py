@@ -40,7 +40,7 @@ class Logbook:
 
     def __init__(self, folder: Path, num_iterations: int, first_iteration: int) -> None:
         self._console = Console()
-        self._events = SummaryWriter(str(folder))
+        self._events = SummaryWriter(str(folder), purge_step=first_iteration)
         self._total = num_iterations
         self._bar: Progress | None = None
         self._task: TaskID | None = None

@@ -5,13 +5,13 @@ import json
 import subprocess
 import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from . import checkpoint, pictures
 from .cameras import Camera
-from .config import RenderSettings, TrainConfig
+from .config import RenderSettings, TrainConfig, validate
 from .data.capture import Capture, Frame
 from .data.nerfies import load_capture
 from .data.synthetic import builtin_capture
@@ -45,8 +45,8 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     return load_capture(root, config.dataset, factor=config.factor, perturbation=config.masks)
 
 
-def create(config: TrainConfig, capture: Capture) -> Path:
-    """Makes the run folder and writes its config.json.
+def new_folder(config: TrainConfig, capture: Capture) -> Path:
+    """Where a new run goes; nothing is made yet.
 
     Raises:
         ValueError: If the folder asked for exists already and holds something.
@@ -57,11 +57,19 @@ def create(config: TrainConfig, capture: Capture) -> Path:
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} exists and is not empty: go on with --resume {folder}, or choose another --out")
+    return folder
+
+
+def create(folder: Path, config: TrainConfig) -> None:
+    """Makes a run folder and writes its config.json.
+
+    Raises:
+        OSError: If it can't be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
     plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
     write_text(folder / "config.json", json.dumps(plain, indent=2, default=str) + "\n")
-    return folder
 
 
 def load_config(folder: Path) -> TrainConfig:
@@ -77,7 +85,12 @@ def load_config(folder: Path) -> TrainConfig:
         raise ValueError(f"{folder} is no run folder: it has no config.json") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    return dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
+    config = dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
+    try:
+        validate(config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return config
 
 
 def _from_plain(kind: Any, values: Any, path: Path) -> Any:
@@ -136,20 +149,31 @@ def renderer(scene: SplitScene, config: TrainConfig, facts: dict[str, Any]) -> R
     return render_at
 
 
-def evaluate_run(folder: Path, capture: Capture | None = None, lpips: Path | None = None, quiet: bool = False) -> str:
+def evaluate_run(
+    folder: Path,
+    capture: Capture | None = None,
+    lpips: Path | None = None,
+    device: Literal["cuda", "cpu"] | None = None,
+    quiet: bool = False,
+) -> str:
     """Evaluates the last iterate of a run: metrics.json, views.csv, pictures and a video; returns a text for people.
+
+    Args:
+        folder: Of the run.
+        capture: Its capture, if that is open already.
+        lpips: Folder with the weights of LPIPS; that of the config if None.
+        device: Where to render; CUDA if there is a GPU.
+        quiet: Whether to show no progress bars.
 
     Raises:
         ValueError: If the run, its capture or the weights of LPIPS can't be used.
         OSError: If something can't be written.
     """
-    config = load_config(folder)
-    if not torch.cuda.is_available():
-        config = dataclasses.replace(config, device="cpu")
-    device = torch.device(config.device or "cpu")
+    config = resolve(dataclasses.replace(load_config(folder), device=device))
+    target = torch.device(config.device or "cpu")
     capture = capture or open_capture(config, quiet)
     scene, facts = newest_scene(folder, config)
-    render_at = renderer(scene.to(device), config, facts)
+    render_at = renderer(scene.to(target), config, facts)
     network = find(lpips or config.lpips)
     chosen = {round(k * (len(capture.val) - 1) / max(1, PICTURES - 1)) for k in range(PICTURES)}
 
@@ -158,8 +182,8 @@ def evaluate_run(folder: Path, capture: Capture | None = None, lpips: Path | Non
             path = folder / "pictures" / f"{frame.name}.png"
             pictures.write_png(path, pictures.comparison(truth, rendering))
 
-    evaluation = evaluate(render_at, capture, device, network and network.to(device), draw, quiet)
-    _write_video(folder / "time.mp4", render_at, capture, device)
+    evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, quiet)
+    _write_video(folder / "time.mp4", render_at, capture, target)
     counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
     run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
     totals = {"iterations": run.pop("iteration"), **run, **counts, "commit": _commit()}
@@ -206,8 +230,10 @@ def _report(evaluation: Evaluation, counts: dict[str, int]) -> str:
 
 
 def _commit() -> str | None:
-    """The commit of the program where it runs from a checkout."""
+    """The commit of the program where it runs from a checkout, not that of a checkout which it is installed in."""
     source = Path(__file__).parent
+    if not (source.parent / ".git").exists():
+        return None
     try:
         done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=source, capture_output=True, text=True)
     except OSError:

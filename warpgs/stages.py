@@ -70,7 +70,8 @@ class Protocol:
         self.config = config
         self.has_depth = has_depth
         schedule = config.schedule
-        pretrain = schedule.pretrain if config.dap and has_depth else 0
+        # Pretraining is of the static branch.
+        pretrain = schedule.pretrain if config.dap and has_depth and config.assume != "dynamic" else 0
         # A component that is off gives its iterations to stage I, so that runs compare at one budget.
         stage2 = schedule.stage2 if config.stage2 else 0
         stage1 = schedule.pretrain + schedule.stage1 + schedule.stage2 - pretrain - stage2

@@ -40,6 +40,7 @@ class Trainer:
     Attributes:
         scene: What is trained.
         iteration: Iterations done.
+        num_aligned: Views whose depth could be aligned to the sparse points.
         seconds: Training time of earlier sessions of this run.
     """
 
@@ -47,11 +48,13 @@ class Trainer:
         self.config, self.capture, self.run = config, capture, run
         self.device = torch.device(config.device or "cpu")
         self.views = Views(capture, self.device, config.resident_bytes, config.assume)
-        self.protocol = Protocol(config, has_depth=self.views.has_depth)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
+        self._earlier_peak = 0
         self.alignments = initialize.align_to_points(capture, self.views)
+        self.num_aligned = int(self.alignments.isfinite().all(1).sum())
+        self.protocol = Protocol(config, has_depth=self.num_aligned > 0)
         self._order: tuple[int, int, list[int]] = (-1, 0, [])
         self._begin_with(initialize.first_scene(config, capture, self._generator("points")))
 
@@ -97,17 +100,22 @@ class Trainer:
         scene, config = self.scene, self.config.densify
         if moment.realign:
             # In place: the iterations' graph reads them.
-            self.alignments.copy_(initialize.align_to_rendering(self.alignments, self.views, scene, moment.sh_degree))
+            rendered = (scene, moment.sh_degree, self.config.antialias)
+            self.alignments.copy_(initialize.align_to_rendering(self.alignments, self.views, *rendered))
         if moment.densify:
             means = self.step.statistics.mean().split([len(scene.static), len(scene.dynamic)])
             generator = self._generator("densify")
-            for gaussians, gradients in zip((scene.static, scene.dynamic), means, strict=True):
-                room = config.max_gaussians - len(scene.static) - len(scene.dynamic)
+            room = config.max_gaussians - len(scene.static) - len(scene.dynamic)
+            wanting = [int((gradients > config.gradient).sum()) for gradients in means]
+            for gaussians, gradients, want in zip((scene.static, scene.dynamic), means, wanting, strict=True):
+                # What room there is is shared in proportion to how many want to grow.
+                share = room * want // max(1, sum(wanting))
                 extent, large = self.capture.extent, moment.remove_large
-                densify(gaussians, self.step.optimizer, gradients, extent, config, room, large, generator)
+                densify(gaussians, self.step.optimizer, gradients, extent, config, share, large, generator)
         if moment.prune:
             cameras = [self.capture.cameras[name].to(self.device) for name in self.capture.train]
-            removed = prune_invisible(scene, self.step.optimizer, cameras, moment.sh_degree, config.visibility)
+            settings = (moment.sh_degree, config.visibility, self.config.antialias)
+            removed = prune_invisible(scene, self.step.optimizer, cameras, *settings)
             logbook.say(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
         if moment.reset:
             for gaussians in (scene.static, scene.dynamic):
@@ -148,12 +156,16 @@ class Trainer:
     # Looking, saving, going back --------------------------------------------------------------------------------------
 
     def _look(self, moment: Moment, logbook: Logbook) -> bool:
-        """Shows the means since the last look; false if the loss was not finite."""
+        """Shows the means since the last look; false if the loss or a parameter was not finite.
+
+        Gaussians that are not finite are not drawn: the loss alone would not tell.
+        """
         *sums, psnr, steps = self.step.sums.tolist()
         self.step.sums.zero_()
         means = {name: value / steps for name, value in zip(TERMS, sums, strict=True)}
         loss = sum(means.values())
-        if not math.isfinite(loss):
+        finite = torch.stack([parameter.isfinite().all() for parameter in self.scene.parameters()]).all()
+        if not math.isfinite(loss) or not bool(finite):
             return False
         num_static, num_dynamic = len(self.scene.static), len(self.scene.dynamic)
         logbook.show(Status(self.iteration, moment.stage.name, loss, psnr / steps, means, num_static, num_dynamic))
@@ -165,14 +177,14 @@ class Trainer:
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
         if rollbacks > MOST_ROLLBACKS:
             raise ValueError(
-                f"the loss is not finite after iteration {failed_at}, and was not after {MOST_ROLLBACKS} returns to a "
-                f"checkpoint; {newest} holds the last good state"
+                f"the loss or a parameter is not finite after iteration {failed_at}, and was not after "
+                f"{MOST_ROLLBACKS} returns to a checkpoint; {newest} holds the last good state"
             )
         self.restore(newest)
         self.rollbacks = rollbacks
         logbook.say(
-            f"the loss is not finite after iteration {failed_at}: back to iteration {self.iteration}, with views and "
-            f"noise in another order ({rollbacks} of at most {MOST_ROLLBACKS} times)"
+            f"the loss or a parameter is not finite after iteration {failed_at}: back to iteration {self.iteration}, "
+            f"with views and noise in another order ({rollbacks} of at most {MOST_ROLLBACKS} times)"
         )
 
     def save(self) -> None:
@@ -191,10 +203,17 @@ class Trainer:
             "relit": moment.relit,
             "sh_degree": moment.sh_degree,
             "train_seconds": self.seconds + time.monotonic() - self._started,
-            "peak_bytes": torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None,
+            "peak_bytes": self._peak_bytes(),
+            "views": list(self.capture.train),
         }
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, facts)
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
+
+    def _peak_bytes(self) -> int | None:
+        """Most memory that tensors have taken on the device, also before this session; None on CPU."""
+        if self.device.type != "cuda":
+            return None
+        return max(self._earlier_peak, torch.cuda.max_memory_allocated(self.device))
 
     def restore(self, path: Path) -> None:
         """Takes up the state of a checkpoint.
@@ -203,28 +222,29 @@ class Trainer:
             ValueError: If it is damaged or of another config.
         """
         loaded = checkpoint.load(path)
-        self.alignments = loaded.tensors["alignments"].to(self.device)
+        if loaded.facts["views"] != list(self.capture.train):
+            raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
+        self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
         self._begin_with(checkpoint.load_scene(loaded, self.config.model, path))
         for name, parameter in self.scene.named_parameters():
-            state = {
-                part: loaded.tensors[f"adam.{part}.{name}"].to(self.device)
-                for part in ("step", "exp_avg", "exp_avg_sq")
-                if f"adam.{part}.{name}" in loaded.tensors
-            }
-            if state:
-                self.step.optimizer.state[parameter] = state
-        self.step.statistics.total = loaded.tensors["gradients.total"].to(self.device)
-        self.step.statistics.count = loaded.tensors["gradients.count"].to(self.device)
-        self.iteration, self.rollbacks = int(loaded.facts["iteration"]), int(loaded.facts["rollbacks"])
-        self.seconds, self._started = float(loaded.facts["train_seconds"]), time.monotonic()
+            if f"adam.step.{name}" in loaded.tensors:
+                shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
+                self.step.optimizer.state[parameter] = {
+                    part: loaded.tensor(f"adam.{part}.{name}", shape).to(self.device) for part, shape in shapes.items()
+                }
+        statistics = self.step.statistics
+        statistics.total = loaded.tensor("gradients.total", statistics.total.shape).to(self.device)
+        statistics.count = loaded.tensor("gradients.count", statistics.count.shape).to(self.device)
+        self.iteration, self.rollbacks = int(loaded.number("iteration")), int(loaded.number("rollbacks"))
+        self.seconds, self._started = loaded.number("train_seconds"), time.monotonic()
+        self._earlier_peak = loaded.facts["peak_bytes"] or 0
 
     def restore_newest(self) -> None:
-        """Takes up the newest checkpoint of the run folder.
+        """Takes up the newest checkpoint of the run folder; a run that died before its first one begins anew.
 
         Raises:
-            ValueError: If there is none, or it is damaged.
+            ValueError: If it is damaged; the one before it is then the newest once it is deleted.
         """
         saved = checkpoint.saved(self.run)
-        if not saved:
-            raise ValueError(f"{self.run} has no checkpoint to go on from")
-        self.restore(saved[-1])
+        if saved:
+            self.restore(saved[-1])

@@ -54,7 +54,6 @@ class Views:
 
     Attributes:
         resident: Whether all views are on the device.
-        has_depth: Whether any view has depth; of captures that are not resident, the first.
 
     Raises:
         ValueError: If a frame has no mask where masks are wanted; the message names it.
@@ -66,11 +65,9 @@ class Views:
         first = self._store(capture.frame(capture.train[0]))
         sizes = {capture.cameras[name].size for name in capture.train}
         self.resident = len(sizes) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
-        self.has_depth = bool(first.inverse_depth.isfinite().any())
         if self.resident:
             stored = [self._store(capture.frame(name)) for name in capture.train]
             self._all = _Stored(*(torch.stack(tensors).to(device) for tensors in zip(*stored, strict=True)))
-            self.has_depth = bool(self._all.inverse_depth.isfinite().any())
 
     def __len__(self) -> int:
         return len(self._capture.train)

@@ -166,3 +166,20 @@ def test_an_array_of_objects_is_never_unpickled(tmp_path):
     np.save(tmp_path / "p.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(ValueError, match="no \\.npy file of numbers"):
         read_array(tmp_path / "p.npy", 10)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "bright"), [("uint8", 1), ("uint8", 255), ("uint16", 1), ("uint16", 255), ("uint16", 65535)]
+)
+def test_a_mask_is_bright_where_it_has_its_largest_value(tmp_path, dtype, bright):
+    mask = (moving_block() > 127).astype(dtype) * np.array(bright, dtype)
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    assert np.array_equal(images.read_mask(tmp_path / "mask.png", SIZE), moving_block() > 127)
+
+
+@pytest.mark.parametrize("header", [b"{", b"{'descr': '<f4', 'fortran_order': False, 'shape': (True,)}"])
+def test_a_damaged_array_header_is_refused_in_words(tmp_path, header):
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.ljust(117) + b"\n" + b"\0" * 64
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(ValueError, match="is damaged or no"):
+        read_array(tmp_path / "a.npy", 100)

@@ -278,3 +278,8 @@ def test_a_real_captures_points_lie_at_the_depth_that_its_frame_shows(tmp_path):
     assert seen.sum() > 1000
     assert 0.8 < frame.static_mask.float().mean() < 0.99
     assert torch.corrcoef(ranks)[0, 1] > 0.9
+
+
+def test_pictures_in_full_size_alone_are_of_nerfds_even_without_masks(root):
+    shutil.rmtree(root / "resized_mask")
+    assert recognise(root) == "nerfds"

@@ -289,6 +289,18 @@ def test_where_nothing_moves_there_are_no_dynamic_gaussians():
     assert len(dynamic_gaussians(capture, ALIGNMENT, config)) == 0
 
 
+def test_where_masks_say_that_nothing_moves_there_are_no_dynamic_gaussians():
+    capture = make_capture(random_points(9), inverse_depth=constant_depth())
+    views = Views(capture, torch.device("cpu"), 1 << 30, assume="static")
+    scene = initialize.first_scene(CONFIG, capture, generator())
+    assert len(initialize.dynamic_gaussians(CONFIG, capture, views, ALIGNMENT, scene, generator())) == 0
+
+
+def test_gaussians_of_unknown_place_are_small_enough_to_stay():
+    gaussians = dynamic_gaussians(capture := make_capture(100.0 * random_points(50)), ALIGNMENT)
+    assert gaussians.scales.max() < CONFIG.densify.max_size * capture.extent
+
+
 def test_where_everything_moves_the_points_become_dynamic_gaussians():
     config, capture = dataclasses.replace(CONFIG, assume="dynamic"), make_capture(random_points(9))
     assert len(initialize.first_scene(config, capture, generator()).static) == 0

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def read_array(path: Path, most: int) -> np.ndarray:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # what the header claims is not allocated
     except FileNotFoundError as error:
         raise ValueError(f"{path} is missing") from error
-    except (ValueError, OSError, EOFError, OverflowError) as error:
+    except (ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError) as error:
         raise ValueError(f"{path} is damaged or no .npy file of numbers") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise ValueError(f"{path} must be an .npy file of numbers")

@@ -112,18 +112,19 @@ def read_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """True where a mask file is bright, of ``size`` (width, height).
+    """True where a mask file is brighter than half of its type's range, of ``size`` (width, height).
 
-    Masks of 0 and 1 instead of 0 and 255 are taken as they are meant.
+    Masks of 0 and 1 instead of 0 and 255, and 16-bit masks of 0 and 255, are taken as they are meant.
 
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = _to_8_bits(decode(path))
+    stored = decode(path)
     _check_size(path, "the mask", stored, size)
     if stored.ndim == 3:
         stored = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY)
-    return stored > (127 if stored.max() > 1 else 0)
+    brightest = next(most for most in (1, 255, 65535) if stored.max() <= most)
+    return stored > brightest // 2
 
 
 def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:

@@ -87,12 +87,13 @@ def recognise(root: Path) -> Dataset:
 
     iPhone: splits/train.json, covisible/<factor>x/val, or depth of camera 0 as .npy. (DyCheck adds splits,
     co-visibility and extra.json to HyperNeRF's captures too, but names those splits train_mono, train_intl, …)
-    NeRF-DS: masks in full size. Else HyperNeRF.
+    NeRF-DS: masks in full size, or pictures in no other. Else HyperNeRF.
     """
     signs = (root.glob("covisible/*x/val"), root.glob("depth/*x/0_*.npy"))
     if (root / "splits/train.json").is_file() or any(next(sign, None) for sign in signs):
         return "iphone"
-    return "nerfds" if (root / "resized_mask/1x").is_dir() else "hypernerf"
+    full_size = (root / "resized_mask/1x").is_dir() or not (root / "rgb/2x").is_dir()
+    return "nerfds" if full_size and (root / "rgb/1x").is_dir() else "hypernerf"
 
 
 def _split(root: Path, kind: Dataset, facts: dict[str, Any], metadata: dict[str, Any]) -> tuple[list[str], list[str]]:

@@ -1,5 +1,7 @@
 """The first Gaussians."""
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -16,17 +18,23 @@ BOX_MARGIN = 1.2
 
 
 def from_points(
-    points: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], sh_degree: int = MAX_SH_DEGREE
+    points: Float[Tensor, "N 3"],
+    colors: Float[Tensor, "N 3"],
+    sh_degree: int = MAX_SH_DEGREE,
+    largest: float = math.inf,
 ) -> Gaussians:
-    """Round Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS)."""
+    """Round Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
+
+    None is larger than ``largest`` [scene units].
+    """
     N = points.shape[0]
     if N <= NEIGHBOURS:
-        return Gaussians.from_points(points, colors, torch.full((N,), 0.01), FIRST_OPACITY, sh_degree)
+        return Gaussians.from_points(points, colors, torch.full((N,), min(0.01, largest)), FIRST_OPACITY, sh_degree)
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
     # Points at one place would get no size at all, a few far ones the size of the scene.
     typical = scales.median().clamp_min(1e-7)
-    scales = scales.clamp(1e-3 * typical, 10.0 * typical)
+    scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(largest)
     return Gaussians.from_points(points, colors, scales, FIRST_OPACITY, sh_degree)
 
 

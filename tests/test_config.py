@@ -1,0 +1,53 @@
+"""Numbers that training would stumble over later are refused at once, by name."""
+
+import dataclasses
+
+import pytest
+
+from warpgs.config import PRESETS, TrainConfig, scaled, validate
+
+
+def changed(name, value, config=PRESETS["paper"]):
+    first, _, rest = name.partition(".")
+    return dataclasses.replace(config, **{first: changed(rest, value, getattr(config, first)) if rest else value})
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_presets_are_valid(name):
+    validate(PRESETS[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("checkpoint_every", 0),
+        ("keep_checkpoints", 0),
+        ("densify.every", 0),
+        ("densify.gradient", -1e-4),
+        ("model.depth", 0),
+        ("model.width", -4),
+        ("model.max_static_points", -1),
+        ("optim.means", -1.0),
+        ("optim.means", float("nan")),
+        ("optim.networks_end", 0.0),
+        ("loss.depth", float("inf")),
+        ("schedule.sh_degree_every", 0),
+        ("factor", 0),
+    ],
+)
+def test_a_number_out_of_its_range_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"^{name} must be "):
+        scaled(changed(name, value))
+
+
+@pytest.mark.parametrize(("degree", "of_appearance"), [(4, 0), (1, 2)])
+def test_degrees_of_harmonics_that_do_not_fit_are_refused(degree, of_appearance):
+    config = changed("model.sh_degree", degree)
+    with pytest.raises(ValueError, match=r"appearance_degree <= model\.sh_degree <= 3"):
+        validate(changed("model.appearance_degree", of_appearance, config))
+
+
+def test_a_schedule_of_pretraining_alone_is_refused():
+    schedule = dataclasses.replace(TrainConfig().schedule, stage1=0, stage2=0)
+    with pytest.raises(ValueError, match="nothing to train"):
+        validate(dataclasses.replace(TrainConfig(), schedule=schedule))
