@@ -17,10 +17,11 @@ ORDER = [
     {"cameras", "scene", "fields"},
     {"data", "render"},
     {"losses", "metrics", "lpips", "pictures", "optim", "densify", "prune", "depth", "views", "initialize"},
-    {"stages", "checkpoint", "logbook", "interrupt"},
+    {"stages", "checkpoint", "logbook", "interrupt", "playback"},
     {"step"},
-    {"evaluate", "bench", "prepare"},
+    {"evaluate", "bench", "prepare", "paths"},
     {"trainer", "runs"},
+    {"export", "film", "viewer", "report"},
     {"cli"},
 ]
 """A module may import from its own group and from those before it."""

@@ -10,14 +10,14 @@ from typing import Any, Literal
 import torch
 
 from . import checkpoint, pictures
-from .cameras import Camera
-from .config import RenderSettings, TrainConfig, validate
+from .config import TrainConfig, validate
 from .data.capture import Capture, Frame
 from .data.nerfies import load_capture
 from .data.synthetic import builtin_capture
 from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_text, write_views
 from .lpips import find, locate
-from .render import Rendering, render
+from .playback import Player
+from .render import Rendering
 from .scene.split import SplitScene
 
 PICTURES = 6
@@ -136,19 +136,6 @@ def newest_scene(folder: Path, config: TrainConfig) -> tuple[SplitScene, dict[st
     return checkpoint.load_scene(loaded, config.model, saved[-1]), loaded.facts
 
 
-def renderer(scene: SplitScene, config: TrainConfig, facts: dict[str, Any]) -> RenderAt:
-    """Renders a scene as the stage that it was trained to does."""
-
-    def render_at(camera: Camera, branches: bool) -> Rendering:
-        time = torch.tensor([camera.time], device=camera.viewmat.device)
-        with torch.no_grad():
-            splats = scene.splats(time, bool(facts["moving"]), bool(facts["relit"]), int(facts["sh_degree"]))
-            settings = RenderSettings(branches=branches, antialias=config.antialias)
-            return render(splats, camera, settings=settings)
-
-    return render_at
-
-
 def evaluate_run(
     folder: Path,
     capture: Capture | None = None,
@@ -173,7 +160,7 @@ def evaluate_run(
     target = torch.device(config.device or "cpu")
     capture = capture or open_capture(config, quiet)
     scene, facts = newest_scene(folder, config)
-    render_at = renderer(scene.to(target), config, facts)
+    render_at = Player(scene.to(target), config, facts)
     network = find(lpips or config.lpips)
     chosen = {round(k * (len(capture.val) - 1) / max(1, PICTURES - 1)) for k in range(PICTURES)}
 
@@ -182,7 +169,7 @@ def evaluate_run(
             path = folder / "pictures" / f"{frame.name}.png"
             pictures.write_png(path, pictures.comparison(truth, rendering))
 
-    evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, quiet)
+    evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, render_at.play, quiet)
     _write_video(folder / "time.mp4", render_at, capture, target)
     counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
     run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
