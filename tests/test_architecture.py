@@ -19,9 +19,9 @@ ORDER = [
     {"losses", "metrics", "lpips", "pictures", "optim", "densify", "prune", "depth", "views", "initialize"},
     {"stages", "checkpoint", "logbook", "interrupt", "playback"},
     {"step"},
-    {"evaluate", "bench", "prepare", "paths"},
+    {"evaluate", "prepare", "paths"},
     {"trainer", "runs"},
-    {"export", "film", "viewer", "report"},
+    {"bench", "export", "film", "viewer", "report"},
     {"cli"},
 ]
 """A module may import from its own group and from those before it."""

@@ -4,8 +4,11 @@ import json
 import pytest
 import torch
 
+from tests import tiny
+from warpgs import runs
 from warpgs.bench import STAGES, Bench, bench
 from warpgs.bench_scenes import SCENES, Scene, random_splats
+from warpgs.bench_training import measure_steps, random_scene
 from warpgs.cli import main
 
 TINY = Scene("tiny", 48, 32, 100, 3.0)
@@ -113,3 +116,40 @@ def test_a_seed_stands_for_one_scene():
 def test_the_disc_holds_a_fifth_of_the_gaussians():
     splats, _ = Scene("many", 48, 32, 100_000, 3.0).make("disc", "cpu")
     assert splats.is_dynamic.float().mean().item() == pytest.approx(0.2, abs=0.01)
+
+
+# Training -----------------------------------------------------------------------------------------------------------
+
+
+def test_steps_of_both_stages_are_timed():
+    figures = measure_steps(300, (48, 32), "cpu", repeats=1)
+    assert (figures["gaussians"], figures["width"], figures["height"]) == (300, 48, 32)
+    assert figures["stage1_ms"] > 0
+    assert figures["stage2_ms"] > 0
+
+
+def test_the_scene_to_time_steps_of_has_both_branches_and_the_papers_networks():
+    splats, camera = random_splats(1000, 64, 48, 3.0, 0)
+    scene = random_scene(splats, camera)
+    assert 100 < len(scene.dynamic) < 300
+    assert len(scene.static) + len(scene.dynamic) == 1000
+    assert len(scene.deformation.trunk.layers) == 8
+    again = scene.splats(torch.zeros(1))
+    assert torch.allclose(again.scales.sort(0).values, splats.scales.sort(0).values, rtol=1e-5)
+
+
+def test_frames_a_second_of_a_run_are_written(tmp_path, capsys):
+    data, run = tiny.write(tmp_path), tmp_path / "run"
+    trainer = tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, data=data))
+    runs.create(run, trainer.config)
+    trainer.save()
+    assert main(["bench", "--device", "cpu", "--fps", str(run), "--json", str(tmp_path / "out.json")]) == 0
+    figures = json.loads((tmp_path / "out.json").read_text())["fps"]
+    assert figures["frames_per_second"] > 0
+    assert figures["static"] == len(trainer.scene.static)
+    assert "frames a second" in capsys.readouterr().out
+
+
+def test_frames_a_second_of_what_is_no_run_are_refused(tmp_path, capsys):
+    assert main(["bench", "--device", "cpu", "--fps", str(tmp_path)]) == 2
+    assert "is no run folder" in capsys.readouterr().err

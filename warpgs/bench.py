@@ -4,7 +4,6 @@ import dataclasses
 import importlib.util
 import json
 import statistics
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,8 @@ import torch
 
 from .bench_report import machine, print_machine, print_result, trace_events
 from .bench_scenes import SCENES, SEED, Branches, Scene
+from .bench_timing import milliseconds
+from .bench_training import bench_fps, bench_steps
 from .bench_workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
 from .cameras import Camera
 from .config import RenderSettings
@@ -76,10 +77,30 @@ class Bench:
     """File for all figures."""
     profile: Path | None = None
     """File for a Chrome trace (chrome://tracing) of the kernels of one render and its way back."""
+    steps: bool = False
+    """Instead of scenes, time whole training steps, by number of Gaussians and size of image."""
+    fps: Path | None = None
+    """Instead of scenes, measure the frames a second of this run."""
 
     def run(self) -> None:
+        if self.steps or self.fps is not None:
+            self.run_training()
+            return
         names: Sequence[str] = self.scenes or (tuple(SCENES) if self.device == "cuda" else ("small",))
         bench(self, [SCENES[name] for name in names])
+
+    def run_training(self) -> None:
+        """Measures what ``steps`` and ``fps`` ask for."""
+        self.check()
+        head = machine(self.device)
+        print_machine(head)
+        report: Measurements = {"machine": head, "repeats": self.repeats}
+        if self.steps:
+            report["steps"] = bench_steps(self.device, self.repeats)
+        if self.fps is not None:
+            report["fps"] = bench_fps(self.fps, self.device)
+        if self.json is not None:
+            self.json.write_text(json.dumps(report, indent=1) + "\n")
 
     def check(self) -> None:
         """Raises ``ValueError`` or ``ImportError`` if this cannot be measured here, before time is spent on it."""
@@ -170,20 +191,6 @@ def time_passes(workloads: dict[str, Workload], graphed: list[str], options: Ben
         for key, step in steps.items():
             samples[key].append(milliseconds(step, options.device))
     return {key: statistics.median(values) for key, values in samples.items()}
-
-
-def milliseconds(step: Callable[[], object], device: str) -> float:
-    """How long a step takes, on the device's own clock."""
-    if device == "cpu":
-        start = time.perf_counter()
-        step()
-        return (time.perf_counter() - start) * 1e3
-    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    begin.record()
-    step()
-    end.record()
-    torch.cuda.synchronize()
-    return begin.elapsed_time(end)
 
 
 def time_stages(workload: Workload, options: Bench) -> dict[str, float]:

@@ -82,6 +82,17 @@ def print_result(result: dict[str, Any]) -> None:
     console.print(table)
 
 
+def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
+    """Prints a table with one line for each row; all rows have the same figures."""
+    console = _console()
+    table = Table(title=title, title_justify="left", box=box.SIMPLE if console.is_terminal else None)
+    for name in rows[0]:
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(*(value if isinstance(value, str) else _text(value) for value in row.values()))
+    console.print(table)
+
+
 def trace_events(scene: str, kernels: Iterable[KernelTime], process: int) -> list[dict[str, Any]]:
     """A scene's kernels in the Trace Event Format [µs], as a process of their own."""
     common = {"pid": process, "tid": 0}
@@ -105,7 +116,7 @@ def _flat(figures: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _text(value: float) -> str:
+def _text(value: int | float) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     return f"{value:.3f}" if value >= 0.01 or value == 0 else f"{value:.2e}"
