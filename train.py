@@ -14,7 +14,6 @@ from warpgs.interrupt import Interrupt
 from warpgs.logbook import Logbook
 from warpgs.trainer import Trainer
 
-
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 
 

@@ -331,3 +331,19 @@ def test_a_schedule_that_cannot_be_is_refused_by_name(name, value, iterations):
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SHORT, **{name: value}), iterations=iterations)
     with pytest.raises(ValueError, match=f"schedule.{name} must be a number of at least ., got {value}"):
         scaled(config)
+
+
+def test_the_appearance_network_recovers_after_each_reset():
+    made = moments(schedule={"recovery": 10})
+    values = [moment.recovered for moment in made]
+    resets = [k for k, moment in enumerate(made) if moment.reset]
+    assert len(resets) > 1
+    for reset in resets:
+        assert values[reset + 1 : reset + 12] == pytest.approx([(k / 10) ** 2 for k in range(11)])
+    assert values[: resets[0] + 1] == [1.0] * (resets[0] + 1)
+    assert values[-1] == 1.0
+
+
+def test_without_pretraining_the_appearance_network_begins_slowly():
+    made = moments(has_depth=False, schedule={"recovery": 10, "reset_every": 1000})
+    assert [moment.recovered for moment in made[:12]] == pytest.approx([*((k / 10) ** 2 for k in range(10)), 1.0, 1.0])

@@ -133,6 +133,9 @@ class Schedule:
     densify_until: int = 15_000
     reset_every: int = 3_000
     """Iterations between opacity resets, while densifying."""
+    recovery: int = 1_000
+    """Iterations over which the rate of the appearance network rises again after an opacity reset: until opacities are
+    back every image is too dark, and the network would learn to brighten everything and never recover."""
     prune_every: int = 5_000
     """Iterations of stage I between visibility-driven prunings."""
     deform_from: int = 3_000
@@ -229,6 +232,7 @@ PRESETS: dict[str, TrainConfig] = {
             densify_from=300,
             densify_until=3_500,
             reset_every=2_500,
+            recovery=500,
             prune_every=2_000,
             deform_from=500,
             noise_until=3_500,
@@ -252,6 +256,7 @@ PRESETS: dict[str, TrainConfig] = {
             densify_from=100,
             densify_until=700,
             reset_every=10_000,
+            recovery=200,
             prune_every=500,
             deform_from=50,
             noise_until=400,

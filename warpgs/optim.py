@@ -45,7 +45,7 @@ def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> Adam:
 
 
 def learning_rates(
-    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float]
+    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float], recovered: float = 1.0
 ) -> list[float]:
     """Learning rate of each group of ``GROUPS``.
 
@@ -54,6 +54,7 @@ def learning_rates(
         extent: Of the capture [scene units]; scales the rate of positions.
         progress: Share of the run done, in [0, 1].
         network_progress: The same for each network, over the iterations in which it is trained.
+        recovered: Share of its rate that the appearance network has.
     """
     gaussians = [
         exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
@@ -67,7 +68,7 @@ def learning_rates(
         exponential(config.networks, config.networks_end, network_progress[name])
         for name in ("deformation", "appearance")
     ]
-    return [*gaussians, *gaussians, *networks]
+    return [*gaussians, *gaussians, networks[0], recovered * networks[1]]
 
 
 def exponential(start: float, end: float, progress: float) -> float:

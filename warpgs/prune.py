@@ -23,8 +23,8 @@ def visibility(
 ) -> Float[Tensor, " N"]:
     """V̄ of every static Gaussian: 1/T Σ_t 1[rendered at t] (1 − α(t)), over all cameras.
 
-    "Rendered" means that it changed a pixel of the static image. α is that of w⁰: the appearance network leaves opacities
-    alone unless ``model.appearance_opacity`` says otherwise.
+    "Rendered" means that it changed a pixel of the static image. α is that of w⁰: the appearance network leaves
+    opacities alone unless ``model.appearance_opacity`` says otherwise.
     """
     static = scene.static
     splats = scene.static_splats(sh_degree)

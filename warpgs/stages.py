@@ -33,6 +33,7 @@ class Moment:
         stage: The stage it belongs to.
         progress: Share of the run done.
         network_progress: Share done of the iterations in which each network is trained.
+        recovered: Share of its rate that the appearance network has, 0 when opacities have just been reset.
         moving, relit: Whether the deformation and the appearance network are in use.
         joint: Whether the joint image is compared with the whole truth.
         sh_degree: Highest degree of spherical harmonics in use.
@@ -45,6 +46,7 @@ class Moment:
     stage: Stage
     progress: float
     network_progress: dict[str, float]
+    recovered: float
     moving: bool
     relit: bool
     joint: bool
@@ -97,6 +99,7 @@ class Protocol:
                 "deformation": self._share_since(schedule.deform_from, in_stage1),
                 "appearance": self._share_since(schedule.relight_from, in_stage1),
             },
+            recovered=self._recovered(in_stage1),
             moving=in_stage1 >= schedule.deform_from or stage.name == "stage2",
             relit=config.app and (in_stage1 >= schedule.relight_from or stage.name == "stage2"),
             joint=stage.name == "stage2",
@@ -117,6 +120,16 @@ class Protocol:
         """Share done of the iterations from one of stage I, or the start of stage II, to the end of the run."""
         first = min(start, self.stage2.start - self.stage1.start)
         return max(0.0, (in_stage1 - first) / max(1, self.num_iterations - self.stage1.start - first))
+
+    def _recovered(self, in_stage1: int) -> float:
+        """Rises with the square of the iterations since opacities were low: after a reset, or without pretraining."""
+        schedule = self.config.schedule
+        last_reset = min(in_stage1, schedule.densify_until - 1) // schedule.reset_every * schedule.reset_every
+        if last_reset < max(1, schedule.densify_from):
+            if self.pretrain.end > 0:
+                return 1.0
+            last_reset = 0
+        return min(1.0, (max(0, in_stage1 - last_reset) / max(1, schedule.recovery)) ** 2)
 
     def _depth_weight(self, progress: float) -> float:
         loss = self.config.loss
