@@ -3,6 +3,7 @@
 import dataclasses
 import statistics
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,7 @@ def _times(step: Step, moment: Moment, device: str, repeats: int) -> Iterable[fl
     ]
     for draw in [draws[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
         step(moment, draw)
-    return [milliseconds(lambda draw=draw: step(moment, draw), device) for draw in draws]
+    return [milliseconds(partial(step, moment, draw), device) for draw in draws]
 
 
 def bench_fps(folder: Path, device: str) -> dict[str, Any]:

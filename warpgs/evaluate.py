@@ -124,9 +124,7 @@ def evaluate(
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
-    return Evaluation(
-        views, _flicker(render_at, cameras), frame_rate(play, cameras), lpips.net if lpips else None
-    )
+    return Evaluation(views, _flicker(render_at, cameras), frame_rate(play, cameras), lpips.net if lpips else None)
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:

@@ -52,8 +52,6 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     return points, init.color_points(points, seen)
 
 
-
-
 def dynamic_gaussians(
     config: TrainConfig,
     capture: Capture,
