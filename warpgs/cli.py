@@ -10,6 +10,7 @@ import tyro
 
 from . import runs
 from .bench import Bench
+from .prepare.commands import Check, Prepare
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,12 @@ class Eval:
         print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device))
 
 
-COMMANDS: dict[str, Callable[..., Bench | Eval]] = {"bench": Bench, "eval": Eval}
+COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Prepare]] = {
+    "bench": Bench,
+    "check": Check,
+    "eval": Eval,
+    "prepare": Prepare,
+}
 """Each command is a dataclass of its options with a method ``run``."""
 
 

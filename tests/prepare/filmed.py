@@ -1,0 +1,129 @@
+"""A tiny filmed scene: textured planes at several depths, a camera that travels past, and a board that moves."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from warpgs.data.lens import Lens
+from warpgs.prepare.frames import SourceFrame
+from warpgs.prepare.scene import write_facts, write_frames
+from warpgs.prepare.sfm import Cameras
+
+SIZE = (256, 192)
+"""(width, height) of the pictures [px]."""
+
+FOCAL = 230.0
+
+PLANES = (  # center, half sizes: boards facing the camera, the first one is the wall behind
+    ((0.0, 0.0, 6.0), (7.0, 5.0)),
+    ((-1.6, 0.6, 4.0), (0.9, 0.8)),
+    ((1.5, 0.9, 3.4), (0.7, 0.6)),
+    ((0.2, -0.9, 4.6), (0.8, 0.5)),
+)
+
+MOVER_HALF = (0.45, 0.4)
+
+
+COLORS = ((150, 150, 130), (90, 130, 170), (120, 170, 90), (170, 150, 80))
+"""Of the planes; the board that moves is red."""
+
+
+def texture(seed: int, color: tuple[int, int, int], size: int, cells: tuple[int, ...]) -> np.ndarray:
+    """[size, size, 3] light and dark blobs of one colour."""
+    generator = np.random.default_rng(seed)
+    light = np.zeros((size, size), np.float32)
+    for count in cells:
+        noise = generator.normal(0.0, 0.35, (count, count)).astype(np.float32)
+        light += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
+    return np.clip(np.exp2(light)[..., None] * np.array(color), 0, 255).astype(np.uint8)
+
+
+def pose(time: float, travel: float = 1.0) -> np.ndarray:
+    """[3, 4] world to camera: sideways and up while turning towards the scene."""
+    center = travel * np.array([2.4 * time - 1.2, 0.5 * np.sin(3.0 * time), 0.3 * time])
+    rotation = cv2.Rodrigues(np.array([0.03 * np.sin(4.0 * time), 0.5 * travel * (time - 0.5), 0.02]))[0]
+    return np.hstack([rotation, -rotation @ center[:, None]])
+
+
+def mover(time: float) -> tuple[float, float, float]:
+    """Center of the board that moves."""
+    return (0.7 * np.sin(5.0 * time), 0.1 + 0.4 * np.cos(6.0 * time), 3.0)
+
+
+def _draw(image: np.ndarray, board: tuple, paint: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """Paints a board over the picture; returns where."""
+    (x, y, z), (half_x, half_y) = board
+    corners = np.array([[x + i * half_x, y + j * half_y, z] for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    seen = corners @ view[:, :3].T + view[:, 3]
+    pixels = FOCAL * seen[:, :2] / seen[:, 2:] + np.array(SIZE) / 2.0 - 0.5
+    side = len(paint) - 1
+    square = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
+    homography = cv2.getPerspectiveTransform(square, pixels.astype(np.float32))
+    drawn = cv2.warpPerspective(paint, homography, SIZE, flags=cv2.INTER_AREA)
+    where = cv2.warpPerspective(np.ones(paint.shape[:2], np.uint8), homography, SIZE, flags=cv2.INTER_NEAREST) > 0
+    image[where] = drawn[where]
+    return where
+
+
+def film(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """[H, W, 3] RGB pictures, and [H, W] true where the board that moves is."""
+    paints = [texture(0, COLORS[0], 512, (20, 60)), *(texture(k, COLORS[k], 128, (5, 14)) for k in (1, 2, 3))]
+    red = texture(9, (190, 60, 50), 128, (4, 12))
+    images, masks = [], []
+    for k in range(num_frames):
+        time = k / (num_frames - 1)
+        image, view = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose(time, travel)
+        for board, paint in sorted(zip(PLANES, paints, strict=True), key=lambda b: -b[0][0][2]):
+            _draw(image, board, paint, view)
+        mask = np.zeros(SIZE[::-1], bool)
+        if moves:
+            mask = _draw(image, (mover(time), MOVER_HALF), red, view)
+        images.append(image)
+        masks.append(mask)
+    return images, masks
+
+
+def poses(num_frames: int = 24) -> np.ndarray:
+    """[F, 3, 4] of the film's pictures."""
+    return np.array([pose(k / (num_frames - 1)) for k in range(num_frames)])
+
+
+def points(count: int = 400) -> np.ndarray:
+    """[count, 3] on the planes that stand."""
+    generator = np.random.default_rng(1)
+    chosen = [PLANES[k % len(PLANES)] for k in range(count)]
+    offsets = generator.uniform(-0.6, 0.6, (count, 2))
+    return np.array([[c[0] + h[0] * o[0], c[1] + h[1] * o[1], c[2]] for (c, h), o in zip(chosen, offsets, strict=True)])
+
+
+def lens() -> Lens:
+    return Lens(*SIZE, (FOCAL, FOCAL), (SIZE[0] / 2, SIZE[1] / 2))
+
+
+def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
+    """A capture of the film with its true cameras and masks."""
+    images, masks = film(num_frames)
+    write_folder(root / "frames", images)
+    names = [path.stem for path in sorted((root / "frames").iterdir())]
+    colors = np.zeros((400, 3), np.uint8)
+    cameras = Cameras(names, lens(), poses(num_frames), points(), colors, 0.1, 10.0)
+    write_frames(root, root / "frames", cameras, masks)
+    write_facts(root, cameras, [SourceFrame(name, name, k) for k, name in enumerate(names)], holdout)
+    return root
+
+
+def write_folder(folder: Path, images: list[np.ndarray]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, image in enumerate(images):
+        cv2.imwrite(str(folder / f"shot{k:03d}.png"), image[..., ::-1])
+    return folder
+
+
+def write_video(path: Path, images: list[np.ndarray], rate: float = 10.0) -> Path:
+    height, width = images[0].shape[:2]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
+    for image in images:
+        writer.write(image[..., ::-1])
+    writer.release()
+    return path

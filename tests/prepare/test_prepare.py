@@ -1,0 +1,171 @@
+"""From pictures to a capture, whole, and what stops it."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.prepare import filmed
+from warpgs.data.nerfies import load_capture
+from warpgs.prepare.check import check_capture
+from warpgs.prepare.frames import Selection
+from warpgs.prepare.options import Options
+from warpgs.prepare.pipeline import Preparation
+
+
+def prepare(source, root, force=False, **options):
+    return Preparation(root, Options(source, **options), force, quiet=True).run()
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    return filmed.write_folder(tmp_path_factory.mktemp("prepare") / "shots", filmed.film(24)[0])
+
+
+@pytest.fixture(scope="module")
+def made(shots):
+    root = shots.parent / "made"
+    prepare(shots, root, holdout=8)
+    return root
+
+
+def distances(capture) -> np.ndarray:
+    """Of the cameras' centres from the true ones after the best similarity, over the length of the path."""
+    names = sorted(capture.cameras)
+    truth = np.array([-filmed.pose(int(n[6:]) / 23)[:, :3].T @ filmed.pose(int(n[6:]) / 23)[:, 3] for n in names])
+    found = np.array([capture.cameras[n].position.numpy() for n in names], np.float64)
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(turn)).sum() / (a**2).sum()
+    return np.linalg.norm(scale * a @ (u @ turn @ vt).T - b, axis=1) / np.ptp(truth, axis=0).max()
+
+
+def test_every_frame_gets_its_true_camera(made):
+    capture = load_capture(made)
+    assert (len(capture.train), len(capture.val)) == (21, 3)
+    assert np.median(distances(capture)) < 0.01
+    assert distances(capture).max() < 0.03
+
+
+def test_the_board_that_moves_is_masked(made):
+    capture = load_capture(made)
+    truth = filmed.film(24)[1]
+    shares = []
+    for name in capture.cameras:
+        moving, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
+        shares.append((moving & true).sum() / (moving | true).sum())
+    assert np.mean(shares) > 0.7
+
+
+def test_what_is_made_is_fit_to_train_on(made):
+    report = check_capture(made)
+    assert report.is_fit
+    assert "24 of 24 frames have masks, 24 have depth" in str(report)
+
+
+def test_a_contact_sheet_and_a_report_are_written(made):
+    assert cv2.imread(str(made / "masks.png")).shape[1] == 6 * 256
+    report = json.loads((made / "prepare.json").read_text())
+    assert report["notes"] == []
+    assert "24 of 24" in report["steps"]["cameras"]
+
+
+def test_only_a_small_state_is_left_of_the_work(made):
+    assert [path.name for path in (made / ".prepare").iterdir()] == ["state.json"]
+
+
+def test_a_finished_capture_is_not_made_again(made, shots):
+    before = (made / "dataset.json").stat().st_mtime_ns
+    prepare(shots, made, holdout=8)
+    assert (made / "dataset.json").stat().st_mtime_ns == before
+
+
+def test_other_options_need_force(made, shots):
+    with pytest.raises(ValueError, match=r"other options \(holdout\).*--force"):
+        prepare(shots, made, holdout=4)
+
+
+def test_a_stopped_attempt_goes_on_where_it_stopped(shots, tmp_path, monkeypatch):
+    stopped = Preparation(tmp_path / "made", Options(shots, masks="none", depth="none"), quiet=True)
+    monkeypatch.setattr(stopped, "_capture", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run()
+    again = Preparation(tmp_path / "made", Options(shots, masks="none", depth="none"), quiet=True)
+    for finished in ("_frames", "_cameras"):
+        monkeypatch.setattr(again, finished, lambda: pytest.fail("was done before"))
+    again.run()
+    capture = load_capture(tmp_path / "made")
+    assert bool(capture.frame(capture.train[0]).static_mask.all())
+
+
+def test_given_masks_are_taken_as_they_are(shots, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for k, mask in enumerate(filmed.film(24)[1]):
+        cv2.imwrite(str(tmp_path / f"masks/shot{k:03d}.png"), np.where(mask, 0, 255).astype(np.uint8))
+    prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), depth="none", lens="SIMPLE_PINHOLE")
+    capture = load_capture(tmp_path / "made")
+    assert np.array_equal(capture.frame("frame_000010").static_mask.numpy(), ~filmed.film(24)[1][10])
+    assert np.median(distances(capture)) < 0.01
+
+
+def test_a_missing_mask_is_named(shots, tmp_path):
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(ValueError, match=r"no mask for frame_000000 \(shot000.png\)"):
+        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"))
+
+
+def test_a_folder_with_something_else_is_not_touched(shots, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(ValueError, match="was not begun by prepare"):
+        prepare(shots, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_force_removes_only_what_prepare_makes(shots, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    (tmp_path / "rgb").mkdir()
+    Preparation(tmp_path, Options(shots), force=True, quiet=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_the_source_is_never_replaced(shots):
+    for root in (shots, shots.parent):
+        with pytest.raises(ValueError, match="holds the source"):
+            Preparation(root, Options(shots), force=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"holdout": 1}, "--holdout"),
+        ({"holdout": -2}, "--holdout"),
+        ({"masks": "nowhere"}, "--masks"),
+        ({"selection": Selection(count=1)}, "--count"),
+    ],
+)
+def test_impossible_options_are_refused(options, word, shots, tmp_path):
+    with pytest.raises(ValueError, match=word):
+        prepare(shots, tmp_path / "made", **options)
+
+
+def test_a_camera_that_stands_still_is_refused_with_advice(tmp_path):
+    still = filmed.write_folder(tmp_path / "still", filmed.film(8, travel=0.0, moves=False)[0])
+    with pytest.raises(ValueError, match=r"move the camera sideways|walk around"):
+        prepare(still, tmp_path / "made")
+
+
+def test_pictures_without_texture_are_refused_with_advice(tmp_path):
+    grey = filmed.write_folder(tmp_path / "grey", [np.full((96, 128, 3), 128, np.uint8)] * 6)
+    with pytest.raises(ValueError, match="hardly any texture"):
+        prepare(grey, tmp_path / "made")
+
+
+def test_a_full_disk_is_told_before_work_starts(shots, tmp_path, monkeypatch):
+    class Usage:
+        free = 5_000_000
+
+    monkeypatch.setattr("shutil.disk_usage", lambda path: Usage)
+    with pytest.raises(OSError, match="of disk are needed, 5 MB are free"):
+        prepare(shots, tmp_path / "made")

@@ -1,0 +1,81 @@
+"""What is written, and in which units."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.prepare import filmed
+from warpgs.data.lens import Lens
+from warpgs.data.nerfies import load_capture, recognise
+from warpgs.prepare.scene import resized_lens, scene_units, static_points, straight_lens
+from warpgs.prepare.sfm import Cameras
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return filmed.write_capture(tmp_path_factory.mktemp("scene"), holdout=4)
+
+
+def test_what_is_written_is_read_back_as_nerf_ds(root):
+    capture = load_capture(root)
+    assert recognise(root) == "nerfds"
+    name = capture.train[3]
+    frame, k = capture.frame(name), int(name.removeprefix("shot"))
+    images, masks = filmed.film(16)
+    assert np.array_equal(frame.image.numpy(), images[k])
+    assert np.array_equal(frame.static_mask.numpy(), ~masks[k])
+    scene = json.loads((root / "scene.json").read_text())
+    center = -filmed.poses(16)[k, :, :3].T @ filmed.poses(16)[k, :, 3]
+    expected = (center - np.array(scene["center"])) * scene["scale"]
+    assert np.allclose(frame.camera.position.numpy(), expected, atol=1e-5)
+
+
+def test_every_fourth_frame_is_held_out(root):
+    capture = load_capture(root)
+    assert len(capture.val) == 4
+    assert not set(capture.val) & set(capture.train)
+    assert min(capture.cameras[n].time for n in capture.train) == 0.0
+
+
+def test_the_scene_lies_in_the_unit_cube(root):
+    capture = load_capture(root)
+    assert float(capture.points.abs().quantile(0.95)) <= 1.0
+    assert float(capture.points.abs().max()) > 0.8
+    assert all(float(camera.position.abs().max()) <= 1.0 + 1e-5 for camera in capture.cameras.values())
+
+
+def test_strays_do_not_shrink_the_scene():
+    points = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
+    with_strays = np.vstack([points, np.full((5, 3), 1e4)])
+    assert scene_units(with_strays, points[:5])[1] == pytest.approx(scene_units(points, points[:5])[1], rel=0.1)
+
+
+def test_a_straight_lens_stays_and_a_bent_one_zooms_in():
+    lens = Lens(64, 48, (50.0, 50.0), (32.0, 24.0))
+    assert straight_lens(lens) == lens
+    bent = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
+    assert straight_lens(bent).focal[0] >= 50.0
+    assert straight_lens(bent).is_straight
+
+
+def test_a_resized_lens_sees_the_same():
+    small = resized_lens(Lens(64, 48, (50.0, 52.0), (30.0, 25.0)), 32, 24)
+    assert (small.width, small.focal, small.center) == (32, (25.0, 26.0), (15.0, 12.5))
+
+
+def test_points_on_what_moves_are_left_out():
+    poses = np.tile(np.hstack([np.eye(3), np.zeros((3, 1))]), (4, 1, 1))
+    points = np.array([[0.0, 0.0, 2.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]])
+    cameras = Cameras(list("abcd"), filmed.lens(), poses, points, np.zeros((3, 3), np.uint8), 0.1, 9.0)
+    moving = np.zeros((4, 192, 256), bool)
+    moving[:3, 90:100, 120:136] = True
+    assert static_points(cameras, list(moving)).tolist() == [False, True, True]
+
+
+def test_cameras_are_saved_and_loaded(tmp_path):
+    cameras = Cameras(["a", "b"], filmed.lens(), filmed.poses(2), filmed.points(7), np.ones((7, 3), np.uint8), 0.5, 8.0)
+    cameras.save(tmp_path / "c.npz")
+    loaded = Cameras.load(tmp_path / "c.npz")
+    assert (loaded.names, loaded.lens, loaded.angle) == (cameras.names, cameras.lens, cameras.angle)
+    assert np.array_equal(loaded.poses, cameras.poses)
