@@ -10,7 +10,11 @@ import tyro
 
 from . import runs
 from .bench import Bench
+from .export.command import Export
+from .film import Render
 from .prepare.commands import Check, Prepare
+from .report.command import Report
+from .viewer.command import View
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,15 @@ class Eval:
         print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device))
 
 
-COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Prepare]] = {
+COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Export | Prepare | Render | Report | View]] = {
     "bench": Bench,
     "check": Check,
     "eval": Eval,
+    "export": Export,
     "prepare": Prepare,
+    "render": Render,
+    "report": Report,
+    "view": View,
 }
 """Each command is a dataclass of its options with a method ``run``."""
 

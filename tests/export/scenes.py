@@ -1,0 +1,72 @@
+"""Small clouds and a small scene that moves, for the tests of exports."""
+
+import torch
+
+from tests import tiny
+from warpgs.cameras import Camera
+from warpgs.config import TrainConfig
+from warpgs.export.cloud import Cloud
+from warpgs.export.moments import Moments
+from warpgs.render import render
+from warpgs.scene.gaussians import Gaussians
+from warpgs.scene.splats import Splats
+from warpgs.scene.split import SplitScene
+
+FACTS = {"moving": True, "relit": True, "sh_degree": 1, "iteration": 32}
+
+
+def cloud(num, degree=1, seed=0):
+    """Gaussians before the camera below, the second half of them dynamic."""
+    random = torch.Generator().manual_seed(seed)
+    splats = Splats(
+        means=torch.rand(num, 3, generator=random) * 2 - 1,
+        quats=torch.nn.functional.normalize(torch.randn(num, 4, generator=random), dim=1),
+        scales=torch.rand(num, 3, generator=random) * 0.15 + 0.02,
+        opacities=torch.rand(num, generator=random) * 0.9 + 0.05,
+        sh=torch.randn(num, (degree + 1) ** 2, 3, generator=random) * 0.3,
+        is_dynamic=torch.arange(num) >= num // 2,
+    )
+    return Cloud.of_splats(splats)
+
+
+def camera(width=64, height=48, time=0.0):
+    origin, up = torch.tensor([0.0, 0.0, -3.0]), torch.tensor([0.0, -1.0, 0.0])
+    return Camera.looking_at(origin, torch.zeros(3), up, 60.0 * width / 64, (width, height), time)
+
+
+def image(cloud, through=None):
+    with torch.no_grad():
+        return render(cloud.splats(), through or camera()).joint.image.clamp(0, 1)
+
+
+def psnr(a, b):
+    return float(-10 * torch.log10((a - b).square().mean().clamp_min(1e-12)))
+
+
+def refusal(read, path):
+    """What a reader says of a file that it does not take; any other error is one of the test."""
+    try:
+        read(path)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def moments(num_static=40, num_dynamic=20, seed=0):
+    """A scene whose networks do something: what moves goes a good part of its way in between."""
+    torch.manual_seed(seed)
+    scene = SplitScene.empty(num_static, num_dynamic, tiny.MODEL)
+    for part in (scene.static, scene.dynamic):
+        part.load_state_dict(_random(len(part)).state_dict())
+    for field in (scene.deformation, scene.appearance):
+        for parameter in field.parameters():
+            torch.nn.init.normal_(parameter, std=0.15)
+    return Moments(scene, TrainConfig(model=tiny.MODEL), FACTS)
+
+
+def _random(num):
+    points, colors = torch.rand(num, 3) * 2 - 1, torch.rand(num, 3)
+    gaussians = Gaussians.from_points(points, colors, torch.rand(num) * 0.1 + 0.05, 0.7, 1)
+    torch.nn.init.normal_(gaussians.sh_rest, std=0.1)
+    torch.nn.init.normal_(gaussians.quats)
+    return gaussians

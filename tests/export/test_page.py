@@ -1,0 +1,248 @@
+"""The page: one file without a network, whose numbers give the scene's own images to within their few bits."""
+
+import base64
+import dataclasses
+import gzip
+import json
+import re
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from tests.export import scenes
+from warpgs.export import page
+from warpgs.export.baking import bake, baked_bytes
+from warpgs.export.page import Start, read_page, write_page
+from warpgs.paths import evenly
+
+KEYS = 9
+
+
+def start(title="scene", track=False):
+    camera = scenes.camera()
+    K, view = camera.K, camera.viewmat.tolist()
+    intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    return Start(title, camera.size, intrinsics, view, 3.0, [view, view] if track else [], 4.0, False)
+
+
+@pytest.fixture(scope="module")
+def moments():
+    return scenes.moments()
+
+
+@pytest.fixture(scope="module")
+def baked(moments):
+    return bake(moments.at, evenly(KEYS))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "scene.html"
+
+
+# Numbers ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", range(KEYS))
+def test_at_key_times_the_image_is_that_of_the_scene_to_within_quantisation(moments, baked, key):
+    time = key / (KEYS - 1)
+    assert scenes.psnr(scenes.image(baked.at(time)), scenes.image(moments.at(time))) > 50
+
+
+def test_between_key_times_the_image_comes_closer_with_more_of_them(moments):
+    times = [0.13, 0.38, 0.71]
+    quality = []
+    for keys in (3, 9, 33):
+        coarse = bake(moments.at, evenly(keys))
+        quality.append(np.mean([scenes.psnr(scenes.image(coarse.at(t)), scenes.image(moments.at(t))) for t in times]))
+    assert quality[0] + 3 < quality[1] < quality[2] - 3
+
+
+@pytest.mark.parametrize("keys", [1, 2])
+def test_a_scene_of_few_key_times_is_shown_at_every_time(moments, keys):
+    few = bake(moments.at, evenly(keys))
+    for time in (0.0, 0.5, 1.0):
+        assert len(few.at(time)) == 60
+    assert scenes.psnr(scenes.image(few.at(0.0)), scenes.image(moments.at(0.0))) > 50
+
+
+@pytest.mark.parametrize(("static", "dynamic"), [(0, 20), (40, 0), (0, 0)])
+def test_a_branch_without_gaussians_is_kept_empty(path, static, dynamic):
+    baked = bake(scenes.moments(static, dynamic).at, evenly(3))
+    write_page(path, baked, start())
+    back = read_page(path)
+    assert [len(back.static), len(back.dynamic)] == [static, dynamic]
+    assert len(back.at(0.3)) == static + dynamic
+
+
+def test_a_gaussian_that_is_not_finite_at_one_time_is_left_out_of_all(moments):
+    def at(time):
+        cloud = moments.at(time)
+        cloud.means[[3, 50], 0] = np.nan if time == 0.5 else 0.0
+        return cloud
+
+    broken = bake(at, evenly(3))
+    assert [len(broken.static), len(broken.dynamic)] == [39, 19]
+    assert broken.at(0.5).finite.all()
+
+
+def test_a_gaussian_without_thickness_does_not_coarsen_the_others(moments):
+    def at(time):
+        cloud = moments.at(time)
+        cloud.log_scales[0, 0] = -46.0
+        return cloud
+
+    kept = bake(at, evenly(2)).at(0.0)
+    assert np.abs(kept.log_scales[1:40] - moments.at(0.0).log_scales[1:40]).max() < 16 / 1023
+
+
+def test_a_mean_far_away_leaves_the_others_within_a_thousandth_of_a_pixel(moments):
+    def at(time):
+        cloud = moments.at(time)
+        cloud.means[0] = 1000.0
+        return cloud
+
+    kept = bake(at, evenly(2)).at(0.0)
+    assert np.abs(kept.means[1:40] - moments.at(0.0).means[1:40]).max() < 1001 / 2**21
+
+
+# The file -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_page_holds_the_baked_scene_exactly(path, baked):
+    write_page(path, baked, start())
+    back = read_page(path)
+    assert back.keys == KEYS
+    for name in ("static", "dynamic"):
+        a, b = getattr(back, name), getattr(baked, name)
+        for array in page.ARRAYS:
+            assert (getattr(a, array) == getattr(b, array)).all()
+        for bound in ("means", "log_scales", "colors", "rest"):
+            assert (getattr(a.bounds, bound) == getattr(b.bounds, bound)).all()
+
+
+def test_a_page_is_the_same_file_every_time(path, baked):
+    write_page(path, baked, start())
+    first = path.read_bytes()
+    write_page(path, baked, start())
+    assert path.read_bytes() == first
+
+
+def test_a_page_names_no_address(path, baked):
+    write_page(path, baked, start())
+    text = path.read_text()
+    assert not re.search(r"https?:|//[a-z]+\.|@import|<link(?![^>]*data:)|src=", text)
+    assert "default-src 'none'" in text
+
+
+@pytest.mark.parametrize("title", ["</script><script>alert(1)</script>", "[[scene]]", "<b>&amp;", "Tür ★"])
+def test_a_title_is_text_whatever_it_says(path, baked, title):
+    write_page(path, baked, start(title))
+    text = path.read_text()
+    assert text.count("<script") == 11
+    assert "<b>" not in text
+    assert read_page(path).keys == KEYS
+    assert json.loads(re.search(r'id="scene">([^<]*)<', text)[1])["start"]["title"] == title
+
+
+def test_every_part_of_the_player_is_in_the_page(path, baked):
+    write_page(path, baked, start())
+    text = path.read_text()
+    assert not page.PLACE.search(text)
+    for part in ("class Orbit", "gl_Position", "discard", "postMessage({order", "touch-action"):
+        assert part in text
+
+
+def test_memory_is_told_before_baking(baked):
+    branches = [baked.static, baked.dynamic]
+    held = sum(getattr(branch, array).nbytes for branch in branches for array in page.ARRAYS)
+    assert baked_bytes(40, 20, KEYS, 3) == held
+
+
+def test_too_many_key_times_are_refused(path, baked):
+    with pytest.raises(ValueError, match="at most 256 key times, got 300"):
+        write_page(path, dataclasses.replace(baked, keys=300), start())
+
+
+def test_too_many_gaussians_are_refused(path, baked, monkeypatch):
+    monkeypatch.setattr(page, "MOST_GAUSSIANS", 39)
+    with pytest.raises(ValueError, match="at most 39 static Gaussians, got 40"):
+        write_page(path, baked, start())
+
+
+# Pages that are none ------------------------------------------------------------------------------------------------
+
+
+def edited(path, baked, change):
+    write_page(path, baked, start())
+    text = path.read_text()
+    facts = json.loads(re.search(r'id="scene">([^<]*)<', text)[1])
+    change(facts)
+    path.write_text(re.sub(r'(id="scene">)[^<]*<', lambda m: m[1] + json.dumps(facts) + "<", text, count=1))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.update(version=2), "it has version 2, this program reads 1"),
+        (lambda f: f.update(format="other"), "it has version"),
+        (lambda f: f.pop("branches"), "it has no branches"),
+        (lambda f: f.update(keys=0), "says that it has 0 key times"),
+        (lambda f: f.update(keys="many"), "invalid literal"),
+        (lambda f: f["branches"]["static"].pop("means"), "it has no means"),
+        (lambda f: f["branches"]["static"].update(means=[[0, 0, 0]]), "bounds of another shape"),
+        (lambda f: f["branches"]["static"].update(colors=[0, float("inf")]), "bounds that are not finite"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry=[1, 10**6, 4]), "too short for its shape"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry=[1, 10**12, 4]), "has the shape"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry=[1, 40, 5]), "has the shape"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry=[1, -1, 4]), "has the shape"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry=[1, 41, 4]), "does not hold what its shape says"),
+        (lambda f: f["branches"]["static"]["shapes"].update(geometry="1"), "has the shape"),
+        (lambda f: f["branches"]["static"]["shapes"].update(rest=[20, 6, 3]), "arrays of different lengths"),
+    ],
+)
+def test_a_page_that_contradicts_itself_is_refused_in_a_line(path, baked, change, words):
+    edited(path, baked, change)
+    with pytest.raises(ValueError, match=words) as error:
+        read_page(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"<html></html>", b"\xff\xfe", b'<script type="application/json" id="scene">{'])
+def test_other_files_are_no_pages(path, data):
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"scene\.html is no page of warpgs"):
+        read_page(path)
+
+
+def test_a_page_that_is_not_there_is_refused(path):
+    with pytest.raises(ValueError, match=r"scene\.html is no file"):
+        read_page(path)
+
+
+def test_a_block_that_expands_without_end_takes_no_more_memory_than_its_shape(path, baked):
+    write_page(path, baked, start())
+    bomb = base64.b64encode(gzip.compress(bytes(64 << 20))).decode()
+    text = re.sub(r'(id="static-geometry">)[^<]*<', lambda m: m[1] + bomb + "<", path.read_text(), count=1)
+    path.write_text(text)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="does not hold what its shape says"):
+        read_page(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 << 20
+
+
+def test_a_damaged_page_is_read_or_refused_in_a_line_but_never_anything_else(path, baked):
+    write_page(path, baked, start())
+    whole, random = path.read_bytes(), np.random.default_rng(0)
+    places = whole.index(b'id="scene"'), whole.index(b'id="vertex-shader"')
+    for _ in range(150):
+        data = bytearray(whole)
+        for place in random.integers(*places, 4):
+            data[place] = random.integers(256)
+        path.write_bytes(data[: random.integers(*places)] if random.random() < 0.2 else data)
+        refusal = scenes.refusal(read_page, path)
+        assert refusal is None or (str(path) in refusal and "\n" not in refusal)

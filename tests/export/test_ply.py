@@ -1,0 +1,153 @@
+"""PLY files: what was written is read, and whatever else comes is refused in one line before memory is taken."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from tests.export import scenes
+from warpgs.export import compressed, ply, standard
+
+TABLE = np.array([(1.5, 7, 255), (-2.0, 8, 0)], [("x", "<f4"), ("word", "<u4"), ("byte", "u1")])
+READERS = [ply.read_ply, standard.read_standard, compressed.read_compressed]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.ply"
+
+
+def put(path, header, data=b""):
+    path.write_bytes("\n".join(["ply", *header, "end_header", ""]).encode() + data)
+
+
+BINARY = "format binary_little_endian 1.0"
+
+
+def test_tables_come_back_as_they_were(path):
+    size = ply.write_ply(path, {"vertex": TABLE, "other": TABLE[:1]})
+    back = ply.read_ply(path)
+    assert list(back) == ["vertex", "other"]
+    assert (back["vertex"] == TABLE).all()
+    assert (back["other"] == TABLE[:1]).all()
+    assert size == path.stat().st_size
+
+
+def test_a_table_of_no_rows_comes_back(path):
+    ply.write_ply(path, {"vertex": TABLE[:0]})
+    assert len(ply.read_ply(path)["vertex"]) == 0
+
+
+def test_comments_and_both_kinds_of_type_names_are_understood(path):
+    put(path, [BINARY, "comment by someone", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?")
+    assert ply.read_ply(path)["vertex"]["x"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("header", "data", "words"),
+    [
+        ([], b"", "is not in the form binary_little_endian"),
+        (["format ascii 1.0", "element vertex 0", "property float x"], b"", "is not in the form binary_little_endian"),
+        (["format binary_big_endian 1.0"], b"", "is not in the form"),
+        ([BINARY, "element vertex 1", "property list uchar int x"], b"", "a header line that this program does not"),
+        ([BINARY, "element vertex 1", "property half x"], b"", "a header line that this program does not read"),
+        ([BINARY, "element vertex -1", "property float x"], b"", "a header line"),
+        ([BINARY, "element vertex 1e3", "property float x"], b"", "a header line"),
+        ([BINARY, "element vertex ²", "property float x"], b"", "a header line"),
+        ([BINARY, "element vertex 9999999999999999999", "property float x"], b"", "a header line"),
+        ([BINARY, "property float x"], b"", "a header line"),
+        ([BINARY, "element vertex 5"], b"", "vertex has 0 properties"),
+        ([BINARY, "element vertex 1", *(f"property float x{k}" for k in range(300))], b"", "has 300 properties"),
+        ([BINARY, "element vertex 1", "property float x", "property float x"], b"", "two properties of the same name"),
+        ([BINARY, "element a 1", "property float x", "element a 1"], b"", "two elements named a"),
+        ([BINARY, "element vertex 2", "property float x"], bytes(7), "is cut short: 2 rows of vertex take 8 bytes"),
+        ([BINARY, "element vertex 999999999999999", "property double x"], bytes(64), "is cut short"),
+        ([BINARY, "element vertex 1", "property float x"], bytes(5), "1 bytes follow its last element"),
+    ],
+)
+@pytest.mark.parametrize("read", READERS)
+def test_what_is_no_such_file_is_refused_in_a_line(path, header, data, words, read):
+    put(path, header, data)
+    with pytest.raises(ValueError, match=words) as error:
+        read(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"ply", b"PK\x03\x04", b"\x80\x04cposix\nsystem\n", b"plyx\n"])
+def test_other_files_are_refused(path, data):
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a\.ply is no PLY file"):
+        ply.read_ply(path)
+
+
+def test_a_file_without_an_end_of_its_header_is_refused(path):
+    path.write_bytes(b"ply\n" + b"comment x\n" * 20_000)
+    with pytest.raises(ValueError, match="has no PLY header"):
+        ply.read_ply(path)
+
+
+def test_a_file_that_is_not_there_is_refused(path):
+    with pytest.raises(ValueError, match="is no file"):
+        ply.read_ply(path)
+
+
+@pytest.mark.parametrize("count", [10**9, 10**15 - 1])
+def test_a_huge_count_takes_no_memory(path, count):
+    put(path, [BINARY, f"element vertex {count}", "property double x"], bytes(64))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="is cut short"):
+        ply.read_ply(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
+@pytest.mark.parametrize(
+    ("write", "read"),
+    [
+        (standard.write_standard, standard.read_standard),
+        (compressed.write_compressed, compressed.read_compressed),
+    ],
+)
+def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(path, write, read):
+    write(path, scenes.cloud(30))
+    whole, random = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(400):
+        data = bytearray(whole)
+        match random.integers(4):
+            case 0:  # cut short
+                del data[random.integers(len(data)) :]
+            case 1:  # some bytes are others
+                for place in random.integers(0, len(data), 8):
+                    data[place] = random.integers(256)
+            case 2:  # the header is
+                for place in random.integers(0, min(len(data), 1200), 3):
+                    data[place] = random.integers(256)
+            case _:  # a digit is
+                digits = [k for k, byte in enumerate(data[:1200]) if chr(byte).isdigit()]
+                data[digits[random.integers(len(digits))]] = ord("0") + random.integers(10)
+        path.write_bytes(data)
+        refusal = scenes.refusal(read, path)
+        assert refusal is None or (str(path) in refusal and "\n" not in refusal)
+        assert refusal is not None or read(path).finite.all()
+
+
+def test_a_file_that_can_not_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"a\.ply could not be written"):
+        ply.write_ply(tmp_path / "file" / "a.ply", {"vertex": TABLE})
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match=r"a\.ply could not be written: No space left on device"):
+        ply.write_ply(path, {"vertex": TABLE})
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+    assert path.read_bytes() == b"old"

@@ -1,0 +1,112 @@
+"""The PLY file of 3DGS: its bytes are where other programs look for them, and it comes back without loss."""
+
+import dataclasses
+import struct
+
+import numpy as np
+import pytest
+
+from tests.export import scenes
+from warpgs.export.ply import read_ply, write_ply
+from warpgs.export.standard import BYTES_PER_GAUSSIAN, COLUMNS, read_standard, write_standard
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.ply"
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("num", [0, 1, 37])
+def test_a_cloud_comes_back_as_it_was(path, degree, num):
+    cloud = scenes.cloud(num, degree)
+    write_standard(path, cloud)
+    back = read_standard(path)
+    assert back.sh.shape == (num, 16, 3)
+    assert (back.sh[:, : (degree + 1) ** 2] == cloud.sh).all()
+    assert (back.sh[:, (degree + 1) ** 2 :] == 0).all()
+    for name in ("means", "log_scales", "logit_opacities"):
+        assert (getattr(back, name) == getattr(cloud, name)).all()
+    assert back.quats == pytest.approx(cloud.quats, abs=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_the_image_is_the_same_after_export_and_import(path, degree):
+    cloud = scenes.cloud(60, degree)
+    write_standard(path, cloud)
+    assert (scenes.image(read_standard(path)) - scenes.image(cloud)).abs().max() < 1e-5
+
+
+def test_a_row_has_248_bytes_in_the_order_of_3dgs(path):
+    cloud = scenes.cloud(1)
+    write_standard(path, cloud)
+    row = struct.unpack("<62f", path.read_bytes()[-BYTES_PER_GAUSSIAN:])
+    assert BYTES_PER_GAUSSIAN == 248
+    assert COLUMNS[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert row[:3] == pytest.approx(cloud.means[0])
+    assert row[3:6] == (0, 0, 0)
+    assert row[6:9] == pytest.approx(cloud.sh[0, 0])
+    assert row[54:55] == pytest.approx(cloud.logit_opacities)
+    assert row[55:58] == pytest.approx(cloud.log_scales[0])
+    assert row[58:62] == pytest.approx(cloud.quats[0])
+
+
+def test_coefficients_are_all_of_red_then_green_then_blue(path):
+    cloud = scenes.cloud(1, degree=1)
+    write_standard(path, cloud)
+    row = struct.unpack("<62f", path.read_bytes()[-BYTES_PER_GAUSSIAN:])
+    for channel in range(3):
+        assert row[9 + 15 * channel : 12 + 15 * channel] == pytest.approx(cloud.sh[0, 1:, channel])
+
+
+def test_a_file_of_a_lower_degree_with_other_columns_is_read(path):
+    cloud = scenes.cloud(5, degree=1)
+    names = [c for c in COLUMNS if not c.startswith(("n", "f_rest"))] + [f"f_rest_{k}" for k in range(9)] + ["extra"]
+    table = np.zeros(5, [(name, "<f8") for name in names])
+    write_standard(path, cloud)
+    full = read_ply(path)["vertex"]
+    for name in names[:-1]:
+        if not name.startswith("f_rest"):
+            table[name] = full[name]
+    for channel in range(3):
+        for k in range(3):
+            table[f"f_rest_{3 * channel + k}"] = cloud.sh[:, 1 + k, channel]
+    write_ply(path, {"vertex": table})
+    assert (read_standard(path).sh == cloud.sh).all()
+
+
+@pytest.mark.parametrize("name", ["x", "opacity", "rot_3", "f_dc_2", "f_rest_7"])
+def test_a_property_that_is_missing_or_of_another_type_is_named(path, name):
+    write_standard(path, scenes.cloud(2))
+    table = read_ply(path)["vertex"]
+    others = [column for column in COLUMNS if column != name]
+    write_ply(path, {"vertex": table[others].astype([(column, "<f4") for column in others])})
+    with pytest.raises(ValueError, match=f"no property {name}|44 properties f_rest"):
+        read_standard(path)
+    write_ply(path, {"vertex": table.astype([(c, "<u4" if c == name else "<f4") for c in COLUMNS])})
+    with pytest.raises(ValueError, match=f"{name} has the type uint32"):
+        read_standard(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["means", "quats", "sh"])
+def test_values_that_are_not_finite_are_refused(path, name, value):
+    cloud = scenes.cloud(4)
+    values = getattr(cloud, name).copy()
+    values[2] = value
+    write_standard(path, dataclasses.replace(cloud, **{name: values}))
+    with pytest.raises(ValueError, match="1 Gaussians with values that are not finite"):
+        read_standard(path)
+
+
+def test_a_rotation_of_no_length_is_refused(path):
+    cloud = scenes.cloud(4)
+    write_standard(path, dataclasses.replace(cloud, quats=np.zeros((4, 4), np.float32)))
+    with pytest.raises(ValueError, match="4 Gaussians with values that are not finite"):
+        read_standard(path)
+
+
+def test_a_file_without_vertices_is_refused(path):
+    write_ply(path, {"face": np.zeros(1, [("x", "<f4")])})
+    with pytest.raises(ValueError, match="has no element vertex"):
+        read_standard(path)

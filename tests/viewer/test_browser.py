@@ -1,0 +1,310 @@
+"""The viewer in a real browser: what a person does there changes what is shown."""
+
+import json
+import shutil
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
+sync_api = pytest.importorskip(
+    "playwright.sync_api", reason="browser tests need playwright: pip install 'warpgs[browser]'"
+)
+
+from tests.viewer import watched  # noqa: E402
+from warpgs.viewer import source as source_module  # noqa: E402
+from warpgs.viewer.command import training_cameras  # noqa: E402
+from warpgs.viewer.layers import picture  # noqa: E402
+from warpgs.viewer.pose import camera_of, pose_of  # noqa: E402
+from warpgs.viewer.server import Viewer  # noqa: E402
+from warpgs.viewer.source import open_source  # noqa: E402
+
+# viser warns of what it can't tell a browser that has left; the command ignores that, too.
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-quic",
+    "--no-first-run",
+]
+SIZE = {"width": 900, "height": 700}
+LEFT = 480
+"""Columns that the panel does not cover [px]."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        found = own if Path(own).exists() else next(filter(None, map(shutil.which, BROWSERS)), None)
+        if found is None:
+            pytest.skip("there is no Chromium: playwright install chromium, or apt-get install chromium")
+        browser = playwright.chromium.launch(executable_path=found, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return watched.make(tmp_path_factory.mktemp("made"))
+
+
+@pytest.fixture(scope="module")
+def viewer(run):
+    source_module.LOOK_EVERY, before = 0.2, source_module.LOOK_EVERY
+    source = open_source(run, "cpu", True)
+    with Viewer(source, training_cameras(source), "127.0.0.1", 0) as viewer:
+        yield viewer
+    source_module.LOOK_EVERY = before
+
+
+@pytest.fixture(scope="module")
+def visit(browser, viewer):
+    """The page, the session that serves it, and the addresses that it asked for."""
+    page, asked = browser.new_page(viewport=SIZE), []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"http://127.0.0.1:{viewer.port}")
+    page.get_by_text("Training cameras").wait_for(timeout=60_000)
+    until(lambda: viewer.sessions)
+    (session,) = viewer.sessions.values()
+    page.locator(".mantine-Notification-closeButton").first.click()  # "software rendering"
+    return page, session, asked
+
+
+@pytest.fixture
+def page(visit):
+    return visit[0]
+
+
+@pytest.fixture
+def session(visit):
+    """At rest, showing everything at the middle of time."""
+    session = visit[1]
+    session.panel.layer.value = "joint"
+    session.panel.residual.value = True
+    session.panel.time.value = 0.5
+    session.panel.snap._impl.update_cb[0](None)
+    settle(session)
+    return session
+
+
+def until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it does not happen"
+        time.sleep(0.05)
+
+
+def settle(session):
+    """Waits for the whole picture of what the controls say now."""
+    until(lambda: session._shown and session._shown[1] == 1 and session._shown[0] == session._wish())
+
+
+def seen(page, session):
+    """What the browser shows beside the panel, once nothing changes any more."""
+    settle(session)
+    before = None
+    for _ in range(40):
+        now = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :LEFT]
+        if before is not None and np.array_equal(now, before):
+            return now.astype(float)
+        before = now
+        time.sleep(0.2)
+    raise AssertionError("the picture does not come to rest")
+
+
+def test_the_page_asks_nobody_but_the_viewer(visit, viewer):
+    schemes = {url.split(":")[0] for url in visit[2] if not url.startswith(f"http://127.0.0.1:{viewer.port}/")}
+    assert visit[2]
+    assert schemes <= {"blob", "data"}
+
+
+def test_the_picture_is_the_scene_through_the_camera(page, session):
+    image = seen(page, session)
+    wish = session._shown[0]
+    wished = picture(wish.snapshot.splats(wish.moment, True), camera_of(wish.pose, wish.size, wish.moment), wish.layer)
+    wished = cv2.resize(wished, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
+    assert wished.std() > 10
+    assert np.abs(image - wished).mean() < 4.0
+
+
+def test_a_screenshot_is_written(page, session, tmp_path_factory):
+    seen(page, session)
+    path = tmp_path_factory.getbasetemp() / "viewer.png"
+    page.screenshot(path=path)
+    assert cv2.imread(str(path)).shape == (SIZE["height"], SIZE["width"], 3)
+
+
+def test_the_slider_moves_time_and_the_picture(page, session):
+    before = seen(page, session)
+    box = page.locator("input[type=text]:visible:not([readonly])").first
+    box.fill("0.95")
+    box.press("Enter")
+    until(lambda: session.panel.time.value == pytest.approx(0.95))
+    assert np.abs(seen(page, session) - before).max() > 10
+
+
+def test_the_slider_moves_by_keys(page, session):
+    thumb = page.get_by_role("slider").first
+    thumb.focus()
+    before = session.panel.time.value
+    for _ in range(5):
+        thumb.press("ArrowRight")
+    until(lambda: session.panel.time.value == pytest.approx(before + 0.005))
+
+
+@pytest.mark.parametrize("layer", ["static", "dynamic", "depth", "alpha", "dynamic mask"])
+def test_layers_switch(page, session, layer):
+    before = seen(page, session)
+    page.locator("input[role=combobox]:visible").first.click()
+    page.get_by_role("option", name=layer, exact=True).click()
+    until(lambda: session.panel.layer.value == layer)
+    assert np.abs(seen(page, session) - before).mean() > 1.0
+
+
+def test_the_residual_switches_off(page, session):
+    before = seen(page, session)
+    page.get_by_role("checkbox").first.click()
+    until(lambda: session.panel.residual.value is False)
+    assert np.abs(seen(page, session) - before).max() > 0
+
+
+def test_time_plays_and_pauses(page, session):
+    page.get_by_role("button", name="Play", exact=True).click()
+    first = session.panel.time.value
+    until(lambda: session.panel.time.value != first)
+    page.get_by_role("button", name="Pause", exact=True).click()
+    until(lambda: not session._clock.playing)
+    settle(session)
+    assert page.get_by_role("button", name="Play", exact=True).is_visible()
+
+
+def test_dragging_orbits(page, session):
+    before, picture_before = session._pose(), seen(page, session)
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(260, 420, steps=5)
+    page.mouse.up()
+    until(lambda: session._pose() != before)
+    assert np.abs(seen(page, session) - picture_before).mean() > 1.0
+
+
+def test_dragging_turns_around_what_is_ahead(page, session, viewer):
+    """Of the training view: the point stays in the middle of the picture, at its distance."""
+    ahead = viewer._training.ahead(int(session.panel.view.value) - 1)
+    distance = np.linalg.norm(ahead - np.array(session._pose().position))
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(260, 400, steps=5)
+    page.mouse.up()
+    until(lambda: np.linalg.norm(np.array(session._pose().position) - ahead) == pytest.approx(distance, rel=1e-3))
+    row, column, _, inside = session._look().project(torch.tensor(ahead[None]).float())
+    middle = session._look()
+    assert bool(inside)
+    assert abs(int(column) - middle.width / 2) < 3
+    assert abs(int(row) - middle.height / 2) < 3
+
+
+def test_keys_fly(page, session):
+    page.mouse.click(200, 400)
+    before = np.array(session._pose().position)
+    page.keyboard.down("w")
+    until(lambda: np.linalg.norm(np.array(session._pose().position) - before) > 1e-3)
+    page.keyboard.up("w")
+    settle(session)
+
+
+def test_looking_through_a_training_camera_is_its_pose_and_its_time(page, session, viewer):
+    view = viewer._training.views[2]
+    session.panel.view.value = 3
+    until(lambda: session.panel.time.value == pytest.approx(view.time))
+    settle(session)
+    assert session._pose().position == pytest.approx(view.pose.position, abs=1e-4)
+    assert session._pose().fov == pytest.approx(view.pose.fov)
+    assert np.abs(np.array(session._pose().wxyz) @ np.array(view.pose.wxyz)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_training_cameras_are_drawn_and_taken_away(page, session):
+    camera = session._client.camera
+    camera.position = camera.position - (camera.look_at - camera.position)
+    before = seen(page, session)
+    session.panel.show_cameras.value = True
+    until(lambda: np.abs(seen(page, session) - before).max() > 50)
+    session.panel.show_cameras.value = False
+    until(lambda: np.abs(seen(page, session) - before).max() < 10)
+
+
+def test_a_camera_path_is_saved(page, session, run):
+    page.get_by_role("button", name="Add keyframe").click()
+    until(lambda: len(session.path.cameras) == 1)
+    session.panel.view.value = 5
+    settle(session)
+    page.get_by_role("button", name="Add keyframe").click()
+    until(lambda: len(session.path.cameras) == 2)
+    page.get_by_role("button", name="Save path").click()
+    until((run / "paths" / "path.json").exists)
+    page.get_by_text("2 keyframes saved as").wait_for()
+    last = json.loads((run / "paths" / "path.json").read_text())["keyframes"][1]
+    assert last["width"] == session.panel.width.value
+    assert last["width"] / last["height"] == pytest.approx(SIZE["width"] / SIZE["height"], rel=0.01)
+    assert last["time"] == pytest.approx(session.panel.time.value)
+    assert session._look().viewmat.tolist() == [pytest.approx(row, abs=1e-5) for row in last["viewmat"]]
+
+
+def test_keyframes_can_be_taken_back(page, session):
+    page.get_by_role("button", name="Add keyframe").click()
+    until(lambda: session.path.cameras)
+    while session.path.cameras:
+        count = len(session.path.cameras)
+        page.get_by_role("button", name="Remove last").click()
+        until(lambda count=count: len(session.path.cameras) < count)
+    page.get_by_text("no keyframes").wait_for()
+    page.get_by_role("button", name="Save path").click()
+    page.get_by_text("a path needs at least one keyframe").wait_for()
+
+
+def test_counts_and_speed_are_shown(page, session):
+    scene = session._shown[0].snapshot.scene
+    page.get_by_text(f"{len(scene.static)} static, {len(scene.dynamic)} dynamic Gaussians").wait_for()
+    page.get_by_text("FPS").wait_for()
+
+
+def test_training_is_followed(page, session, run):
+    before = seen(page, session)
+    iteration = session._shown[0].snapshot.iteration
+    watched.advance(run, 7)
+    page.get_by_text(f"iteration {iteration + 7}").wait_for(timeout=20_000)
+    assert np.abs(seen(page, session) - before).max() > 0
+
+
+def test_each_browser_has_its_own_controls(browser, viewer, session):
+    other = browser.new_page(viewport=SIZE)
+    other.goto(f"http://127.0.0.1:{viewer.port}")
+    until(lambda: len(viewer.sessions) == 2)
+    second = list(viewer.sessions.values())[1]
+    second.panel.time.value = 0.125
+    settle(second)
+    assert session.panel.time.value == pytest.approx(pose_time(viewer, session))
+    thread = second._thread
+    other.close()
+    until(lambda: len(viewer.sessions) == 1)
+    until(lambda: not thread.is_alive())
+
+
+def pose_time(viewer, session):
+    """Time of the training view that the session looks through."""
+    return viewer._training.views[int(session.panel.view.value) - 1].time
+
+
+def test_poses_are_exact(session):
+    assert pose_of(session._look()).fov == pytest.approx(session._pose().fov)

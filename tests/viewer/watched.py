@@ -1,0 +1,51 @@
+"""A run that takes a second, to look at."""
+
+import dataclasses
+from pathlib import Path
+
+import torch
+
+from tests import tiny
+from warpgs import checkpoint, runs
+from warpgs.data.nerfies import load_capture
+
+
+def make(folder: Path) -> Path:
+    """A run folder with a trained tiny scene, whose capture is beside it."""
+    data = tiny.write(folder / "capture")
+    capture = load_capture(data)
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run")
+    run = runs.new_folder(config, capture)
+    runs.create(run, config)
+    tiny.train(tiny.trainer(data, run, config))
+    _brighten(run)
+    return run
+
+
+def _brighten(run: Path) -> None:
+    """So short a training leaves a dark scene that hardly changes."""
+    newest = checkpoint.load(checkpoint.saved(run)[-1])
+    tensors = dict(newest.tensors)
+    for branch in ("static", "dynamic"):
+        tensors[f"scene.{branch}.logit_opacities"] = tensors[f"scene.{branch}.logit_opacities"] * 0 + 2.0
+        tensors[f"scene.{branch}.log_scales"] = tensors[f"scene.{branch}.log_scales"].clamp(-3.0, -1.5)
+    tensors["scene.dynamic.sh_dc"] = tensors["scene.dynamic.sh_dc"] + torch.tensor([1.0, -1.0, -1.0])
+    for network in ("deformation", "appearance"):
+        tensors[f"scene.{network}.trunk.head.weight"] = 0.3 * torch.ones_like(
+            tensors[f"scene.{network}.trunk.head.weight"]
+        )
+    checkpoint.save(newest.path, tensors, dict(newest.facts))
+
+
+def advance(run: Path, by: int = 1) -> Path:
+    """Writes a checkpoint as if training had gone on; its scene is another one."""
+    newest = checkpoint.load(checkpoint.saved(run)[-1])
+    iteration = newest.facts["iteration"] + by
+    tensors = {n: t + 0.01 if n.startswith("scene.static.means") else t for n, t in newest.tensors.items()}
+    path = checkpoint.path_of(run, iteration)
+    checkpoint.save(path, tensors, {**newest.facts, "iteration": iteration})
+    return path
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return bool(torch.equal(a, b))

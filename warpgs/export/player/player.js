@@ -1,0 +1,265 @@
+const element = (id) => document.getElementById(id);
+const SCENE = JSON.parse(element('scene').textContent);
+const START = SCENE.start, NAMES = ['static', 'dynamic'], BRANCHES = NAMES.map((name) => SCENE.branches[name]);
+const WIDTH = 2048; // texels a row
+const lastKey = SCENE.keys - 1;
+
+function fail(text) {
+  element('message').textContent = text;
+  document.body.dataset.state = 'failed';
+  throw new Error(text);
+}
+
+// Numbers ------------------------------------------------------------------------------------------------------------
+
+async function unpacked(name, array, Kind) {
+  const text = atob(element(`${name}-${array}`).textContent), packed = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
+  element(`${name}-${array}`).remove();
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  const size = Kind.BYTES_PER_ELEMENT, count = planes.length / size, values = new Kind(count);
+  for (let p = 0; p < size; p++) for (let i = 0; i < count; i++) values[i] |= planes[p * count + i] << (8 * p);
+  const shape = SCENE.branches[name].shapes[array], frame = shape[1] * shape[2];
+  for (let i = frame; i < count; i++) values[i] += values[i - frame]; // wraps around
+  return values;
+}
+
+function meansOf(geometry, {shapes, means}) {
+  // One Float32Array a key time, for the sorter.
+  const [keys, count] = shapes.geometry, [low, high] = means, step = low.map((v, k) => (high[k] - v) / 2097151);
+  return Array.from({length: keys}, (_, key) => {
+    const out = new Float32Array(3 * count);
+    for (let i = 0, w = key * count * 4; i < count; i++, w += 4) {
+      const a = geometry[w], b = geometry[w + 1];
+      out[3 * i] = low[0] + (a >>> 11) * step[0];
+      out[3 * i + 1] = low[1] + (((a & 2047) << 10) | (b >>> 21)) * step[1];
+      out[3 * i + 2] = low[2] + (b & 2097151) * step[2];
+    }
+    return out;
+  });
+}
+
+function layersOfRest(rest, [count, bases]) {
+  // Texels (R, G, B, unused), a layer a coefficient.
+  const out = new Uint8Array(bases * count * 4);
+  for (let i = 0; i < count; i++) for (let k = 0; k < bases; k++) for (let c = 0; c < 3; c++) {
+    out[(k * count + i) * 4 + c] = rest[(i * bases + k) * 3 + c];
+  }
+  return out;
+}
+
+// WebGL --------------------------------------------------------------------------------------------------------------
+
+const canvas = element('canvas');
+const gl = canvas.getContext('webgl2', {alpha: false, antialias: false, preserveDrawingBuffer: true})
+  || fail('This page needs WebGL2, which this browser does not have or has turned off.');
+
+function compiled() {
+  const program = gl.createProgram();
+  for (const [kind, id] of [[gl.VERTEX_SHADER, 'vertex-shader'], [gl.FRAGMENT_SHADER, 'fragment-shader']]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, element(id).textContent.trim());
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) fail(`${id}: ${gl.getShaderInfoLog(shader)}`);
+    gl.attachShader(program, shader);
+  }
+  gl.bindAttribLocation(program, 0, 'row');
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) fail(gl.getProgramInfoLog(program));
+  return program;
+}
+
+const program = compiled();
+const uniform = (name) => gl.getUniformLocation(program, name);
+gl.useProgram(program);
+
+function texture(unit, name, values, count, layers, isInteger) {
+  const [inside, outside, kind] = isInteger
+    ? [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT] : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
+  const height = Math.max(1, Math.ceil(count / WIDTH));
+  gl.activeTexture(gl.TEXTURE0 + unit);
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
+  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, inside, WIDTH, height, Math.max(1, layers));
+  for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, end, gl.NEAREST);
+  }
+  const whole = new values.constructor(WIDTH * height * 4);
+  for (let layer = 0; layer < layers; layer++) {
+    whole.set(values.subarray(layer * count * 4, (layer + 1) * count * 4));
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, WIDTH, height, 1, outside, kind, whole);
+  }
+  gl.uniform1i(uniform(name), unit);
+}
+
+async function upload() {
+  const means = [];
+  for (const [branch, name] of NAMES.entries()) {
+    const facts = BRANCHES[branch], {shapes} = facts, count = shapes.geometry[1];
+    const geometry = await unpacked(name, 'geometry', Uint32Array);
+    means.push(meansOf(geometry, facts));
+    texture(branch, `${name}Geometry`, geometry, count, shapes.geometry[0], true);
+    texture(2 + branch, `${name}Colors`, await unpacked(name, 'colors', Uint8Array), count, shapes.colors[0], false);
+    const rest = layersOfRest(await unpacked(name, 'rest', Uint8Array), shapes.rest);
+    texture(4 + branch, `${name}Rest`, rest, count, shapes.rest[1], false);
+    gl.uniform3fv(uniform(`lowest[${branch}]`), facts.means[0]);
+    gl.uniform3fv(uniform(`span[${branch}]`), facts.means[1].map((v, k) => v - facts.means[0][k]));
+    gl.uniform2fv(uniform(`sizes[${branch}]`), facts.log_scales);
+    gl.uniform2fv(uniform(`colors[${branch}]`), facts.colors);
+    gl.uniform2fv(uniform(`rests[${branch}]`), facts.rest);
+    gl.uniform1i(uniform(`restBases[${branch}]`), shapes.rest[1]);
+  }
+  gl.uniform1i(uniform('lastKey'), lastKey);
+  gl.uniform1i(uniform('compensate'), START.antialias);
+  return means;
+}
+
+// What is shown ------------------------------------------------------------------------------------------------------
+
+const wanted = new URLSearchParams(location.hash.slice(1)); // e.g. #time=0.5&play=0&layers=dynamic
+const state = {time: 0, playing: wanted.get('play') !== '0', sorting: false, count: 0, changed: true};
+const orbit = new Orbit(cameraOf(START.viewmat), START.pivot);
+const track = START.track.map(cameraOf);
+const numberOf = (value) => Number.isFinite(parseFloat(value)) ? Math.min(1, Math.max(0, parseFloat(value))) : 0;
+state.time = numberOf(wanted.get('time'));
+if (wanted.has('layers')) for (const name of NAMES) element(name).checked = wanted.get('layers').includes(name);
+if (wanted.get('controls') === '0') element('controls').hidden = true;
+element('follow').checked = wanted.get('follow') === '1' && track.length > 0;
+element('follow-label').hidden = track.length === 0;
+
+function currentCamera() {
+  if (element('follow').checked) {
+    const place = state.time * (track.length - 1), before = Math.min(Math.floor(place), track.length - 1);
+    orbit.set(between(track[before], track[Math.min(before + 1, track.length - 1)], place - before));
+  }
+  return orbit.camera;
+}
+
+function resized() {
+  const width = Math.round(canvas.clientWidth * devicePixelRatio), height = Math.round(canvas.clientHeight * devicePixelRatio);
+  if (canvas.width === width && canvas.height === height) return;
+  canvas.width = width;
+  canvas.height = height;
+  state.changed = true;
+}
+
+function draw(camera, position) {
+  const [width, height] = START.size, [fx, fy, cx, cy] = START.intrinsics;
+  const zoom = Math.min(canvas.width / width, canvas.height / height);
+  const r = camera.rotation, t = r.map((row) => -dot(row, camera.position));
+  gl.viewport(0, 0, canvas.width, canvas.height);
+  gl.clearColor(0, 0, 0, 1);
+  gl.clear(gl.COLOR_BUFFER_BIT);
+  gl.uniform1f(uniforms.position, position);
+  gl.uniform2f(uniforms.viewport, canvas.width, canvas.height);
+  gl.uniform4f(uniforms.intrinsics, fx * zoom, fy * zoom,
+    canvas.width / 2 + (cx - width / 2) * zoom, canvas.height / 2 + (cy - height / 2) * zoom);
+  gl.uniformMatrix4fv(uniforms.view, false,
+    [r[0][0], r[1][0], r[2][0], 0, r[0][1], r[1][1], r[2][1], 0, r[0][2], r[1][2], r[2][2], 0, ...t, 1]);
+  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, state.count);
+}
+
+const uniforms = Object.fromEntries(['position', 'viewport', 'intrinsics', 'view'].map((name) => [name, uniform(name)]));
+const worker = new Worker(URL.createObjectURL(new Blob([element('sorter').textContent], {type: 'text/javascript'})));
+worker.onerror = (event) => fail(`The sorter failed: ${event.message}`);
+worker.onmessage = ({data}) => {
+  gl.bufferData(gl.ARRAY_BUFFER, data.order, gl.DYNAMIC_DRAW);
+  state.count = data.order.length;
+  state.sorting = false;
+  state.answered = true;
+  state.drawn = false;
+  element('message').textContent = '';
+};
+
+let before = performance.now(), sortedFor = '';
+function frame(now) {
+  const passed = Math.min(0.1, (now - before) / 1000);
+  before = now;
+  if (state.playing && lastKey > 0) {
+    state.time = (state.time + passed * Number(element('speed').value) / START.seconds) % 1;
+    state.changed = true;
+  }
+  resized();
+  if (state.changed || !state.drawn) {
+    const camera = currentCamera(), position = state.time * lastKey, z = camera.rotation[2];
+    const shown = NAMES.map((name) => element(name).checked), key = JSON.stringify([camera, position, shown]);
+    if (!state.sorting && key !== sortedFor) {
+      state.sorting = true;
+      sortedFor = key;
+      worker.postMessage({view: [...z, -dot(z, camera.position)], position, shown});
+    }
+    draw(camera, position);
+    state.changed = key !== sortedFor;
+    state.drawn = true;
+    if (state.answered) document.body.dataset.state = state.sorting || state.changed ? 'playing' : 'settled';
+    element('time').value = state.time;
+    element('clock').textContent = `${(state.time * START.seconds).toFixed(2)} / ${START.seconds.toFixed(1)} s`;
+    element('play').textContent = state.playing ? 'pause' : 'play';
+  }
+  requestAnimationFrame(frame);
+}
+
+// What a viewer does -------------------------------------------------------------------------------------------------
+
+const touch = () => { state.changed = true; };
+const toggle = () => { state.playing = !state.playing; touch(); };
+const home = () => { element('follow').checked = false; orbit.reset(); touch(); };
+const pointers = new Map();
+element('play').onclick = toggle;
+element('home').onclick = home;
+element('time').oninput = () => { state.playing = false; state.time = Number(element('time').value); touch(); };
+for (const id of [...NAMES, 'follow']) element(id).onchange = touch;
+canvas.oncontextmenu = (event) => event.preventDefault();
+canvas.onpointerdown = (event) => {
+  canvas.setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
+};
+canvas.onpointerup = canvas.onpointercancel = (event) => pointers.delete(event.pointerId);
+canvas.onpointermove = (event) => {
+  const last = pointers.get(event.pointerId);
+  if (!last) return;
+  const right = (event.clientX - last[0]) / canvas.clientHeight, down = (event.clientY - last[1]) / canvas.clientHeight;
+  const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+  element('follow').checked = false;
+  if (other) {
+    const apart = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+    orbit.approach(apart(last) / Math.max(1, apart([event.clientX, event.clientY])));
+    orbit.shift(right / 2, down / 2);
+  } else if (event.buttons & 2 || event.shiftKey) {
+    orbit.shift(right, down);
+  } else {
+    orbit.turn(3 * right, -3 * down);
+  }
+  pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  touch();
+};
+canvas.addEventListener('wheel', (event) => {
+  event.preventDefault();
+  element('follow').checked = false;
+  orbit.approach(Math.exp(event.deltaY / 800));
+  touch();
+}, {passive: false});
+addEventListener('keydown', (event) => {
+  if (event.target !== document.body && event.target !== canvas) return;
+  const step = lastKey > 0 ? 1 / lastKey : 0;
+  if (event.key === ' ') toggle();
+  else if (event.key === 'Home') home();
+  else if (event.key === 'ArrowLeft' || event.key === 'ArrowRight') {
+    state.playing = false;
+    state.time = Math.min(1, Math.max(0, state.time + (event.key === 'ArrowLeft' ? -step : step)));
+    touch();
+  } else return;
+  event.preventDefault();
+});
+canvas.addEventListener('webglcontextlost', () => fail('The graphics card was taken away; load the page again.'));
+
+upload().then((means) => {
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 4, 0);
+  gl.vertexAttribDivisor(0, 1);
+  gl.enable(gl.BLEND);
+  gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+  worker.postMessage({means});
+  requestAnimationFrame(frame);
+}).catch((error) => fail(`The scene could not be shown: ${error.message}`));

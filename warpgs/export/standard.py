@@ -1,0 +1,101 @@
+"""The PLY file of 3DGS, as its own viewer, SuperSplat and the plug-ins of game engines read it.
+
+One row a Gaussian, all floats: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (all of red, then green, then blue),
+opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Degree 3 is always written, because several readers
+want rows of exactly that length; bands that the scene does not have are zero.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from .cloud import Cloud
+from .ply import column, read_ply, write_ply
+
+MOST_REST = 15
+"""Coefficients a channel beside the constant one, of degrees 1 to 3."""
+
+COLUMNS = [
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{k}" for k in range(3 * MOST_REST)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+]
+BYTES_PER_GAUSSIAN = 4 * len(COLUMNS)
+
+
+def write_standard(path: Path, cloud: Cloud) -> int:
+    """Writes the Gaussians of a cloud; returns the size of the file [bytes].
+
+    Raises:
+        OSError: If it can't be written; the message names the file.
+    """
+    N, rest = len(cloud), cloud.sh.shape[1] - 1
+    padded = np.zeros((N, MOST_REST, 3), np.float32)
+    padded[:, :rest] = cloud.sh[:, 1:]
+    values = [
+        cloud.means,
+        np.zeros((N, 3), np.float32),
+        cloud.sh[:, 0],
+        padded.transpose(0, 2, 1).reshape(N, 3 * MOST_REST),
+        cloud.logit_opacities[:, None],
+        cloud.log_scales,
+        cloud.quats,
+    ]
+    rows = np.ascontiguousarray(np.concatenate(values, 1, dtype="<f4"))
+    return write_ply(path, {"vertex": rows.view([(name, "<f4") for name in COLUMNS]).reshape(N)})
+
+
+def read_standard(path: Path) -> Cloud:
+    """The Gaussians of such a file, of whatever degree it has.
+
+    Raises:
+        ValueError: If it is no such file, damaged, or has a value that is not finite; the message names it.
+    """
+    tables = read_ply(path)
+    if "vertex" not in tables:
+        raise ValueError(f"{path} has no element vertex")
+    vertex = tables["vertex"]
+    cloud = Cloud(
+        means=_block(path, vertex, ["x", "y", "z"]),
+        quats=unit_quats(_block(path, vertex, [f"rot_{k}" for k in range(4)])),
+        log_scales=_block(path, vertex, [f"scale_{k}" for k in range(3)]),
+        logit_opacities=_block(path, vertex, ["opacity"])[:, 0],
+        sh=_coefficients(path, vertex),
+        is_dynamic=np.zeros(len(vertex), bool),
+    )
+    if not cloud.finite.all():
+        raise ValueError(f"{path} has {np.count_nonzero(~cloud.finite):,} Gaussians with values that are not finite")
+    return cloud
+
+
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Quaternions of length 1; a zero one, which is no rotation, becomes NaN."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def num_rest(path: Path, table: np.ndarray) -> int:
+    """Coefficients a channel beside the constant one: 0, 3, 8 or 15.
+
+    Raises:
+        ValueError: If the file has any other number.
+    """
+    names = table.dtype.names or ()
+    count = sum(name.startswith("f_rest_") for name in names)
+    if count not in (0, 9, 24, 45):
+        raise ValueError(f"{path} has {count} properties f_rest_*, expected 0, 9, 24 or 45")
+    return count // 3
+
+
+def _coefficients(path: Path, vertex: np.ndarray) -> np.ndarray:
+    constant = _block(path, vertex, [f"f_dc_{k}" for k in range(3)])[:, None]
+    rest = num_rest(path, vertex)
+    others = np.zeros((len(vertex), 0), np.float32)
+    if rest:
+        others = _block(path, vertex, [f"f_rest_{k}" for k in range(3 * rest)])
+    return np.concatenate([constant, others.reshape(-1, 3, rest).transpose(0, 2, 1)], 1)
+
+
+def _block(path: Path, vertex: np.ndarray, names: list[str]) -> np.ndarray:
+    with np.errstate(over="ignore"):  # doubles that are too large become infinite, and are refused
+        return np.stack([column(path, vertex, name).astype(np.float32) for name in names], 1)

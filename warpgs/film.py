@@ -1,0 +1,211 @@
+"""Pictures and videos of a trained run: its own views, or along a camera path."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from rich.progress import track
+from torch import Tensor
+
+from . import paths, paths_file, pictures, runs
+from .cameras import Camera
+from .data.capture import Capture
+from .evaluate import RenderAt
+from .playback import Player
+from .render import Rendering
+
+PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
+
+MOST_FRAMES = 100_000
+LARGEST_SUPERSAMPLING = 8
+REACH = 0.3
+"""Radius of the spiral, as a share of the radius of the filming camera's own path."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Renders a run's newest checkpoint to pictures and a video."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    """Run folder."""
+    path: PathName = "views"
+    """What the camera does: the evaluation views; a fixed camera while time runs; the filming camera's path at a frozen
+    moment; the same while time runs; a spiral around the middle view; bullet time around it."""
+    keyframes: Path | None = None
+    """JSON file of keyframes to follow instead (docs/export.md)."""
+    out: Path | None = None
+    """Folder to write into; RUN/render/PATH if left out."""
+    view: str | None = None
+    """Id of the view that fixed, spiral and bullet start from; the middle evaluation view if left out."""
+    time: float | None = None
+    """Moment in [0, 1] at which frozen and bullet stand still (½ if left out); spiral runs through time if left out."""
+    frames: int = 120
+    """Pictures along a path."""
+    rate: float = pictures.VIDEO_RATE
+    """Pictures a second of the video."""
+    write: Literal["both", "png", "mp4"] = "both"
+    """Numbered PNG files, a video, or both."""
+    layers: Literal["joint", "static", "dynamic", "all"] = "joint"
+    """Which image; all of them side by side."""
+    truth: bool = False
+    """With views: the picture that was filmed beside the image."""
+    scale: float = 1.0
+    """Size of the pictures, as a factor of the capture's."""
+    supersample: int = 1
+    """Render this many times as large a side, and average down."""
+    data: Path | None = None
+    """Where the capture is now, if it was moved."""
+    device: Literal["cuda", "cpu"] | None = None
+    """Where to render; CUDA if there is a GPU."""
+    quiet: bool = False
+    """Show no progress."""
+
+    def run(self) -> None:
+        print(render_run(self))
+
+
+def render_run(options: Render) -> str:
+    """Does what the command was asked; returns a text for people.
+
+    Raises:
+        ValueError: If the run, its capture, the path or an option can't be used.
+        OSError: If something can't be written.
+    """
+    _check(options)
+    config = dataclasses.replace(runs.load_config(options.run_folder), device=options.device)
+    config = runs.resolve(dataclasses.replace(config, data=options.data or config.data, lpips=None))
+    scene, facts = runs.newest_scene(options.run_folder, config)
+    capture = runs.open_capture(config, options.quiet)
+    means = torch.cat([scene.dynamic.means, scene.static.means]).detach()
+    centers = torch.stack([capture.cameras[name].position for name in capture.train])
+    cameras, names = _cameras(options, capture, scene.dynamic.means.detach(), means)
+    paths.Ball.around(means, centers).check(cameras, str(options.keyframes or options.path))
+    device = torch.device(config.device or "cpu")
+    film = _Film(options, capture, Player(scene.to(device), config, facts), device)
+    kind = options.keyframes.stem if options.keyframes else options.path
+    folder = options.out or options.run_folder / "render" / kind
+    return _write(options, folder, names, film.pictures(cameras, names))
+
+
+def _check(options: Render) -> None:
+    if not 1 <= options.frames <= MOST_FRAMES:
+        raise ValueError(f"--frames must be between 1 and {MOST_FRAMES:,}, got {options.frames}")
+    if not 1 <= options.supersample <= LARGEST_SUPERSAMPLING:
+        raise ValueError(f"--supersample must be between 1 and {LARGEST_SUPERSAMPLING}, got {options.supersample}")
+    if options.time is not None and not 0 <= options.time <= 1:
+        raise ValueError(f"--time must be in [0, 1], got {options.time}")
+    for name, value in (("scale", options.scale), ("rate", options.rate)):
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"--{name} must be positive, got {value}")
+    if options.truth and (options.path != "views" or options.keyframes):
+        raise ValueError("--truth is for the evaluation views: nothing was filmed along another path")
+
+
+def _cameras(options: Render, capture: Capture, moving: Tensor, means: Tensor) -> tuple[list[Camera], list[str]]:
+    """The cameras of the path, and a name for the picture of each."""
+    frames, moment = options.frames, 0.5 if options.time is None else options.time
+    if options.keyframes is not None:
+        return _numbered(paths_file.read_path(options.keyframes, capture, frames))
+    if options.path == "views":
+        if not capture.val:
+            raise ValueError(f"{capture.name} has no evaluation views; choose another --path")
+        return [capture.cameras[name] for name in capture.val], list(capture.val)
+    if options.path in ("frozen", "moving"):
+        path = paths.filming(capture, frames)
+        frozen = [dataclasses.replace(camera, time=moment) for camera in path]
+        return _numbered(path if options.path == "moving" else frozen)
+    camera = _view(options, capture)
+    if options.path == "fixed":
+        return _numbered(paths.at_times(camera, paths.evenly(frames)))
+    distance = paths.focus(camera, moving if len(moving) else means)
+    if options.path == "spiral":
+        times = paths.evenly(frames) if options.time is None else [options.time] * frames
+        return _numbered(paths.spiral(camera, distance, REACH * capture.extent, times))
+    return _numbered(paths.bullet(camera, distance, moment, frames))
+
+
+def _numbered(path: list[Camera]) -> tuple[list[Camera], list[str]]:
+    return path, [f"{k:05d}" for k in range(len(path))]
+
+
+def _view(options: Render, capture: Capture) -> Camera:
+    names = capture.val or capture.train
+    name = options.view or names[len(names) // 2]
+    if name not in capture.cameras:
+        raise ValueError(f"{capture.name} has no view {name!r}; its first is {names[0]!r}")
+    return capture.cameras[name]
+
+
+@dataclass(frozen=True)
+class _Film:
+    options: Render
+    capture: Capture
+    render_at: RenderAt
+    device: torch.device
+
+    def pictures(self, cameras: list[Camera], names: list[str]) -> Iterator[np.ndarray]:
+        for camera, name in track(
+            list(zip(cameras, names, strict=True)), "rendering", disable=self.options.quiet, transient=True
+        ):
+            yield pictures.to_bytes(self.picture(camera, name))
+
+    def picture(self, camera: Camera, name: str) -> Float[Tensor, "H W 3"]:
+        options = self.options
+        factor = options.supersample
+        camera = paths.resized(camera, options.scale).to(self.device)
+        rendering = self.render_at(paths.resized(camera, factor), options.layers != "joint")
+        images = [_averaged(image, factor) for image in _images(rendering, options.layers)]
+        if options.truth:
+            truth = self.capture.frame(name).image.to(self.device).float() / 255.0
+            images.insert(0, _fitted(truth, camera))
+        return torch.cat(images, 1)
+
+
+def _images(rendering: Rendering, layers: str) -> list[Float[Tensor, "H W 3"]]:
+    by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
+    chosen = by_name if layers == "all" else {layers: by_name[layers]}
+    return [layer.image.clamp(0, 1) for layer in chosen.values() if layer is not None]
+
+
+def _averaged(image: Float[Tensor, "H W 3"], factor: int) -> Float[Tensor, "h w 3"]:
+    if factor == 1:
+        return image
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
+
+
+def _fitted(truth: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
+    """A filmed picture in the size of a camera's."""
+    size = (camera.height, camera.width)
+    if truth.shape[:2] == size:
+        return truth
+    channels = truth.permute(2, 0, 1)[None]
+    return torch.nn.functional.interpolate(channels, size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
+
+
+def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:
+    """Writes pictures as they come."""
+    with ExitStack() as stack:
+        video = pictures.Video(folder / "video.mp4", options.rate)
+        writer = stack.enter_context(video) if options.write != "png" else None
+        for name, image in zip(names, images, strict=True):
+            if writer is not None:
+                _add(writer, image)
+            if options.write != "mp4":
+                pictures.write_png(folder / f"{name}.png", image)
+    height, width = image.shape[:2]
+    return f"{len(names)} pictures of {width} × {height} in {folder}"
+
+
+def _add(video: pictures.Video, image: np.ndarray) -> None:
+    try:
+        video.add(image)
+    except OSError as error:
+        raise OSError(f"{error}; --write png needs no encoder for MP4") from error

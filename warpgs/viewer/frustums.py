@@ -1,0 +1,35 @@
+"""Cameras drawn into the scene of one browser."""
+
+import numpy as np
+import viser
+
+from .pose import Pose
+
+BLUE, ORANGE = (90, 160, 255), (255, 160, 60)
+LINE_PIXELS = 1.5
+
+
+def add_frustum(
+    scene: viser.SceneApi,
+    name: str,
+    pose: Pose,
+    aspect: float,
+    scale: float,
+    color: tuple[int, int, int],
+    image: np.ndarray | None = None,
+) -> viser.CameraFrustumHandle:
+    """Draws a camera whose picture is ``aspect`` times as wide as it is high."""
+    return scene.add_camera_frustum(
+        name,
+        pose.fov,
+        aspect,
+        scale=scale,
+        thickness=LINE_PIXELS,
+        thickness_units="screen",
+        color=color,
+        image=image,
+        wxyz=np.array(pose.wxyz),
+        position=np.array(pose.position),
+        cast_shadow=False,
+        receive_shadow=False,
+    )

@@ -1,0 +1,56 @@
+"""Where a browser's camera looks, and what its mouse turns around."""
+
+from typing import NamedTuple
+
+import numpy as np
+import viser
+
+from .source import Source
+from .training_cameras import TrainingCameras
+
+FOV = 0.9
+"""Vertical field of view without training cameras [rad]."""
+
+AWAY = np.array([0.0, 0.0, -2.0])
+"""Place of the camera without training cameras, from the middle of the scene: captures are about [-1, 1]."""
+
+UP = np.array([0.0, -1.0, 0.0])
+"""Upward direction without training cameras."""
+
+
+class Look(NamedTuple):
+    """A camera of the browser.
+
+    Attributes:
+        target: Point ahead of it, which its mouse turns around.
+        up: Upward direction of the world.
+        fov: Vertical field of view [rad].
+    """
+
+    position: np.ndarray
+    target: np.ndarray
+    up: np.ndarray
+    fov: float
+
+
+def look_through(training: TrainingCameras, number: int) -> Look:
+    """A training camera, but for its roll."""
+    pose = training.views[number].pose
+    return Look(np.array(pose.position), training.ahead(number), training.up, pose.fov)
+
+
+def first_look(source: Source, training: TrainingCameras | None) -> Look:
+    """The middle training camera; without any, a look at the middle of the scene."""
+    if training is not None:
+        return look_through(training, len(training.views) // 2)
+    snapshot = None if source.follow else source.current()
+    center = np.zeros(3) if snapshot is None else snapshot.center.double().numpy()
+    return Look(center + AWAY, center, UP, FOV)
+
+
+def aim(camera: viser.CameraHandle, look: Look) -> None:
+    """Points a browser's camera."""
+    camera.fov = look.fov
+    camera.up_direction = look.up
+    camera.position = look.position
+    camera.look_at = look.target

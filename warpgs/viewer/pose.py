@@ -1,0 +1,53 @@
+"""Cameras of the browser (orientation, position, vertical field of view) and ours."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from warpgs.cameras import Camera
+
+Vector = tuple[float, ...]
+
+
+class Pose(NamedTuple):
+    """A camera as the browser has it; OpenCV axes, like ours.
+
+    Attributes:
+        wxyz: Rotation from the camera to the world.
+        position: Centre in the world.
+        fov: Vertical field of view [rad].
+    """
+
+    wxyz: Vector
+    position: Vector
+    fov: float
+
+
+def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
+    """The camera of a pose for an image of ``size`` (width, height), principal point in the middle.
+
+    Raises:
+        ValueError: If the pose is not finite, its rotation is zero or its field of view is not in (0, π).
+    """
+    w, x, y, z = pose.wxyz
+    if not all(map(math.isfinite, (*pose.wxyz, *pose.position))) or not any(pose.wxyz) or not 0 < pose.fov < math.pi:
+        raise ValueError(f"the browser's camera can't be used: {pose}")
+    world_to_camera = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = world_to_camera
+    viewmat[:3, 3] = -world_to_camera @ np.array(pose.position)
+    width, height = size
+    focal = 0.5 * height / math.tan(0.5 * pose.fov)
+    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    return Camera(torch.tensor(viewmat, dtype=torch.float32), torch.tensor(K), width, height, time)
+
+
+def pose_of(camera: Camera) -> Pose:
+    """The pose of a camera; a principal point away from the middle is lost, the browser has none."""
+    camera = camera.to("cpu")
+    x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3].double().numpy().T).as_quat().tolist()
+    fov = 2.0 * math.atan2(0.5 * camera.height, float(camera.K[1, 1]))
+    return Pose((w, x, y, z), tuple(camera.position.tolist()), fov)
