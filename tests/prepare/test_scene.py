@@ -31,6 +31,16 @@ def test_what_is_written_is_read_back_as_nerf_ds(root):
     assert np.allclose(frame.camera.position.numpy(), expected, atol=1e-5)
 
 
+def test_half_size_is_read_with_factor_2_and_what_moves_in_part_counts_as_moving(root):
+    capture = load_capture(root, factor=2)
+    name = capture.train[3]
+    frame, mask = capture.frame(name), filmed.film(16)[1][int(name.removeprefix("shot"))]
+    blocks = mask.reshape(mask.shape[0] // 2, 2, mask.shape[1] // 2, 2)
+    assert np.array_equal(~frame.static_mask.numpy(), blocks.any((1, 3)))
+    assert recognise(root) == "nerfds"
+    assert frame.camera.K[0, 0].item() == pytest.approx(filmed.FOCAL / 2)
+
+
 def test_every_fourth_frame_is_held_out(root):
     capture = load_capture(root)
     assert len(capture.val) == 4

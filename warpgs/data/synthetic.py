@@ -4,7 +4,6 @@ Ray-traced, and written in the layout of NeRF-DS, so that it takes the same way 
 """
 
 import hashlib
-import io
 import json
 import math
 import os
@@ -14,7 +13,6 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from rich.progress import track
@@ -22,6 +20,8 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
+
+from .writing import write_array, write_json, write_png
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
 """Scene units are (p − CENTER) · SCALE."""
@@ -179,23 +179,21 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
         shot, camera = picture(k / (scene.num_frames - 1), shift, scene, device)
         static = (shot.bodies < num_static).cpu()
         metadata[name] = {"time_id": k, "warp_id": k, "appearance_id": k, "camera_id": int(side == "right")}
-        _write_png(folder / f"rgb/1x/{name}.png", (shot.image.cpu().clamp(0, 1) * 255).round().byte().numpy())
-        _write_png(folder / f"resized_mask/1x/{name}.png.png", static.byte().numpy() * 255)
-        _write_json(folder / f"camera/{name}.json", _camera_facts(camera.to("cpu")))
+        write_png(folder / f"rgb/1x/{name}.png", (shot.image.cpu().clamp(0, 1) * 255).round().byte().numpy())
+        write_png(folder / f"resized_mask/1x/{name}.png.png", static.byte().numpy() * 255)
+        write_json(folder / f"camera/{name}.json", _camera_facts(camera.to("cpu")))
         if side == "left":
-            _write_png(folder / f"depth/1x/{name}.png", _monocular(shot.depth.cpu(), k / scene.num_frames))
+            write_png(folder / f"depth/1x/{name}.png", _monocular(shot.depth.cpu(), k / scene.num_frames))
             points.append(_surface_points(shot.depth.cpu(), static, camera.to("cpu"), k, scene))
-    _write_json(folder / "metadata.json", metadata)
+    write_json(folder / "metadata.json", metadata)
     left, right = ([n for n in metadata if n.startswith(side)] for side in ("left", "right"))
     dataset = {"count": len(metadata), "num_exemplars": len(left), "ids": [*metadata], "train_ids": left}
-    _write_json(folder / "dataset.json", {**dataset, "val_ids": right})
-    _write_json(
+    write_json(folder / "dataset.json", {**dataset, "val_ids": right})
+    write_json(
         folder / "scene.json",
         {"center": CENTER, "scale": SCALE, "bbox": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 4.0},
     )
-    array = io.BytesIO()
-    np.save(array, torch.cat(points)[: scene.num_points].numpy())
-    _write(folder / "points.npy", array.getvalue())
+    write_array(folder / "points.npy", torch.cat(points)[: scene.num_points].numpy())
 
 
 def _camera_facts(camera: Camera) -> dict[str, object]:
@@ -230,23 +228,6 @@ def _surface_points(depth: Tensor, static: Tensor, camera: Camera, k: int, scene
     row, column = rows[chosen], columns[chosen]
     points = camera.unproject(row, column, depth[row, column])
     return points + POINT_NOISE * torch.randn(points.shape, generator=generator)
-
-
-def _write_png(path: Path, image: np.ndarray) -> None:
-    _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    _write(path, data.tobytes())
-
-
-def _write_json(path: Path, values: object) -> None:
-    _write(path, json.dumps(values).encode())
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:  # which does not name the file when the disk is full
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
 
 
 def builtin_capture(

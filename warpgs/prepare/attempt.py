@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from warpgs.data.synthetic import _write_json as write_json
+from warpgs.data.writing import write_json
 
 REPORT = "prepare.json"
 """Beside the capture: options, results and seconds of every step, notes."""

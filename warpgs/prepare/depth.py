@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from warpgs.data.writing import write_array
+
 from .dense import Footage, LocalGeometry, triangulate
 from .parallel import each
 
@@ -87,8 +89,4 @@ def write_depth(path: Path, inverse_depth: Float[np.ndarray, "H W"]) -> None:
     """
     known = inverse_depth[np.isfinite(inverse_depth)]
     scale = float(np.median(known)) if len(known) else 1.0
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, np.minimum(inverse_depth / scale, 1e3).astype(np.float16))
-    except OSError as error:
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
+    write_array(path, np.minimum(inverse_depth / scale, 1e3).astype(np.float16))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.images import LARGEST_SIDE, decode
-from warpgs.data.synthetic import _write_png as write_png
+from warpgs.data.writing import write_json, write_png
 
 from .parallel import progress
 
@@ -96,7 +96,7 @@ def take_frames(source: Path, folder: Path, selection: Selection, quiet: bool = 
         raise ValueError(
             f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {FEWEST_FRAMES} are needed"
         )
-    (folder / "frames.json").write_text(json.dumps([asdict(frame) for frame in taken]))
+    write_json(folder / "frames.json", [asdict(frame) for frame in taken])
     return taken
 
 

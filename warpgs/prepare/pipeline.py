@@ -13,7 +13,7 @@ import numpy as np
 
 from warpgs.data.images import decode, read_mask
 from warpgs.data.lens import straighten
-from warpgs.data.synthetic import _write_png as write_png
+from warpgs.data.writing import write_png
 
 from . import contact_sheet
 from .attempt import REPORT, Attempt

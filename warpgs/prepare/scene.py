@@ -10,14 +10,16 @@ from jaxtyping import Bool, Float
 
 from warpgs.data.images import decode
 from warpgs.data.lens import Lens, pinhole_matrix, straighten
-from warpgs.data.synthetic import _write_json as write_json
-from warpgs.data.synthetic import _write_png as write_png
+from warpgs.data.writing import write_array, write_json, write_png
 
 from .frames import SourceFrame
 from .sfm import Cameras
 
 KEPT_SHARE = 0.02
 """Share of the points at each end of each axis that does not count for the size of the scene: strays."""
+
+FACTORS = (1, 2)
+"""Downscalings that pictures and masks are written in; training takes the second with ``--factor 2``."""
 
 MOST_MOVING = 0.5
 """Share of the frames that see a point where something moves, above which the point is left out."""
@@ -69,7 +71,7 @@ def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 
 
 
 def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequence[Bool[np.ndarray, "H W"]]) -> None:
-    """Writes pictures and masks, straightened, and the camera of every frame.
+    """Writes pictures and masks, straightened, in full and in half size, and the camera of every frame.
 
     Raises:
         ValueError: If a frame was damaged since it was taken.
@@ -78,9 +80,12 @@ def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequ
     straight = straight_lens(cameras.lens)
     for name, pose, mask in zip(cameras.names, cameras.poses, moving, strict=True):
         image = cv2.cvtColor(decode(frames_folder / f"{name}.png"), cv2.COLOR_BGR2RGB)
-        write_png(root / f"rgb/1x/{name}.png", straighten(image, cameras.lens))
-        static = straighten(~mask, cameras.lens)
-        write_png(root / f"resized_mask/1x/{name}.png.png", static.astype(np.uint8) * 255)
+        image, moving_here = straighten(image, cameras.lens), straighten(mask, cameras.lens).astype(np.uint8)
+        for factor in FACTORS:
+            size = round(straight.width / factor), round(straight.height / factor)
+            write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+            static = cv2.resize(255 * moving_here, size, interpolation=cv2.INTER_AREA) == 0  # no pixel of it moves
+            write_png(root / f"resized_mask/{factor}x/{name}.png.png", static.astype(np.uint8) * 255)
         write_json(root / f"camera/{name}.json", _camera_facts(straight, pose))
 
 
@@ -116,10 +121,7 @@ def write_facts(root: Path, cameras: Cameras, frames: Sequence[SourceFrame], hol
     near, far = np.quantile(depths[depths > 0], [0.001, 0.999]) * scale
     facts = {"center": center.tolist(), "scale": scale, "near": 0.5 * near, "far": 2.0 * far}
     write_json(root / "scene.json", {**facts, "bbox": [[-1, -1, -1], [1, 1, 1]]})
-    try:
-        np.save(root / "points.npy", cameras.points)
-    except OSError as error:
-        raise OSError(f"{root / 'points.npy'} could not be written: {error.strerror or error}") from error
+    write_array(root / "points.npy", cameras.points)
     first = frames[0].step
     ids = [{"time_id": f.step - first, "warp_id": k, "appearance_id": k, "camera_id": 0} for k, f in enumerate(frames)]
     names = [f.name for f in frames]
