@@ -333,17 +333,15 @@ def test_a_schedule_that_cannot_be_is_refused_by_name(name, value, iterations):
         scaled(config)
 
 
-def test_the_appearance_network_recovers_after_each_reset():
-    made = moments(schedule={"recovery": 10})
-    values = [moment.recovered for moment in made]
-    resets = [k for k, moment in enumerate(made) if moment.reset]
-    assert len(resets) > 1
-    for reset in resets:
-        assert values[reset + 1 : reset + 12] == pytest.approx([(k / 10) ** 2 for k in range(11)])
-    assert values[: resets[0] + 1] == [1.0] * (resets[0] + 1)
-    assert values[-1] == 1.0
+def test_a_network_begins_slowly():
+    made = moments(schedule={"warmup": 10})
+    for name, begins in (("deformation", lambda m: m.moving), ("appearance", lambda m: m.relit)):
+        first = next(k for k, moment in enumerate(made) if begins(moment))
+        values = [moment.network_warmth[name] for moment in made]
+        assert values[:first] == [0.0] * first
+        assert values[first : first + 12] == pytest.approx([*((k + 1) / 10 for k in range(10)), 1.0, 1.0])
+        assert values[-1] == 1.0
 
 
-def test_without_pretraining_the_appearance_network_begins_slowly():
-    made = moments(has_depth=False, schedule={"recovery": 10, "reset_every": 1000})
-    assert [moment.recovered for moment in made[:12]] == pytest.approx([*((k / 10) ** 2 for k in range(10)), 1.0, 1.0])
+def test_without_warmup_networks_begin_at_their_full_rate():
+    assert all(set(m.network_warmth.values()) == {1.0} for m in moments(schedule={"warmup": 0}))

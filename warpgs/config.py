@@ -133,9 +133,6 @@ class Schedule:
     densify_until: int = 15_000
     reset_every: int = 3_000
     """Iterations between opacity resets, while densifying."""
-    recovery: int = 1_000
-    """Iterations over which the rate of the appearance network rises again after an opacity reset: until opacities are
-    back every image is too dark, and the network would learn to brighten everything and never recover."""
     prune_every: int = 5_000
     """Iterations of stage I between visibility-driven prunings."""
     deform_from: int = 3_000
@@ -143,6 +140,9 @@ class Schedule:
     relight_from: int = 0
     """Iteration of stage I from which the appearance network changes static Gaussians. In the paper that is stage II;
     by then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
+    warmup: int = 1_000
+    """Iterations over which the rate of a network rises when it begins: at the full rate Adam's first steps, all of one
+    sign, push most units below zero for good, and now and then all of them."""
     noise_until: int = 20_000
     """Iteration of stage I at which the noise on time has died away."""
     sh_degree_every: int = 1_000
@@ -232,9 +232,9 @@ PRESETS: dict[str, TrainConfig] = {
             densify_from=300,
             densify_until=3_500,
             reset_every=2_500,
-            recovery=500,
             prune_every=2_000,
             deform_from=500,
+            warmup=500,
             noise_until=3_500,
             sh_degree_every=500,
         ),
@@ -256,9 +256,9 @@ PRESETS: dict[str, TrainConfig] = {
             densify_from=100,
             densify_until=700,
             reset_every=10_000,
-            recovery=200,
             prune_every=500,
             deform_from=50,
+            warmup=100,
             noise_until=400,
             sh_degree_every=400,
         ),

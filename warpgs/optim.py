@@ -45,7 +45,7 @@ def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> Adam:
 
 
 def learning_rates(
-    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float], recovered: float = 1.0
+    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float], warmth: dict[str, float]
 ) -> list[float]:
     """Learning rate of each group of ``GROUPS``.
 
@@ -54,7 +54,7 @@ def learning_rates(
         extent: Of the capture [scene units]; scales the rate of positions.
         progress: Share of the run done, in [0, 1].
         network_progress: The same for each network, over the iterations in which it is trained.
-        recovered: Share of its rate that the appearance network has.
+        warmth: Share of its rate that each network has.
     """
     gaussians = [
         exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
@@ -65,10 +65,10 @@ def learning_rates(
         config.sh_rest,
     ]
     networks = [
-        exponential(config.networks, config.networks_end, network_progress[name])
+        warmth[name] * exponential(config.networks, config.networks_end, network_progress[name])
         for name in ("deformation", "appearance")
     ]
-    return [*gaussians, *gaussians, networks[0], recovered * networks[1]]
+    return [*gaussians, *gaussians, *networks]
 
 
 def exponential(start: float, end: float, progress: float) -> float:

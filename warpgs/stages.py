@@ -33,7 +33,7 @@ class Moment:
         stage: The stage it belongs to.
         progress: Share of the run done.
         network_progress: Share done of the iterations in which each network is trained.
-        recovered: Share of its rate that the appearance network has, 0 when opacities have just been reset.
+        network_warmth: Share of its rate that each network has; rises from 0 when it begins.
         moving, relit: Whether the deformation and the appearance network are in use.
         joint: Whether the joint image is compared with the whole truth.
         sh_degree: Highest degree of spherical harmonics in use.
@@ -46,7 +46,7 @@ class Moment:
     stage: Stage
     progress: float
     network_progress: dict[str, float]
-    recovered: float
+    network_warmth: dict[str, float]
     moving: bool
     relit: bool
     joint: bool
@@ -81,6 +81,9 @@ class Protocol:
         self.stage1 = Stage("stage1", pretrain, pretrain + stage1)
         self.stage2 = Stage("stage2", pretrain + stage1, pretrain + stage1 + stage2)
         self.num_iterations = self.stage2.end
+        # Iterations of stage I from which the networks are in use; in stage II they always are.
+        starts = {"deformation": schedule.deform_from, "appearance": schedule.relight_from}
+        self._begin = {name: min(start, stage1) for name, start in starts.items()}
 
     def stage_at(self, iteration: int) -> Stage:
         return next(stage for stage in (self.pretrain, self.stage1, self.stage2) if iteration < stage.end)
@@ -95,13 +98,10 @@ class Protocol:
         return Moment(
             stage=stage,
             progress=progress,
-            network_progress={
-                "deformation": self._share_since(schedule.deform_from, in_stage1),
-                "appearance": self._share_since(schedule.relight_from, in_stage1),
-            },
-            recovered=self._recovered(in_stage1),
-            moving=in_stage1 >= schedule.deform_from or stage.name == "stage2",
-            relit=config.app and (in_stage1 >= schedule.relight_from or stage.name == "stage2"),
+            network_progress={name: self._share_since(start, in_stage1) for name, start in self._begin.items()},
+            network_warmth={name: self._warmth(in_stage1 - start) for name, start in self._begin.items()},
+            moving=in_stage1 >= self._begin["deformation"],
+            relit=config.app and in_stage1 >= self._begin["appearance"],
             joint=stage.name == "stage2",
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // schedule.sh_degree_every),
             depth_weight=self._depth_weight(progress),
@@ -117,19 +117,12 @@ class Protocol:
         )
 
     def _share_since(self, start: int, in_stage1: int) -> float:
-        """Share done of the iterations from one of stage I, or the start of stage II, to the end of the run."""
-        first = min(start, self.stage2.start - self.stage1.start)
-        return max(0.0, (in_stage1 - first) / max(1, self.num_iterations - self.stage1.start - first))
+        """Share done of the iterations from one of stage I to the end of the run."""
+        return max(0.0, (in_stage1 - start) / max(1, self.num_iterations - self.stage1.start - start))
 
-    def _recovered(self, in_stage1: int) -> float:
-        """Rises with the square of the iterations since opacities were low: after a reset, or without pretraining."""
-        schedule = self.config.schedule
-        last_reset = min(in_stage1, schedule.densify_until - 1) // schedule.reset_every * schedule.reset_every
-        if last_reset < max(1, schedule.densify_from):
-            if self.pretrain.end > 0:
-                return 1.0
-            last_reset = 0
-        return min(1.0, (max(0, in_stage1 - last_reset) / max(1, schedule.recovery)) ** 2)
+    def _warmth(self, iterations: int) -> float:
+        warmup = self.config.schedule.warmup
+        return min(1.0, max(0.0, (iterations + 1) / warmup)) if warmup else 1.0
 
     def _depth_weight(self, progress: float) -> float:
         loss = self.config.loss

@@ -75,7 +75,7 @@ class Step:
 
     def __call__(self, moment: Moment, draw: Draw) -> None:
         """Runs the iteration of a moment of the schedule."""
-        progress = (moment.progress, moment.network_progress, moment.recovered)
+        progress = (moment.progress, moment.network_progress, moment.network_warmth)
         rates = optim.learning_rates(self.config.optim, self.extent, *progress)
         numbers = [draw.noise, moment.depth_weight, *draw.background.tolist(), *rates]
         self._numbers.copy_(torch.tensor(numbers), non_blocking=True)

@@ -60,8 +60,11 @@ def trained(num_steps=3, rate=0.01, **sizes):
     return scene, optimizer
 
 
-def rates_at(progress, network_progress, extent=1.0, config=RATES):
-    return dict(zip(GROUPS, learning_rates(config, extent, progress, network_progress), strict=True))
+WARM = dict.fromkeys(NETWORKS, 1.0)
+
+
+def rates_at(progress, network_progress, extent=1.0, config=RATES, warmth=WARM):
+    return dict(zip(GROUPS, learning_rates(config, extent, progress, network_progress, warmth), strict=True))
 
 
 # The optimizer -------------------------------------------------------------------------------------------------------
@@ -281,3 +284,11 @@ def test_the_default_rates_of_networks_are_the_papers():
 def test_a_rate_of_zero_stays_zero():
     rates = torch.tensor([exponential(0.0, 0.0, progress) for progress in (0.0, 0.5, 1.0)])
     assert not rates.any()
+
+
+def test_a_network_that_is_not_warm_yet_has_a_share_of_its_rate():
+    progress = dict.fromkeys(NETWORKS, 0.3)
+    warm = rates_at(0.3, progress)
+    for name in NETWORKS:
+        cold = rates_at(0.3, progress, warmth={**WARM, name: 0.25})
+        assert cold == {**warm, name: pytest.approx(0.25 * warm[name])}
