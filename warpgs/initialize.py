@@ -1,5 +1,7 @@
 """Where training begins: the first Gaussians of both branches, and monocular depth in scene units."""
 
+from collections.abc import Iterable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,13 +13,28 @@ from .render import render
 from .scene import init
 from .scene.gaussians import Gaussians
 from .scene.split import SplitScene
-from .views import Views
+from .views import View, Views
 
 COLOR_VIEWS = 12
 """Training views from which points without colours take theirs, at most."""
 
 LIFTED_SHARE = 8
 """Moving pixels that are lifted, for each dynamic Gaussian to begin with, at most."""
+
+LEAST_KNOWN = 0.1
+"""Share of the moving pixels that depth must be known of; depth from motion knows that of what stands still only."""
+
+NEAREST_POINTS = 8
+"""Points around a moving pixel that it is put before where depth is not known."""
+
+BEFORE = 0.9
+"""Its depth over that of the nearest of them."""
+
+MOST_POINTS = 2_000
+"""Points of a picture that are looked at for it."""
+
+PIXELS_AT_ONCE = 8_192
+"""Keeps the table of their distances from the points under 100 MB."""
 
 LARGEST_SHARE = 0.5
 """Largest first Gaussian of unknown place, as a share of the size at which densification removes it."""
@@ -60,9 +77,10 @@ def dynamic_gaussians(
     scene: SplitScene,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Dynamic Gaussians at moving pixels lifted by aligned depth; without depth, anywhere in the scene's box.
+    """Dynamic Gaussians at moving pixels lifted by aligned depth.
 
-    Where nothing moves there are none.
+    Without depth they begin before the points around them, without points anywhere in the scene's box; where nothing
+    moves there are none.
     """
     most, degree = config.model.dynamic_points, config.model.sh_degree
     if config.assume == "static":
@@ -72,16 +90,22 @@ def dynamic_gaussians(
     num_moving = sum(int((~views[index].static_mask).sum()) for index in range(len(views)))
     if num_moving == 0:
         return Gaussians.empty(0, degree)
-    share = LIFTED_SHARE * most / num_moving
-    lifted = [_lift(views, index, alignments[index], share, generator) for index in range(len(views))]
-    positions, colors = (torch.cat(values) for values in zip(*lifted, strict=True))
+    share = min(1.0, LIFTED_SHARE * most / num_moving)
+    planes = (depth.metric_depth(views[k].inverse_depth, alignments[k]) for k in range(len(views)))
+    positions, colors = _lift(views, planes, share, generator)
+    if len(positions) >= LEAST_KNOWN * share * num_moving:
+        chosen = init.subsample(positions, most, generator)
+        return init.from_points(positions[chosen], colors[chosen], degree)
+    points = capture.points.to(views.device)
+    planes = (_before_points(views[k], points, generator) for k in range(len(views)))
+    positions, colors = _lift(views, planes, share, generator)
     if len(positions) == 0:
         trunk = scene.deformation.trunk
         positions = _anywhere(trunk.center.cpu(), trunk.half_size.cpu(), most, generator)
-        largest = LARGEST_SHARE * config.densify.max_size * capture.extent
-        return init.from_points(positions, torch.full_like(positions, 0.5), degree, largest)
+        colors = torch.full_like(positions, 0.5)
     chosen = init.subsample(positions, most, generator)
-    return init.from_points(positions[chosen], colors[chosen], degree)
+    largest = LARGEST_SHARE * config.densify.max_size * capture.extent
+    return init.from_points(positions[chosen], colors[chosen], degree, largest)
 
 
 def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -89,16 +113,45 @@ def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Ge
 
 
 def _lift(
-    views: Views, index: int, alignment: Tensor, share: float, generator: torch.Generator
+    views: Views, planes: Iterable[Float[Tensor, "H W"]], share: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Positions and colours of a random share of a view's moving pixels, on the CPU."""
-    view = views[index]
-    wanted = ~view.static_mask
-    if share < 1.0:
-        wanted = wanted & (torch.rand(wanted.shape, generator=generator) < share).to(wanted.device)
-    metric = depth.metric_depth(view.inverse_depth, alignment)
-    points, colors = init.lift(metric, wanted, view.image, view.camera)
-    return points.cpu(), colors.cpu()
+    """Positions and colours of a random share of all views' moving pixels, on the CPU.
+
+    Args:
+        views: The views.
+        planes: [H, W] depth of each.
+        share: At most 1.
+        generator: Of the choice.
+    """
+    lifted = []
+    for index, plane in enumerate(planes):
+        view = views[index]
+        wanted = ~view.static_mask
+        if share < 1.0:
+            wanted = wanted & (torch.rand(wanted.shape, generator=generator) < share).to(wanted.device)
+        points, colors = init.lift(plane, wanted, view.image, view.camera)
+        lifted.append((points.cpu(), colors.cpu()))
+    positions, colors = (torch.cat(values) for values in zip(*lifted, strict=True))
+    return positions, colors
+
+
+def _before_points(view: View, points: Float[Tensor, "P 3"], generator: torch.Generator) -> Float[Tensor, "H W"]:
+    """Depth before the nearest of the points around each moving pixel, because what moves hides what stands; else NaN.
+
+    Where it truly is one camera does not tell; there it looks right from where it was filmed, and hides nothing else.
+    """
+    plane = torch.full(view.static_mask.shape, torch.nan, device=points.device)
+    row, column, z, inside = view.camera.project(points)
+    seen = inside.nonzero()[:, 0]
+    seen = seen[init.subsample(seen, MOST_POINTS, generator).to(seen.device)]
+    moving = (~view.static_mask).nonzero()
+    if len(seen) == 0:
+        return plane
+    places = torch.stack([row[seen], column[seen]], 1).float()
+    for part in moving.split(PIXELS_AT_ONCE):
+        around = torch.cdist(part.float(), places).topk(min(NEAREST_POINTS, len(seen)), largest=False).indices
+        plane[part[:, 0], part[:, 1]] = BEFORE * z[seen][around].amin(1)
+    return plane
 
 
 def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:

@@ -274,9 +274,39 @@ def test_frames_that_could_not_be_aligned_give_no_dynamic_gaussians():
     assert len(dynamic_gaussians(capture, ALIGNMENT, config)) == 600
 
 
+def mostly_unknown():
+    """What depth from motion leaves of what moves: a few pixels at its border."""
+    plane = torch.full((HEIGHT, WIDTH), torch.nan)
+    plane[BLOCK[0], BLOCK[1].start] = 0.3
+    return plane
+
+
+def points_around_the_block(depth):
+    row = torch.tensor([8, 8, 22, 22, 15, 15, 8, 22])
+    column = torch.tensor([13, 37, 13, 37, 13, 37, 25, 25])
+    return CAMERA.unproject(row, column, depth)
+
+
+@pytest.mark.parametrize("inverse_depth", [None, mostly_unknown()])
+def test_without_depth_dynamic_gaussians_begin_before_the_points_around_them(inverse_depth):
+    points = points_around_the_block(torch.linspace(2.0, 3.0, 8))
+    gaussians = dynamic_gaussians(make_capture(points, inverse_depth=inverse_depth), ALIGNMENT)
+    row, column, depth, _ = CAMERA.project(gaussians.means.detach())
+    assert len(gaussians) == NETWORK.dynamic_points
+    assert not moving_mask()[row, column].any()
+    assert error(depth, torch.full_like(depth, 2.0 * initialize.BEFORE)) < 1e-4
+
+
+def test_only_the_points_around_a_moving_pixel_count():
+    around, corner = points_around_the_block(torch.full((8,), 3.0)), torch.zeros(1, dtype=torch.long)
+    points = torch.cat([around, around, CAMERA.unproject(corner, corner, torch.ones(1))])
+    depth = CAMERA.project(dynamic_gaussians(make_capture(points), ALIGNMENT).means.detach())[2]
+    assert error(depth, torch.full_like(depth, 3.0 * initialize.BEFORE)) < 1e-4
+
+
 @pytest.mark.parametrize("inverse_depth", [None, torch.full((HEIGHT, WIDTH), torch.nan)])
-def test_without_depth_dynamic_gaussians_begin_anywhere_in_the_box(inverse_depth):
-    points = random_points(200) + 7.0
+def test_without_depth_and_points_in_sight_dynamic_gaussians_begin_anywhere_in_the_box(inverse_depth):
+    points = random_points(200) + CAMERA.position + 50.0 * (CAMERA.position / CAMERA.position.norm())
     gaussians = dynamic_gaussians(make_capture(points, inverse_depth=inverse_depth), ALIGNMENT)
     center, half_size = init.scene_box(points)
     assert len(gaussians) == NETWORK.dynamic_points
