@@ -35,11 +35,14 @@ class Prepare:
     lens: LensModel = "SIMPLE_RADIAL"
     """COLMAP's model of the lens."""
     masks: str = "motion"
-    """What moves: found by motion, none, or a folder of masks named as the frames, 0 = moving."""
-    depth: Literal["flow", "none"] = "flow"
-    """Depth of the static scene by optical flow between frames, or none."""
+    """What moves: found by motion, that followed by a network (sam2), none, or a folder of masks named as the frames,
+    0 = moving."""
+    depth: Literal["flow", "anything", "none"] = "flow"
+    """Depth of the static scene by optical flow between frames, of all by a network (anything), or none."""
     holdout: int = 0
     """Every so many-th frame is kept for evaluation, as val_ids; 0 keeps none."""
+    weights: Path | None = None
+    """Folder of the networks' weights; the Hugging Face cache if not given. Nothing is downloaded."""
     force: bool = False
     """Replaces a capture that is there."""
     quiet: bool = False
@@ -49,7 +52,7 @@ class Prepare:
         from .pipeline import Preparation  # takes half a second that the other commands do without
 
         selection = Selection(self.fps, self.count, self.longest_side)
-        options = Options(self.source, selection, self.lens, self.masks, self.depth, self.holdout)
+        options = Options(self.source, selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
         preparation = Preparation(self.capture, options, self.force, self.quiet)
         was_finished = preparation.attempt.is_finished
         try:

@@ -88,5 +88,5 @@ def write_depth(path: Path, inverse_depth: Float[np.ndarray, "H W"]) -> None:
         OSError: If it can't be written; the message names the file.
     """
     known = inverse_depth[np.isfinite(inverse_depth)]
-    scale = float(np.median(known)) if len(known) else 1.0
+    scale = (float(np.median(known)) if len(known) else 0.0) or 1.0  # a network may find all of it infinitely far
     write_array(path, np.minimum(inverse_depth / scale, 1e3).astype(np.float16))

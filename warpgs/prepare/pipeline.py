@@ -15,13 +15,14 @@ from warpgs.data.images import decode, read_mask
 from warpgs.data.lens import straighten
 from warpgs.data.writing import write_png
 
-from . import contact_sheet
+from . import contact_sheet, depth_anything, sam2
 from .attempt import REPORT, Attempt
 from .contact_sheet import sheet, spread
 from .dense import Footage
 from .depth import static_depth, write_depth
 from .frames import SourceFrame, list_frames, take_frames
 from .motion_masks import find_moving, lift
+from .networks import DEPTH_ANYTHING, SAM2, find_weights
 from .options import Options
 from .scene import resized_lens, static_points, straight_lens, write_facts, write_frames
 from .sfm import Cameras, recover_cameras
@@ -104,14 +105,14 @@ class Preparation:
             raise OSError(f"{self.root}: {megabytes} MB of disk are needed, {free} MB are free")
 
     def _first_cameras(self) -> str:
-        if self.options.masks != "motion":
+        if not self.options.finds_motion:
             return ""
         return self._recover("first", [f.name for f in self._listed()], None, thorough=False)
 
     def _masks(self) -> str:
         if self.options.masks == "none":
             return ""
-        if self.options.masks == "motion":
+        if self.options.finds_motion:
             return self._first_masks()
         frames = self._listed()
         return self._keep_masks([f.name for f in frames], [self._given_mask(f) for f in frames])
@@ -136,7 +137,7 @@ class Preparation:
 
     def _masks_again(self) -> str:
         """What moves misled the first pass where the second fits much better: its masks are wrong as well."""
-        if self.options.masks != "motion":
+        if not self.options.finds_motion:
             return ""
         first, final = self._load("first"), self._load("final")
         misled = final.error < MISLED * first.error or self._moving_share() > DOUBTFUL_MOVING
@@ -144,10 +145,12 @@ class Preparation:
 
     def _find_masks(self, cameras: Cameras) -> str:
         size = cameras.lens.width, cameras.lens.height
-        images = lift(self._working_images(cameras))
-        height, width = images[0].shape[:2]
-        footage = Footage(images, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
-        moving = find_moving(images, footage, self.quiet)
+        images = self._working_images(cameras)
+        lifted, (height, width) = lift(images), images[0].shape[:2]
+        footage = Footage(lifted, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
+        moving = find_moving(lifted, footage, self.quiet)
+        if self.options.masks == "sam2":
+            moving = sam2.follow(images, moving, find_weights(SAM2, self.options.weights), self.quiet)
         resized = [cv2.resize(m.astype(np.float32), size, interpolation=cv2.INTER_CUBIC) > 0.5 for m in moving]
         return self._keep_masks(cameras.names, resized)
 
@@ -171,7 +174,7 @@ class Preparation:
         if self.options.masks == "none":
             return self._recover("final", [f.name for f in self._listed()], None)
         masks = self.work / "masks"
-        if self.options.masks != "motion":
+        if not self.options.finds_motion:
             return self._recover("final", [f.name for f in self._listed()], masks)
         first = self._load("first")
         try:
@@ -231,22 +234,25 @@ class Preparation:
         if self.options.depth == "none":
             return "none"
         cameras = self._load("final")
-        size = None
-        images = []
-        for name in cameras.names:
-            image = self._picture(name)
-            size = size or _working_size(image)
-            images.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-        lens = resized_lens(straight_lens(cameras.lens), *images[0].shape[1::-1])
-        moving = [straighten(m, cameras.lens) for m in self._mask_of(cameras)]
-        moving = [cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0 for m in moving]
-        planes = static_depth(Footage(lift(images), lens, cameras.poses, cameras.points), moving, self.quiet)
+        images = [_working(self._picture(name)) for name in cameras.names]
+        by_network = self.options.depth == "anything"
+        planes = self._network_depth(images) if by_network else self._flow_depth(cameras, images)
         for name, plane in zip(cameras.names, planes, strict=True):
             write_depth(self.root / f"depth/1x/{name}.npy", plane)
         chosen = spread(len(planes))
         pictures = [contact_sheet.of_depth(planes[k]) for k in chosen]
         write_png(self.root / "depth.png", sheet(pictures, [cameras.names[k] for k in chosen]))
         return f"known on {np.mean([np.isfinite(plane).mean() for plane in planes]):.0%} of the pixels"
+
+    def _network_depth(self, images: list[np.ndarray]) -> list[np.ndarray]:
+        return depth_anything.predict(images, find_weights(DEPTH_ANYTHING, self.options.weights), self.quiet)
+
+    def _flow_depth(self, cameras: Cameras, images: list[np.ndarray]) -> list[np.ndarray]:
+        size = images[0].shape[1::-1]
+        moving = [straighten(m, cameras.lens) for m in self._mask_of(cameras)]
+        moving = [cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0 for m in moving]
+        lens = resized_lens(straight_lens(cameras.lens), *size)
+        return static_depth(Footage(lift(images), lens, cameras.poses, cameras.points), moving, self.quiet)
 
     def _listed(self) -> list[SourceFrame]:
         return list_frames(self.work / "frames")
@@ -265,14 +271,13 @@ class Preparation:
         return cv2.cvtColor(decode(self.root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
 
     def _working_images(self, cameras: Cameras) -> list[np.ndarray]:
-        images = []
-        for name in cameras.names:
-            image = cv2.cvtColor(decode(self.work / f"frames/{name}.png"), cv2.COLOR_BGR2RGB)
-            images.append(cv2.resize(image, _working_size(image), interpolation=cv2.INTER_AREA))
-        return images
+        frames = [decode(self.work / f"frames/{name}.png") for name in cameras.names]
+        return [_working(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for frame in frames]
 
 
-def _working_size(image: np.ndarray) -> tuple[int, int]:
+def _working(image: np.ndarray) -> np.ndarray:
+    """A picture no larger than motion and depth are found on."""
     height, width = image.shape[:2]
     factor = min(1.0, WORKING_SIDE / max(width, height))
-    return max(1, round(width * factor)), max(1, round(height * factor))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
