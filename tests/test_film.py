@@ -181,15 +181,10 @@ def test_only_the_files_asked_for_are_written(run, tmp_path, write, kinds):
 
 @pytest.mark.parametrize("quiet", [True, False])
 def test_progress_is_shown_unless_it_should_be_quiet(run, tmp_path, monkeypatch, quiet):
-    hidden = []
-
-    def track(steps, name, disable, transient):
-        hidden.append(disable)
-        return steps
-
-    monkeypatch.setattr(film, "track", track)
+    told = []
+    monkeypatch.setattr(film, "progress", lambda steps, name, quiet: told.append(quiet) or steps)
     render(run, tmp_path, path="fixed", quiet=quiet)
-    assert hidden == [quiet]
+    assert told == [quiet]
 
 
 # Refusals -----------------------------------------------------------------------------------------------------------

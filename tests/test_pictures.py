@@ -2,7 +2,9 @@
 
 import errno
 import os
+import sys
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -154,7 +156,55 @@ def test_a_video_without_frames_is_no_file(tmp_path):
 def test_a_video_that_can_not_be_opened_is_named(tmp_path):
     (tmp_path / "a.mp4").mkdir()
     with (
-        pytest.raises(OSError, match=r"a\.mp4 could not be opened as a video"),
+        pytest.raises(OSError, match=r"a\.mp4 could not be written as a video: Is a directory"),
         pictures.Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
+
+
+def test_a_disk_that_is_full_is_told_and_leaves_no_video(tmp_path):
+    """/dev/full says of every write that there is no room."""
+    (tmp_path / "a.mp4").symlink_to("/dev/full")
+    with (
+        pytest.raises(OSError, match=r"a\.mp4 could not be written as a video: No space left on device"),
+        pictures.Video(tmp_path / "a.mp4") as v,
+    ):
+        v.add(np.zeros((H, W, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_browsers_play_what_is_written(tmp_path):
+    """H.264 with half as many colours a side, the index in front."""
+    with pictures.Video(tmp_path / "a.mp4") as video:
+        video.add(np.zeros((H, W, 3), np.uint8))
+    data = (tmp_path / "a.mp4").read_bytes()
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        assert (file.streams[0].codec_context.name, file.streams[0].pix_fmt) == ("h264", "yuv420p")
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+def test_a_video_has_the_rate_asked_for(tmp_path):
+    with pictures.Video(tmp_path / "a.mp4", 29.97) as video:
+        for _ in range(3):
+            video.add(np.zeros((H, W, 3), np.uint8))
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        assert float(file.streams[0].average_rate) == pytest.approx(29.97, abs=0.01)
+
+
+def test_without_ffmpeg_a_line_says_where_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with (
+        pytest.raises(OSError, match="a video needs FFmpeg, which comes with PyAV: pip install av"),
+        pictures.Video(tmp_path / "a.mp4") as v,
+    ):
+        v.add(np.zeros((H, W, 3), np.uint8))
+
+
+def test_without_an_encoder_for_h264_a_line_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(av, "codecs_available", {"mpeg4"})
+    with (
+        pytest.raises(OSError, match=r"a\.mp4 can't be written: the FFmpeg .* has no libx264"),
+        pictures.Video(tmp_path / "a.mp4") as v,
+    ):
+        v.add(np.zeros((H, W, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == []

@@ -117,7 +117,7 @@ def test_every_view_and_its_figures_are_there(tmp_path, run):
 def test_all_scalars_are_curves(tmp_path, run):
     page = report(tmp_path, run)
     labels = {attrs.get("aria-label") for tag, attrs in page.elements if tag == "svg"}
-    assert {"loss/total", "psnr/train", "gaussians/static", "psnr of each view"} <= labels
+    assert {"loss/total", "psnr/train", "gaussians/static", "PSNR [dB] of each view"} <= labels
 
 
 def test_timing_is_there(tmp_path, run):
@@ -222,7 +222,7 @@ def test_without_events_there_are_no_training_curves_and_it_says_so(tmp_path, ru
     shutil.rmtree(run / "events")
     page = report(tmp_path, run)
     assert "Without TensorBoard events: run" in page.text
-    assert "psnr of each view" in page.text
+    assert "PSNR [dB] of each view" in page.text
 
 
 def test_a_run_without_evaluation_views_is_reported(tmp_path, run):
@@ -401,13 +401,13 @@ def test_a_config_of_another_version_is_refused(capsys, run):
 def test_events_that_are_cut_off_are_read_as_far_as_they_go(tmp_path, run):
     path = next((run / "events").iterdir())
     path.write_bytes(path.read_bytes()[:-20])
-    assert "psnr of each view" in report(tmp_path, run, views=0).text
+    assert "PSNR [dB] of each view" in report(tmp_path, run, views=0).text
 
 
 def test_events_that_are_none_do_not_keep_a_report_from_being_made(tmp_path, run):
     path = next((run / "events").iterdir())
     path.write_bytes(b"nonsense" * 100)
-    assert "psnr of each view" in report(tmp_path, run, views=0).text
+    assert "PSNR [dB] of each view" in report(tmp_path, run, views=0).text
 
 
 def test_a_place_that_cannot_be_written_is_one_line(capsys, run, tmp_path):

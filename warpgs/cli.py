@@ -27,9 +27,11 @@ class Eval:
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
     device: Literal["cuda", "cpu"] | None = None
     """Where to render; CUDA if there is a GPU."""
+    quiet: bool = False
+    """Show no progress."""
 
     def run(self) -> None:
-        print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device))
+        print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device, quiet=self.quiet))
 
 
 COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Export | Prepare | Render | Report | View]] = {
@@ -45,6 +47,10 @@ COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Export | Prepare | Rend
 """Each command is a dataclass of its options with a method ``run``."""
 
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="warpgs", description=__doc__, args=arguments)
@@ -53,4 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, ImportError, OSError) as error:
         print(f"warpgs: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("warpgs: stopped", file=sys.stderr)
+        return INTERRUPTED
     return 0

@@ -14,13 +14,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from rich.progress import track
 from torch import Tensor
 
 from . import metrics
 from .cameras import Camera
 from .data.capture import Capture, Frame
 from .lpips import Lpips
+from .progress import progress
 from .render import Rendering
 
 RenderAt = Callable[[Camera, bool], Rendering]
@@ -116,7 +116,7 @@ def evaluate(
     """
     play = play or (lambda camera: render_at(camera, False))
     views = []
-    for index, name in enumerate(track(capture.val, "evaluating", disable=quiet, transient=True)):
+    for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
         frame = capture.frame(name)
         truth = frame.image.to(device).float() / 255.0
         rendering = render_at(frame.camera.to(device), True)

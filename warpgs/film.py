@@ -12,7 +12,6 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from . import paths, paths_file, pictures, runs
@@ -20,6 +19,7 @@ from .cameras import Camera
 from .data.capture import Capture
 from .evaluate import RenderAt
 from .playback import Player
+from .progress import progress
 from .render import Rendering
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
@@ -40,7 +40,7 @@ class Render:
     """What the camera does: the evaluation views; a fixed camera while time runs; the filming camera's path at a frozen
     moment; the same while time runs; a spiral around the middle view; bullet time around it."""
     keyframes: Path | None = None
-    """JSON file of keyframes to follow instead (docs/export.md)."""
+    """JSON file of keyframes to follow instead (docs/viewing.md)."""
     out: Path | None = None
     """Folder to write into; RUN/render/PATH if left out."""
     view: str | None = None
@@ -152,9 +152,7 @@ class _Film:
     device: torch.device
 
     def pictures(self, cameras: list[Camera], names: list[str]) -> Iterator[np.ndarray]:
-        for camera, name in track(
-            list(zip(cameras, names, strict=True)), "rendering", disable=self.options.quiet, transient=True
-        ):
+        for camera, name in progress(list(zip(cameras, names, strict=True)), "rendering", self.options.quiet):
             yield pictures.to_bytes(self.picture(camera, name))
 
     def picture(self, camera: Camera, name: str) -> Float[Tensor, "H W 3"]:

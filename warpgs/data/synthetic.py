@@ -8,18 +8,17 @@ import json
 import math
 import os
 import shutil
-import sys
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
+from warpgs.progress import progress
 
 from .writing import write_array, write_json, write_png
 
@@ -169,12 +168,11 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
     """
     if scene.num_frames < 2:
         raise ValueError(f"the built-in scene needs at least 2 frames, got {scene.num_frames}")
-    hidden = quiet or not sys.stdout.isatty()
     num_static = len(_static_bodies())
     jobs = [("left", k, 0.0) for k in range(scene.num_frames)]
     jobs += [("right", k, BASELINE) for k in range(0, scene.num_frames, 2)]
     metadata, points = {}, []
-    for side, k, shift in track(jobs, "making the built-in scene", disable=hidden, transient=True):
+    for side, k, shift in progress(jobs, "making the built-in scene", quiet):
         name = f"{side}_{k:06d}"
         shot, camera = picture(k / (scene.num_frames - 1), shift, scene, device)
         static = (shot.bodies < num_static).cpu()

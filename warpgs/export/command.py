@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.progress import track
 
 from warpgs import paths
+from warpgs.progress import progress
 
 from .baking import bake, baked_bytes
 from .cloud import Cloud
@@ -102,8 +102,7 @@ def _export_files(options: Export, moments: Moments, folder: Path) -> str:
     names = {"all": ["scene"], "apart": ["static", "dynamic"]}.get(options.layers, [options.layers])
     suffix, write = WRITERS[options.format]
     num_files, size, largest = 0, 0, 0
-    hidden = options.quiet or len(times) == 1
-    for k, time in enumerate(track(times, "exporting", disable=hidden, transient=True)):
+    for k, time in enumerate(progress(times, "exporting", options.quiet or len(times) == 1)):
         cloud = moments.at(time)
         for name in names:
             rows = cloud.finite if name == "scene" else cloud.finite & (cloud.is_dynamic == (name == "dynamic"))
@@ -127,7 +126,7 @@ def _export_page(options: Export, moments: Moments, folder: Path) -> str:
         )
     capture, origin = find_capture(moments, options.quiet)
     start = opening(moments, capture, options.keys, options.seconds)
-    times = track(paths.evenly(options.keys), "baking", disable=options.quiet, transient=True)
+    times = progress(paths.evenly(options.keys), "baking", options.quiet)
     baked = bake(moments.at, times)
     written = write_page(folder / "scene.html", baked, start)
     num = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {options.keys} key times"

@@ -32,6 +32,8 @@ class Report:
     """Worst and best views to show, so many of each."""
     device: Literal["cuda", "cpu"] | None = None
     """Where to render; CUDA if there is a GPU."""
+    quiet: bool = False
+    """Show no progress."""
 
     def run(self) -> None:
         """Writes the report.
@@ -56,7 +58,7 @@ class Report:
         chosen = [records[k] for k in group]
         worst, best = extremes(chosen, self.views)
         try:
-            strips = [rendered(record, [*worst, *best], self.device) for record in chosen]
+            strips = [rendered(record, [*worst, *best], self.device, self.quiet) for record in chosen]
         except (ValueError, OSError) as error:
             worst, best = extremes(chosen, self.views, set.intersection(*map(available, chosen)))
             reason = " ".join(str(error).split())

@@ -28,7 +28,8 @@ svg .tick { fill: var(--soft); } svg line { stroke: var(--line); }
 svg polyline { fill: none; stroke-width: 1.6; }
 .dot { display: inline-block; width: .75em; height: .75em; border-radius: 50%; margin-right: .4em; }
 .strips { overflow-x: auto; } .strips td { border: 0; padding: .15rem; vertical-align: top; text-align: left; }
-.strips img { display: block; width: 300px; } .strips th { border: 0; padding: .15rem .3rem; }
+.strips th { border: 0; padding: .15rem .3rem; }
+.strips img { display: block; width: clamp(140px, (min(100vw, 1500px) - 5rem) / var(--columns) - .3rem, 300px); }
 """
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -111,7 +112,7 @@ def _charts(records: Sequence[Record]) -> str:
     silent = [record.label for record in records if not record.curves]
     note = f"<p class=note>Without TensorBoard events: {text(', '.join(silent))}</p>" if silent else ""
     by_view = [
-        chart(f"{name} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(records)], dots=True)
+        chart(f"{NAMES[name]} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(records)], dots=True)
         for name in ("psnr", "ssim", "lpips")
     ]
     legend = " ".join(_named(records, k) for k in range(len(records)))
@@ -135,8 +136,10 @@ def _gallery(records: Sequence[Record], gallery: Gallery) -> str:
         if views:
             rows.append(f"<tr><th>{title}: truth</th>{names}</tr>")
         rows += [_gallery_row(records, gallery, view) for view in views]
+    columns = 1 + 2 * len(gallery.runs)
     scale = f"<p class=note>By PSNR. Error: mean over colours, black at 0, bright at {ERROR_RANGE} and above.</p>"
-    return f'<h2>Worst and best views</h2>{scale}{notes}<div class="strips"><table>{"".join(rows)}</table></div>'
+    table = f'<div class="strips" style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
+    return f"<h2>Worst and best views</h2>{scale}{notes}{table}"
 
 
 def _gallery_row(records: Sequence[Record], gallery: Gallery, name: str) -> str:
@@ -159,7 +162,7 @@ def _views(records: Sequence[Record]) -> str:
     parts = ["<h2>Every view</h2>"]
     for number, record in enumerate(records):
         names = dict.fromkeys(name for view in record.views for name, v in view.figures.items() if v is not None)
-        head = "".join(f"<th>{text(name)}</th>" for name in ("view", "time", *names))
+        head = "".join(f"<th>{text(NAMES.get(name, name))}</th>" for name in ("view", "time", *names))
         rows = "".join(
             f"<tr><td class=text>{text(view.name)}</td><td>{view.time:.4f}</td>"
             + "".join(f"<td>{_number(view.figures.get(name))}</td>" for name in names)

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from warpgs import pictures, runs
 from warpgs.playback import Player
+from warpgs.progress import progress
 
 from .record import Record
 
@@ -51,7 +52,7 @@ def available(record: Record) -> set[str]:
     return {view.name for view in record.views if _kept(record.folder, view.name) is not None}
 
 
-def rendered(record: Record, names: Sequence[str], device: Literal["cuda", "cpu"] | None) -> Strips:
+def rendered(record: Record, names: Sequence[str], device: Literal["cuda", "cpu"] | None, quiet: bool) -> Strips:
     """Strips of views, rendered from the newest checkpoint.
 
     Raises:
@@ -60,11 +61,11 @@ def rendered(record: Record, names: Sequence[str], device: Literal["cuda", "cpu"
     """
     config = runs.resolve(dataclasses.replace(record.config, device=device, lpips=None))
     target = torch.device(config.device or "cpu")
-    capture = runs.open_capture(config, quiet=True)
+    capture = runs.open_capture(config, quiet)
     scene, facts = runs.newest_scene(record.folder, config)
     render_at = Player(scene.to(target), config, facts)
     strips = {}
-    for name in names:
+    for name in progress(names, f"pictures of {record.label}", quiet):
         if name not in capture.cameras:
             raise ValueError(f"{capture.name} has no view {name}")
         frame = capture.frame(name)
