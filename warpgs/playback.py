@@ -1,7 +1,7 @@
 """Playing a trained scene: one frame after another, both networks evaluated for each."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,19 @@ from .cameras import Camera
 from .config import RenderSettings, TrainConfig
 from .ops.graph import capture
 from .render import Rendering, render
+from .scene.splats import Splats
 from .scene.split import SplitScene
+
+MOST_RECORDINGS = 4
+"""Sizes of images whose frames are kept recorded: a few browsers may watch one scene."""
+
+
+class _Recording(NamedTuple):
+    """A frame in a CUDA graph, which reads the camera and the time from where they were when it was recorded."""
+
+    camera: Camera
+    time: Float[Tensor, "1"]
+    replay: Callable[[], tuple[Tensor, ...]]
 
 
 class Player:
@@ -27,31 +39,55 @@ class Player:
     """
 
     def __init__(self, scene: SplitScene, config: TrainConfig, facts: dict[str, Any]) -> None:
-        self.scene, self.config = scene, config
-        self._stage = (bool(facts["moving"]), bool(facts["relit"]), int(facts["sh_degree"]))
-        self._size: tuple[int, int] | None = None
-        self._replay: Callable[[], tuple[Tensor, ...]] | None = None
+        self.scene, self.config, self.facts = scene, config, facts
+        self._moving, self._relit, self._degree = bool(facts["moving"]), bool(facts["relit"]), int(facts["sh_degree"])
+        self._recordings: dict[tuple[int, int], _Recording] = {}
+
+    @property
+    def device(self) -> torch.device:
+        return self.scene.static.means.device
+
+    @property
+    def records(self) -> bool:
+        """Whether ``play`` replays a CUDA graph."""
+        return self.device.type == "cuda" and self.config.graph
+
+    def is_recorded(self, size: tuple[int, int]) -> bool:
+        """Whether a frame of this size is recorded already; else the next one takes longer."""
+        return size in self._recordings
+
+    @torch.no_grad()
+    def splats(self, moment: float, residual: bool = True) -> Splats:
+        """The scene at a moment in [0, 1], with or without the appearance residual."""
+        return self._splats(torch.tensor([moment], device=self.device), residual)
 
     def __call__(self, camera: Camera, branches: bool) -> Rendering:
         """Renders through a camera at the camera's time, with or without the images of the branches."""
-        time = torch.tensor([camera.time], device=camera.viewmat.device)
-        return self._render(camera, time, branches)
+        return self._render(camera, torch.tensor([camera.time], device=camera.viewmat.device), branches)
 
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The joint image; on CUDA the same tensor every time, with new values."""
-        if not (camera.viewmat.is_cuda and self.config.graph):
+        if not self.records:
             return self(camera, False).joint.image
-        if self._replay is None or self._size != camera.size:
-            self._size = camera.size
-            self._seen = Camera(camera.viewmat.clone(), camera.K.clone(), *camera.size)
-            self._time = torch.tensor([camera.time], device=camera.viewmat.device)
-            self._replay = capture(lambda: (self._render(self._seen, self._time, False).joint.image,))
-        self._seen.viewmat.copy_(camera.viewmat)
-        self._seen.K.copy_(camera.K)
-        self._time.fill_(camera.time)
-        return self._replay()[0]
+        recording = self._recordings.get(camera.size) or self._record(camera)
+        recording.camera.viewmat.copy_(camera.viewmat)
+        recording.camera.K.copy_(camera.K)
+        recording.time.fill_(camera.time)
+        return recording.replay()[0]
+
+    def _record(self, camera: Camera) -> _Recording:
+        while len(self._recordings) >= MOST_RECORDINGS:
+            del self._recordings[next(iter(self._recordings))]
+        seen = Camera(camera.viewmat.clone(), camera.K.clone(), *camera.size)
+        time = torch.tensor([camera.time], device=camera.viewmat.device)
+        replay = capture(lambda: (self._render(seen, time, False).joint.image,))
+        recording = self._recordings[camera.size] = _Recording(seen, time, replay)
+        return recording
+
+    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
+        return self.scene.splats(time, self._moving, self._relit and residual, self._degree)
 
     @torch.no_grad()
-    def _render(self, camera: Camera, time: Tensor, branches: bool) -> Rendering:
+    def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
         settings = RenderSettings(branches=branches, antialias=self.config.antialias)
-        return render(self.scene.splats(time, *self._stage), camera, settings=settings)
+        return render(self._splats(time), camera, settings=settings)

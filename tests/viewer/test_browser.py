@@ -132,7 +132,7 @@ def test_the_page_asks_nobody_but_the_viewer(visit, viewer):
 def test_the_picture_is_the_scene_through_the_camera(page, session):
     image = seen(page, session)
     wish = session._shown[0]
-    wished = picture(wish.snapshot.splats(wish.moment, True), camera_of(wish.pose, wish.size, wish.moment), wish.layer)
+    wished = picture(wish.player.splats(wish.moment), camera_of(wish.pose, wish.size, wish.moment), wish.layer)
     wished = cv2.resize(wished, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
     assert wished.std() > 10
     assert np.abs(image - wished).mean() < 4.0
@@ -274,14 +274,14 @@ def test_keyframes_can_be_taken_back(page, session):
 
 
 def test_counts_and_speed_are_shown(page, session):
-    scene = session._shown[0].snapshot.scene
+    scene = session._shown[0].player.scene
     page.get_by_text(f"{len(scene.static)} static, {len(scene.dynamic)} dynamic Gaussians").wait_for()
     page.get_by_text("FPS").wait_for()
 
 
 def test_training_is_followed(page, session, run):
     before = seen(page, session)
-    iteration = session._shown[0].snapshot.iteration
+    iteration = session._shown[0].player.facts["iteration"]
     watched.advance(run, 7)
     page.get_by_text(f"iteration {iteration + 7}").wait_for(timeout=20_000)
     assert np.abs(seen(page, session) - before).max() > 0

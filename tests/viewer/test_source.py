@@ -27,9 +27,10 @@ def at_once(monkeypatch):
 
 
 def test_a_run_is_shown_as_its_newest_checkpoint_has_it(run):
-    snapshot = open_source(run, "cpu", False).current()
-    assert snapshot.iteration == 32
-    assert (snapshot.moving, snapshot.relit) == (True, True)
+    player = open_source(run, "cpu", False).current()
+    assert player.facts["iteration"] == 32
+    newest = checkpoint.load(checkpoint.saved(run)[-1]).tensors
+    assert watched.same(player.scene.static.means, newest["scene.static.means"])
 
 
 def test_a_finished_run_is_not_looked_at_again(run, at_once):
@@ -41,9 +42,9 @@ def test_a_finished_run_is_not_looked_at_again(run, at_once):
 
 def test_a_newer_checkpoint_is_followed(run, at_once):
     source = open_source(run, "cpu", True)
-    assert source.current().iteration == 32
+    assert source.current().facts["iteration"] == 32
     watched.advance(run)
-    assert source.current().iteration == 33
+    assert source.current().facts["iteration"] == 33
 
 
 def test_a_checkpoint_that_did_not_change_is_not_read_again(run, at_once):
@@ -81,7 +82,7 @@ def test_a_followed_run_may_be_without_a_checkpoint_yet(run, at_once):
     assert source.current() is None
     assert source.note == "waiting for the first checkpoint"
     shutil.move(run / "away", run / "checkpoints")
-    assert source.current().iteration == 32
+    assert source.current().facts["iteration"] == 32
     assert source.note == ""
 
 
@@ -121,8 +122,8 @@ def test_a_damaged_run_is_refused(run):
 
 
 def test_the_residual_can_be_left_out(run):
-    snapshot = open_source(run, "cpu", False).current()
-    plain, relit = (snapshot.splats(0.5, residual) for residual in (False, True))
-    num = len(snapshot.scene.static)
-    assert watched.same(plain.sh[:num], snapshot.scene.static.sh)
-    assert not watched.same(relit.sh[:num], snapshot.scene.static.sh)
+    player = open_source(run, "cpu", False).current()
+    plain, relit = (player.splats(0.5, residual) for residual in (False, True))
+    num = len(player.scene.static)
+    assert watched.same(plain.sh[:num], player.scene.static.sh)
+    assert not watched.same(relit.sh[:num], player.scene.static.sh)

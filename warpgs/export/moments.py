@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Int64
 
 from warpgs import runs
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.playback import Player
 from warpgs.render import render
 from warpgs.scene.split import SplitScene
 
@@ -49,14 +49,11 @@ class Moments:
         config = runs.load_config(folder)
         config = dataclasses.replace(config, device="cpu", data=data or config.data)
         scene, facts = runs.newest_scene(folder, config)
-        return Moments(scene, config, {name: facts[name] for name in ("moving", "relit", "sh_degree", "iteration")})
+        return Moments(scene, config, facts)
 
     def at(self, time: float) -> Cloud:
         """The Gaussians at a moment in [0, 1], in the same rows at every moment."""
-        with torch.no_grad():
-            moving, relit = bool(self.facts["moving"]), bool(self.facts["relit"])
-            splats = self.scene.splats(torch.tensor([time]), moving, relit, int(self.facts["sh_degree"]))
-        cloud = Cloud.of_splats(splats)
+        cloud = Cloud.of_splats(Player(self.scene, self.config, self.facts).splats(time))
         return cloud if self.rows is None else cloud.select(self.rows)
 
     def lightest_left_out(self, most: int, cameras: Sequence[Camera]) -> "Moments":

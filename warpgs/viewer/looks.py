@@ -3,7 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+import torch
 import viser
+
+from warpgs.scene.split import SplitScene
 
 from .source import Source
 from .training_cameras import TrainingCameras
@@ -43,9 +46,15 @@ def first_look(source: Source, training: TrainingCameras | None) -> Look:
     """The middle training camera; without any, a look at the middle of the scene."""
     if training is not None:
         return look_through(training, len(training.views) // 2)
-    snapshot = None if source.follow else source.current()
-    center = np.zeros(3) if snapshot is None else snapshot.center.double().numpy()
+    player = None if source.follow else source.current()
+    center = np.zeros(3) if player is None else _middle(player.scene)
     return Look(center + AWAY, center, UP, FOV)
+
+
+def _middle(scene: SplitScene) -> np.ndarray:
+    """Median of the Gaussians' centres; zero without Gaussians."""
+    means = torch.cat([scene.static.means, scene.dynamic.means]).detach()
+    return means.median(0).values.double().cpu().numpy() if len(means) else np.zeros(3)
 
 
 def aim(camera: viser.CameraHandle, look: Look) -> None:
