@@ -8,11 +8,13 @@ import pickle
 import resource
 import struct
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from tests import tiny
+from tests.export.scenes import refusal
 from warpgs import checkpoint
 from warpgs.scene.split import SplitScene
 
@@ -196,7 +198,7 @@ def test_a_file_of_another_program_is_refused(tmp_path):
         checkpoint.load(tmp_path / "a.safetensors")
 
 
-@pytest.mark.parametrize("facts", [None, "", "{", "[1, 2]", "3", '"moving"'])
+@pytest.mark.parametrize("facts", [None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
 def test_facts_that_are_no_object_are_damage(tmp_path, facts):
     path = write_raw(tmp_path / "a.safetensors", metadata(facts=facts))
     with pytest.raises(ValueError, match="is damaged"):
@@ -206,6 +208,18 @@ def test_facts_that_are_no_object_are_damage(tmp_path, facts):
 def test_a_fact_that_is_missing_is_named_with_the_file(path):
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no sh_degree"):
         checkpoint.load(path).facts["sh_degree"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("moving", "yes"), ("relit", 1), ("sh_degree", 3), ("sh_degree", 0.5), ("sh_degree", []), ("iteration", -1)],
+)
+def test_facts_that_no_stage_has_are_damage(path, name, value):
+    loaded = checkpoint.load(path)
+    facts = {"moving": True, "relit": True, "sh_degree": 2, "iteration": 5, name: value}
+    checkpoint.save(path, loaded.tensors, facts)
+    with pytest.raises(ValueError, match=f"{path} is damaged: {name} can't be"):
+        checkpoint.load(path).check_stage(2)
 
 
 def test_a_tensor_that_is_missing_is_named_with_the_file(path):
@@ -243,6 +257,31 @@ def test_a_tensor_larger_than_the_file_is_damage(tmp_path):
     path = write_raw(tmp_path / "a.safetensors", {**metadata(), "scene.static.means": entry}, b"\0" * 12)
     with pytest.raises(ValueError, match="is damaged"):
         checkpoint.load(path)
+
+
+def read_whole(path):
+    """All that is read of a checkpoint before its scene is shown."""
+    loaded = checkpoint.load(path)
+    loaded.check_stage(tiny.MODEL.sh_degree)
+    checkpoint.load_scene(loaded, tiny.MODEL, path)
+
+
+def test_a_damaged_checkpoint_is_read_or_refused_in_a_line_but_never_anything_else(tmp_path):
+    path = checkpoint.path_of(tmp_path, 3)
+    checkpoint.save(path, tensors_of(scene()), {**FACTS, "relit": True, "sh_degree": 1})
+    read_whole(path)
+    whole, random = path.read_bytes(), np.random.default_rng(0)
+    header = 8 + struct.unpack("<Q", whole[:8])[0]
+    refused = 0
+    for _ in range(300):
+        data = bytearray(whole[: random.integers(len(whole))] if random.random() < 0.2 else whole)
+        for place in random.integers(0, min(header, len(data)) if random.random() < 0.8 else len(data), 3):
+            data[place] = random.choice([random.integers(256), *b'0123456789"[]{},:-'])
+        path.write_bytes(data)
+        said = refusal(read_whole, path)
+        refused += said is not None
+        assert said is None or str(path) in said
+    assert refused > 200
 
 
 def test_rows_of_no_width_make_no_gaussians(tmp_path):

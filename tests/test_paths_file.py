@@ -2,9 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 
+from tests.export.scenes import refusal
 from tests.test_paths import capture, is_rigid, positions
 from warpgs.paths_file import read_path
 
@@ -155,3 +157,19 @@ def test_a_huge_file_is_not_read(path):
     path.write_text(" " * ((1 << 20) + 1))
     with pytest.raises(ValueError, match="is larger than"):
         read_path(path, FILM, 3)
+
+
+def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(path):
+    saved = {**SAVED, "K": FILM.cameras["0"].K.tolist(), "width": 32, "height": 24}
+    text = json.dumps({"up": [0, -1, 0], "keyframes": [{"view": "0", "time": 0.0}, PLACED, saved]}).encode()
+    path.write_bytes(text)
+    assert len(read_path(path, FILM, 3)) == 3
+    random = np.random.default_rng(0)
+    for _ in range(600):
+        data = bytearray(text)
+        for place in random.integers(0, len(data), random.integers(1, 4)):
+            data[place] = random.choice([random.integers(256), *b'0123456789eE"[]{},:-.'])
+        path.write_bytes(data[: random.integers(len(data))] if random.random() < 0.2 else data)
+        said = refusal(lambda path: read_path(path, FILM, 3), path)
+        assert said is None or (str(path) in said and "\n" not in said)
+        assert said is not None or all(bool(c.viewmat.isfinite().all()) for c in read_path(path, FILM, 3))

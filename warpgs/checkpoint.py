@@ -48,7 +48,7 @@ class Checkpoint:
             )
         return tensor
 
-    def number(self, name: str) -> float:
+    def number(self, name: str) -> int | float:
         """A fact that is a number, 0 or more.
 
         Raises:
@@ -58,6 +58,32 @@ class Checkpoint:
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
             raise ValueError(f"{self.path} is damaged: {name} can't be {value!r}")
         return value
+
+    def flag(self, name: str) -> bool:
+        """A fact that is true or false.
+
+        Raises:
+            ValueError: If it is missing or something else.
+        """
+        value = self.facts[name]
+        if not isinstance(value, bool):
+            raise ValueError(f"{self.path} is damaged: {name} can't be {value!r}")
+        return value
+
+    def check_stage(self, sh_degree: int) -> None:
+        """Checks the facts that say how the scene is shown.
+
+        Args:
+            sh_degree: Highest degree that the scene has.
+
+        Raises:
+            ValueError: If one is missing or something else.
+        """
+        self.flag("moving")
+        self.flag("relit")
+        self.number("iteration")
+        if self.number("sh_degree") not in range(sh_degree + 1):
+            raise ValueError(f"{self.path} is damaged: sh_degree can't be {self.facts['sh_degree']!r}")
 
 
 def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
@@ -97,7 +123,7 @@ def load(path: Path) -> Checkpoint:
             return Checkpoint(path, _Parts(path, tensors), _Parts(path, json.loads(metadata["facts"])))
     except FileNotFoundError as error:
         raise ValueError(f"{path} does not exist") from error
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 

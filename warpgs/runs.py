@@ -83,7 +83,7 @@ def load_config(folder: Path) -> TrainConfig:
         values = json.loads(path.read_text())
     except (FileNotFoundError, NotADirectoryError) as error:
         raise ValueError(f"{folder} is no run folder: it has no config.json") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     config = dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
     try:
@@ -133,6 +133,7 @@ def newest_scene(folder: Path, config: TrainConfig) -> tuple[SplitScene, dict[st
     if not saved:
         raise ValueError(f"{folder} has no checkpoint yet")
     loaded = checkpoint.load(saved[-1])
+    loaded.check_stage(config.model.sh_degree)
     return checkpoint.load_scene(loaded, config.model, saved[-1]), loaded.facts
 
 
