@@ -20,6 +20,14 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory) -> Path:
+    """A run folder, trained once for all tests, which leave it as it is; its capture is ``../capture``."""
+    from tests import tiny  # after the import hook
+
+    return tiny.finished(tmp_path_factory.mktemp("finished"))
+
+
 @pytest.fixture
 def contracts_off():
     """Turns the run-time checks of annotations off, so that the package's own checks have the word."""

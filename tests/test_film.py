@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -12,7 +13,6 @@ from tests import tiny
 from tests.test_pictures import frames_of
 from warpgs import film, pictures, runs
 from warpgs.cli import main
-from warpgs.data.nerfies import load_capture
 from warpgs.film import Render, render_run
 from warpgs.playback import Player
 
@@ -21,23 +21,13 @@ quickly = tiny.quickly
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
+def run(finished_run, tmp_path_factory):
+    return shutil.copytree(finished_run, tmp_path_factory.mktemp("runs") / "run")
 
 
 @pytest.fixture(scope="module")
-def capture(data):
-    return load_capture(data)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, data):
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    runs.create(folder, dataclasses.replace(tiny.CONFIG, data=data))
-    trainer = tiny.trainer(data, folder)
-    tiny.train(trainer)
-    trainer.save()
-    return folder
+def capture(run):
+    return runs.open_capture(runs.load_config(run))
 
 
 @pytest.fixture(scope="module")

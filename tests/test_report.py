@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from tests import tiny
 from tests.tiny import quickly  # noqa: F401
 from warpgs import runs
 from warpgs.cli import main
@@ -30,18 +29,13 @@ EVIL = "<img src=x onerror=alert(1)>&\"'"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, quickly):  # noqa: F811
-    """A run that was trained and evaluated; its capture is beside it."""
-    folder = tmp_path_factory.mktemp("made")
-    data = tiny.write(folder / "capture")
-    capture = load_capture(data)
-    config = dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run")
-    runs.create(folder / "run", config)
-    tiny.train(tiny.trainer(data, folder / "run", config))
+def made(finished_run, tmp_path_factory, quickly):  # noqa: F811
+    """A run that was evaluated, too."""
+    run = shutil.copytree(finished_run, tmp_path_factory.mktemp("made") / "run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runs, "VIDEO_FRAMES", 2)
-        runs.evaluate_run(folder / "run", capture, device="cpu", quiet=True)
-    return folder / "run"
+        runs.evaluate_run(run, device="cpu", quiet=True)
+    return run
 
 
 @pytest.fixture

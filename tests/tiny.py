@@ -1,6 +1,8 @@
 """Runs that take less than a second: a small built-in capture and small networks, through all stages."""
 
+import dataclasses
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
 
 import jaxtyping
@@ -8,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from warpgs import checkpoint
+from warpgs import checkpoint, runs
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
 from warpgs.data.nerfies import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
@@ -49,8 +51,8 @@ CONFIG = TrainConfig(
 )
 
 
-@pytest.fixture(scope="module")
-def quickly():
+@contextmanager
+def in_haste():
     """Without the checks of annotations, and on one thread: both cost more than they bring in runs this small."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -58,6 +60,12 @@ def quickly():
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def quickly():
+    with in_haste():
+        yield
 
 
 def write(folder: Path) -> Path:
@@ -72,6 +80,16 @@ def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
 def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
     with Logbook(trainer.run / "events", trainer.protocol.num_iterations, trainer.iteration) as logbook:
         return trainer.train(logbook, interrupt)
+
+
+def finished(folder: Path) -> Path:
+    """A run that went through all stages; its capture is beside it."""
+    data = write(folder / "capture")
+    config = dataclasses.replace(CONFIG, data=data, out=folder / "run")
+    runs.create(folder / "run", config)
+    with in_haste():
+        train(trainer(data, folder / "run", config))
+    return folder / "run"
 
 
 class StopWhen(Interrupt):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 
@@ -23,18 +24,13 @@ quickly = tiny.quickly
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
+def run(finished_run, tmp_path_factory):
+    return shutil.copytree(finished_run, tmp_path_factory.mktemp("runs") / "the run")
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, data):
-    folder = tmp_path_factory.mktemp("runs") / "the run"
-    runs.create(folder, dataclasses.replace(tiny.CONFIG, data=data))
-    trainer = tiny.trainer(data, folder)
-    tiny.train(trainer)
-    trainer.save()
-    return folder
+def data(run):
+    return runs.load_config(run).data
 
 
 def export(run, tmp_path, **options):

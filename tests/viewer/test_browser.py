@@ -55,8 +55,8 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return watched.make(tmp_path_factory.mktemp("made"))
+def run(finished_run, tmp_path_factory):
+    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture(scope="module")
@@ -230,7 +230,9 @@ def test_looking_through_a_training_camera_is_its_pose_and_its_time(page, sessio
     until(lambda: session.panel.time.value == pytest.approx(view.time))
     settle(session)
     assert session._pose().position == pytest.approx(view.pose.position, abs=1e-4)
-    assert session._pose().fov == pytest.approx(view.pose.fov)
+    width, height = session._canvas()
+    across = height * view.aspect * np.tan(view.pose.fov / 2) / np.tan(session._pose().fov / 2)
+    assert across == pytest.approx(min(width, height * view.aspect))  # the whole picture of the camera, and no more
     assert np.abs(np.array(session._pose().wxyz) @ np.array(view.pose.wxyz)) == pytest.approx(1.0, abs=1e-6)
 
 

@@ -18,8 +18,8 @@ from warpgs.viewer.training_cameras import MOST_FRUSTUMS
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return watched.make(tmp_path_factory.mktemp("made"))
+def run(finished_run, tmp_path_factory):
+    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from warpgs.viewer.source import open_source
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return watched.make(tmp_path_factory.mktemp("made"))
+def made(finished_run, tmp_path_factory):
+    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

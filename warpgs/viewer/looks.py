@@ -1,5 +1,6 @@
 """Where a browser's camera looks, and what its mouse turns around."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -36,10 +37,18 @@ class Look(NamedTuple):
     fov: float
 
 
-def look_through(training: TrainingCameras, number: int) -> Look:
-    """A training camera, but for its roll."""
-    pose = training.views[number].pose
-    return Look(np.array(pose.position), training.ahead(number), training.up, pose.fov)
+def look_through(training: TrainingCameras, number: int, aspect: float = math.inf) -> Look:
+    """A training camera, but for its roll.
+
+    Args:
+        training: All of them.
+        number: Which.
+        aspect: Width over height of the canvas; if that is narrower than the camera's picture, the field of view is
+            as much larger as it takes to have the whole picture in it.
+    """
+    view = training.views[number]
+    widened = max(1.0, view.aspect / aspect) * math.tan(0.5 * view.pose.fov)
+    return Look(np.array(view.pose.position), training.ahead(number), training.up, 2.0 * math.atan(widened))
 
 
 def first_look(source: Source, training: TrainingCameras | None) -> Look:

@@ -1,5 +1,6 @@
 """The keyframes that one browser collects."""
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +29,7 @@ class PathEditor:
         self, scene: viser.SceneApi, panel: Panel, run: Path, look: Callable[[], Camera], scale: float
     ) -> None:
         self._scene, self._panel, self._run, self._look, self._scale = scene, panel, run, look, scale
+        self._changing = threading.Lock()  # every click comes on a thread of its own
         self.cameras: list[Camera] = []
         panel.add_keyframe.on_click(lambda _: self._add())
         panel.remove_keyframe.on_click(lambda _: self._remove())
@@ -37,16 +39,18 @@ class PathEditor:
         seen = self._look()
         pose = pose_of(seen)
         even = (max(2, seen.width & ~1), max(2, seen.height & ~1))  # video codecs want even sizes
-        size = self.cameras[0].size if self.cameras else even  # a film has one
-        self.cameras.append(camera_of(pose, size, seen.time))
-        add_frustum(self._scene, self._name(), pose, size[0] / size[1], self._scale, ORANGE)
-        self._panel.path_note.content = self._count()
+        with self._changing:
+            size = self.cameras[0].size if self.cameras else even  # a film has one
+            self.cameras.append(camera_of(pose, size, seen.time))
+            add_frustum(self._scene, self._name(), pose, size[0] / size[1], self._scale, ORANGE)
+            self._panel.path_note.content = self._count()
 
     def _remove(self) -> None:
-        if self.cameras:
-            self._scene.remove_by_name(self._name())
-            self.cameras.pop()
-        self._panel.path_note.content = self._count()
+        with self._changing:
+            if self.cameras:
+                self._scene.remove_by_name(self._name())
+                self.cameras.pop()
+            self._panel.path_note.content = self._count()
 
     def _save(self) -> None:
         try:

@@ -133,8 +133,9 @@ class Session:
         """Looks through the training camera that the slider is at, at its time."""
         number = min(int(self.panel.view.value), len(training.views)) - 1
         view, camera = training.views[number], self._client.camera
+        width, height = self._canvas()
         with self._client.atomic():
-            aim(camera, look_through(training, number))
+            aim(camera, look_through(training, number, width / height))
             camera.wxyz = np.array(view.pose.wxyz)
         put(self.panel.time, view.time)
         image = training.picture(number)
