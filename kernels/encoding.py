@@ -1,9 +1,11 @@
 """Sinusoidal encoding of positions and time (paper Eq. 6).
 
-    γ(p) = (p, sin(2⁰ π p) … sin(2ᴸ⁻¹ π p), cos(2⁰ π p) … cos(2ᴸ⁻¹ π p)) with p = (value - center) / half_size
+    γ(p) = (p, sin(2⁰ π p) … sin(2ᴸ⁻¹ π p), cos(2⁰ π p) … cos(2ᴸ⁻¹ π p)) with p = (mean - center) / half_size
 
-Columns: the D values, then D L sines, a value's frequencies together, then the cosines in the same order. It has no
-adjoint: positions get no gradient from the networks, as in Deformable-3DGS, and time is given.
+Columns: the D values, then D L sines, a value's frequencies together, then the cosines in the same order; D is 3 for
+positions, then 1 for time. Whole periods are taken off 2ᵏ p before π comes in, and both are exact: every frequency is
+as precise as the first. It has no adjoint: positions get no gradient from the networks, as in Deformable-3DGS, and time
+is given.
 """
 
 import functools
@@ -14,35 +16,44 @@ import warp as wp
 
 @functools.cache
 def make_encode(half: bool) -> wp.Kernel:
-    """Kernel that writes one number of an encoding, one thread each, in half or single precision."""
+    """Kernel that writes the columns of x, y, z or t of a row, one thread each, in half or single precision."""
     number = wp.float16 if half else wp.float32
 
     @wp.kernel(enable_backward=False, module="unique")
     def encode(
         first: int,
-        values: wp.array2d[float],
+        means: wp.array2d[float],
+        time: wp.array[float],
         center: wp.array[float],
         half_size: wp.array[float],
-        bands: int,
+        position_bands: int,
+        time_bands: int,
+        room: int,
         encoding: wp.array2d[number],
     ):
         thread = first + wp.tid()
-        columns = encoding.shape[1]
-        row = thread // columns
-        column = thread - row * columns
-        dims = values.shape[1]
-        axis = column
-        if column >= dims:
-            axis = ((column - dims) % (dims * bands)) // bands
-        p = (values[row, axis] - center[axis]) / half_size[axis]
-        result = p
-        if column >= dims:
-            band = (column - dims) % bands
-            angle = p * wp.static(math.pi) * float(1 << band)
-            if column < dims + dims * bands:
-                result = wp.sin(angle)
-            else:
-                result = wp.cos(angle)
-        encoding[row, column] = number(result)
+        row = thread >> 2
+        axis = thread & 3
+        dims = 3
+        bands = position_bands
+        begin = room
+        p = time[0]
+        if axis < 3:
+            p = (means[row, axis] - center[axis]) / half_size[axis]
+        else:
+            axis = 0
+            dims = 1
+            bands = time_bands
+            begin = room + 3 + 6 * position_bands
+            for column in range(begin + 1 + 2 * bands, encoding.shape[1]):
+                encoding[row, column] = number(0.0)
+        encoding[row, begin + axis] = number(p)
+        column = begin + dims + axis * bands
+        for _ in range(bands):
+            angle = wp.static(math.pi) * (p - 2.0 * wp.round(0.5 * p))
+            encoding[row, column] = number(wp.sin(angle))
+            encoding[row, column + dims * bands] = number(wp.cos(angle))
+            p *= 2.0
+            column += 1
 
     return encode

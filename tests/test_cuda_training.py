@@ -76,7 +76,8 @@ def test_half_precision_loses_little_whatever_the_size_of_gradients(num, scale):
         weights, biases = layers([64, 64, 64, 64, 10], 21, skip=2)
         kind = torch.float32 if device == "cuda" else dtype
         parameters = [p.to(device, kind).requires_grad_() for p in (*weights, *biases)]
-        outputs = perceptron(encoding.to(device, dtype), parameters[:5], parameters[5:], skip=2)
+        inputs = torch.nn.functional.pad(encoding.to(device, dtype), (64, 3))  # room before, padding behind
+        outputs = perceptron(inputs, parameters[:5], parameters[5:], skip=2)
         outputs.backward(cotangent.to(device, kind))
         results.append([outputs.detach().cpu().double(), *(p.grad.cpu().double() for p in parameters)])
     for expected, actual in zip(*results, strict=True):

@@ -1,6 +1,5 @@
 """The trunk that both networks share, and the two networks: deformation (Eq. 10) and appearance (Eq. 8)."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -21,21 +20,18 @@ class Trunk(nn.Module):
 
     center: Tensor
     half_size: Tensor
-    no_time: Tensor
-    all_time: Tensor
 
     def __init__(
         self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"], outputs: int
     ) -> None:
         super().__init__()
-        self.position_bands, self.time_bands = config.position_bands, config.time_bands
+        self.bands = (config.position_bands, config.time_bands)
         self.skip = config.skip if config.skip < config.depth else 0
+        self.room = config.width if self.skip else 0
         self.uses_half = config.half
         self.register_buffer("center", center.clone())
         self.register_buffer("half_size", half_size.clone())
-        self.register_buffer("no_time", torch.zeros(1), persistent=False)
-        self.register_buffer("all_time", torch.ones(1), persistent=False)
-        encoded = encoded_size(3, config.position_bands) + encoded_size(1, config.time_bands)
+        encoded = encoded_size(*self.bands)
         sizes = [encoded] + [config.width + (encoded if k == config.skip else 0) for k in range(1, config.depth)]
         self.layers = nn.ModuleList([nn.Linear(size, config.width) for size in sizes])
         self.head = nn.Linear(config.width, outputs)
@@ -45,18 +41,9 @@ class Trunk(nn.Module):
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N outputs"]:
         """Evaluates the network at N positions and one time. No gradient flows to the positions."""
         half = self.uses_half and means.is_cuda
-        position = encode(means.detach(), self.position_bands, self.center, self.half_size, half)
-        moment = encode(time[:, None], self.time_bands, self.no_time, self.all_time)[0]
-        weights, biases = [], []
-        for index, layer in enumerate([*self.layers, self.head]):
-            weight, bias = layer.weight, layer.bias
-            if index in (0, self.skip):
-                # Time is the same for all Gaussians: its share of the product is a part of the bias.
-                weight, of_time = weight.split([weight.shape[1] - len(moment), len(moment)], 1)
-                bias = bias + of_time @ moment
-            weights.append(weight)
-            biases.append(bias)
-        return perceptron(position, weights, biases, self.skip)
+        inputs = encode(means.detach(), time, self.bands, self.center, self.half_size, self.room, half)
+        layers = [*self.layers, self.head]
+        return perceptron(inputs, [layer.weight for layer in layers], [layer.bias for layer in layers], self.skip)
 
 
 class DeformationField(nn.Module):

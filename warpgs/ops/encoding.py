@@ -9,42 +9,51 @@ from warpgs.kernels import encoding as kernels
 from .contracts import check_same_device, check_tensor
 from .tape import Run
 
+ALIGNMENT = 8
+"""Rows are padded with zeros to multiples of this: tensor cores want rows of 16 bytes."""
+
 
 def encode(
-    values: Float[Tensor, "N D"],
-    bands: int,
-    center: Float[Tensor, " D"],
-    half_size: Float[Tensor, " D"],
+    means: Float[Tensor, "N 3"],
+    time: Float[Tensor, "1"],
+    bands: tuple[int, int],
+    center: Float[Tensor, "3"],
+    half_size: Float[Tensor, "3"],
+    room: int = 0,
     half: bool = False,
-) -> Float[Tensor, "N D*(1+2*{bands})"]:
-    """γ(p) of paper Eq. 6 for p = (values − center) / half_size. No gradient flows back.
+) -> Float[Tensor, "N columns"]:
+    """[γ(p), γ(t)] of paper Eq. 6 for p = (means − center) / half_size. No gradient flows back.
 
     Args:
-        values: [N, D] coordinates.
-        bands: Number of frequencies L; the lowest has wavelength 2 in p.
-        center, half_size: [D] box that becomes [-1, 1].
+        means: [N, 3] positions.
+        time: [1] one moment for all of them, in [0, 1].
+        bands: Numbers of frequencies L of positions and of time; the lowest has wavelength 2.
+        center, half_size: [3] box that becomes [-1, 1].
+        room: Columns to leave before the encoding, unset.
         half: Whether to write half precision.
 
     Returns:
-        [N, D (1 + 2 L)]: the values, then sin(2ᵏ π p) and cos(2ᵏ π p) for k = 0 … L − 1.
+        [N, room + columns]: p, then sin(2ᵏ π p), then cos(2ᵏ π p) for k = 0 … L − 1; t alike; then zeros.
 
     Raises:
         ValueError: On a wrong shape, dtype or device.
     """
     sizes: dict[str, int] = {}
-    check_tensor("values", values, ("N", "D"), sizes)
-    check_tensor("center", center, ("D",), sizes)
-    check_tensor("half_size", half_size, ("D",), sizes)
-    check_same_device({"values": values, "center": center, "half_size": half_size})
+    check_tensor("means", means, ("N", 3), sizes)
+    check_tensor("time", time, (1,), sizes)
+    check_tensor("center", center, (3,), sizes)
+    check_tensor("half_size", half_size, (3,), sizes)
+    check_same_device({"means": means, "time": time, "center": center, "half_size": half_size})
     with torch.no_grad():
-        run = Run(values.device, [])
-        encoding = run.empty(
-            len(values), encoded_size(values.shape[1], bands), dtype=torch.float16 if half else torch.float32
-        )
-        run.launch(kernels.make_encode(half), encoding.numel(), values, center, half_size, bands, encoding)
+        run = Run(means.device, [])
+        columns = encoded_size(*bands)
+        columns += -columns % ALIGNMENT
+        encoding = run.empty(len(means), room + columns, dtype=torch.float16 if half else torch.float32)
+        arguments = (means, time, center, half_size, *bands, room, encoding)
+        run.launch(kernels.make_encode(half), 4 * len(means), *arguments)
     return encoding
 
 
-def encoded_size(dims: int, bands: int) -> int:
-    """Columns that ``encode`` makes of ``dims`` coordinates."""
-    return dims * (1 + 2 * bands)
+def encoded_size(position_bands: int, time_bands: int) -> int:
+    """Columns of ``encode`` before the zeros."""
+    return 3 * (1 + 2 * position_bands) + 1 + 2 * time_bands
