@@ -32,7 +32,8 @@ def test_the_encoding_is_that_of_the_reference():
     positions = reference((means.double() - center) / half_size, 6)
     moments = reference(TIME.double()[:, None], 4).expand(50, -1)
     encoded = encode(means, TIME, (6, 4), center, half_size)[:, : encoded_size(6, 4)]
-    assert error(encoded, torch.cat([positions, moments], 1)) < 1e-6
+    # p is rounded before the highest frequency multiplies its error by 32 π.
+    assert error(encoded, torch.cat([positions, moments], 1)) < 2e-5
 
 
 @pytest.mark.parametrize("bands", [(1, 2), (4, 1), (10, 10)])
