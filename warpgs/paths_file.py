@@ -1,7 +1,7 @@
 """Camera paths from a JSON file of keyframes.
 
     {"up": [0, -1, 0], "keyframes": [
-        {"view": "000012", "time": 0.0},
+        {"view": "000012", "time": 0.0, "at": 0},
         {"position": [0.1, 0, -1], "target": [0, 0, 0], "time": 0.5, "focal": 600, "at": 2.5},
         {"view": "000040", "time": 1.0, "at": 4}]}
 
