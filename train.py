@@ -10,8 +10,10 @@ import tyro
 
 from warpgs import runs
 from warpgs.config import PRESETS, TrainConfig, scaled
+from warpgs.data.capture import Capture
 from warpgs.interrupt import Interrupt
 from warpgs.logbook import Logbook
+from warpgs.prepare.check import quick_findings
 from warpgs.trainer import Trainer
 
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
@@ -36,18 +38,28 @@ def parse(arguments: Sequence[str]) -> TrainConfig:
     return tyro.cli(TrainConfig, default=PRESETS[preset], args=list(arguments), prog="train.py")
 
 
+def checked(capture: Capture) -> Capture:
+    """The capture, after its warnings; one that would be trained on in vain ends the program with exit code 1."""
+    findings = quick_findings(capture)
+    for finding in findings:
+        print(finding, file=sys.stderr if finding.level == "error" else sys.stdout)
+    if any(finding.level == "error" for finding in findings):
+        raise SystemExit(1)
+    return capture
+
+
 def start(config: TrainConfig) -> Trainer:
     """A trainer at the start of a new run, or where an earlier run stopped."""
     if config.resume is None:
         config = scaled(runs.resolve(config))
-        capture = runs.open_capture(config)
+        capture = checked(runs.open_capture(config))
         trainer = Trainer(config, capture, runs.new_folder(config, capture))
         runs.create(trainer.run, config)  # now that nothing has been refused
         return trainer
     folder, device = config.resume, config.device
     config = runs.load_config(folder)
     config = runs.resolve(dataclasses.replace(config, device=device or config.device))
-    trainer = Trainer(config, runs.open_capture(config), folder)
+    trainer = Trainer(config, checked(runs.open_capture(config)), folder)
     trainer.restore_newest()
     return trainer
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from warpgs import checkpoint
@@ -105,6 +106,32 @@ def test_a_damaged_picture_is_one_line_that_names_it(tmp_path):
     path = data / "rgb/1x/left_000003.png"
     path.write_bytes(path.read_bytes()[:100])
     assert "left_000003.png" in refused("--data", data, *QUICK, "--iterations", 40, "--out", tmp_path / "run")
+
+
+def look_away(data):
+    """Turns every camera around its vertical axis: none sees the points any more."""
+    for path in (data / "camera").iterdir():
+        facts = json.loads(path.read_text())
+        facts["orientation"] = (np.diag([-1.0, 1.0, -1.0]) @ np.array(facts["orientation"])).tolist()
+        path.write_text(json.dumps(facts))
+
+
+def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
+    data = builtin_capture(tmp_path, SMALL, quiet=True)
+    look_away(data)
+    run = train("--data", data, *QUICK, "--iterations", 40, "--out", tmp_path / "run")
+    assert run.returncode == 1
+    assert [line for line in run.stderr.splitlines() if line.startswith("error:")] == [
+        "error: the cameras do not see the points: orientation, position or scene.json's center and scale are wrong"
+    ]
+    assert "Traceback" not in run.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_training_would_suffer_from_is_told_and_what_is_well_is_not(finished):
+    run, _ = finished
+    warnings = [line for line in run.stdout.splitlines() if line.startswith("warning:")]
+    assert warnings == ["warning: 6 training frames are very few"]
 
 
 def test_an_existing_run_is_not_overwritten(data, finished):

@@ -106,14 +106,12 @@ def check_capture(root: Path, dataset: Dataset | None = None, factor: int | None
 
 
 def quick_findings(capture: Capture) -> list[Finding]:
-    """What can be told of an opened capture at once, from its cameras, points and three frames.
+    """The errors and warnings that cameras, points and three frames of an opened capture tell, in less than a second.
 
-    Frames that can't be read are left for training to complain about.
+    Raises:
+        ValueError: If one of the three frames can't be read.
     """
-    try:
-        findings = [*_counts(capture), *_geometry(capture, QUICK_SAMPLES)]
-    except ValueError as error:
-        return [Finding("error", "files", str(error))]
+    findings = [*_counts(capture), *_geometry(capture, QUICK_SAMPLES)]
     return [f for f in findings if f.level != "note"]
 
 
