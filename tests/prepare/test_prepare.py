@@ -1,5 +1,6 @@
 """From pictures to a capture, whole, and what stops it."""
 
+import errno
 import json
 
 import cv2
@@ -168,4 +169,36 @@ def test_a_full_disk_is_told_before_work_starts(shots, tmp_path, monkeypatch):
 
     monkeypatch.setattr("shutil.disk_usage", lambda path: Usage)
     with pytest.raises(OSError, match="of disk are needed, 5 MB are free"):
+        prepare(shots, tmp_path / "made")
+
+
+def test_a_disk_that_fills_up_is_told_with_how_to_go_on(shots, tmp_path, monkeypatch):
+    def fill_up(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("warpgs.prepare.pipeline.take_frames", fill_up)
+    with pytest.raises(OSError, match=r"the disk is full; make room and run the same command again$"):
+        prepare(shots, tmp_path / "made")
+
+
+def test_pictures_that_share_nothing_are_refused_with_advice(tmp_path):
+    unrelated = [filmed.texture(k, filmed.COLORS[0], 256, (20, 60)) for k in range(6)]
+    with pytest.raises(ValueError, match="no two frames show enough of the same static things"):
+        prepare(filmed.write_folder(tmp_path / "unrelated", unrelated), tmp_path / "made")
+
+
+def test_masks_of_everything_are_refused_with_advice(shots, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for path in shots.iterdir():
+        cv2.imwrite(str(tmp_path / "masks" / path.name), np.zeros(filmed.SIZE[::-1], np.uint8))
+    with pytest.raises(ValueError, match=r"hardly any texture where nothing moves: 0 features .* check the masks"):
+        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"))
+
+
+def test_where_nearly_everything_seems_to_move_masks_are_asked_for(tmp_path, monkeypatch):
+    shots = filmed.write_folder(tmp_path / "shots", filmed.film(10)[0])
+    monkeypatch.setattr(
+        "warpgs.prepare.pipeline.find_moving", lambda images, *rest: [np.ones(i.shape[:2], bool) for i in images]
+    )
+    with pytest.raises(ValueError, match=r"100% of the pixels seem to move.*--masks FOLDER"):
         prepare(shots, tmp_path / "made")
