@@ -101,6 +101,17 @@ def test_a_stopped_attempt_goes_on_where_it_stopped(shots, tmp_path, monkeypatch
     assert bool(capture.frame(capture.train[0]).static_mask.all())
 
 
+def test_a_frame_that_can_not_be_placed_is_named_and_left_out(tmp_path):
+    images = filmed.film(10)[0]
+    stray = cv2.resize(filmed.texture(5, filmed.COLORS[1], 256, (20, 60)), filmed.SIZE)
+    shots = filmed.write_folder(tmp_path / "shots", [*images[:6], stray, *images[6:]])
+    report = prepare(shots, tmp_path / "made", masks="none", depth="none")
+    assert report["notes"] == ["left out, because no camera was found for them: frame_000006 (shot006.png)"]
+    capture = load_capture(tmp_path / "made")
+    assert len(capture.train) == 10
+    assert "frame_000006" not in capture.cameras
+
+
 def test_given_masks_are_taken_as_they_are(shots, tmp_path):
     (tmp_path / "masks").mkdir()
     for k, mask in enumerate(filmed.film(24)[1]):

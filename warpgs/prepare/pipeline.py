@@ -206,9 +206,7 @@ class Preparation:
         placed = set(cameras.names)
         left_out = [f"{f.name} ({f.source})" for f in frames if f.name not in placed]
         if left_out:
-            self.attempt.notes.append(
-                f"{len(left_out)} frames could not be placed and are left out: {', '.join(left_out)}"
-            )
+            self.attempt.notes.append(f"left out, because no camera was found for them: {', '.join(left_out)}")
         write_frames(self.root, self.work / "frames", cameras, moving)
         write_facts(self.root, cameras, [f for f in frames if f.name in placed], self.options.holdout)
         share = float(np.mean([mask.mean() for mask in moving]))
