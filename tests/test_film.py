@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from tests import tiny
 from tests.test_pictures import frames_of
-from warpgs import film, pictures, runs
+from warpgs import checkpoint, film, pictures, runs
 from warpgs.cli import main
 from warpgs.film import Render, render_run
 from warpgs.playback import Player
@@ -231,3 +232,54 @@ def test_without_an_encoder_the_way_out_is_told(run, tmp_path, monkeypatch):
 def test_a_folder_that_is_no_run_ends_the_command_with_a_line(tmp_path, capsys):
     assert main(["render", str(tmp_path)]) == 2
     assert capsys.readouterr().err == f"warpgs: {tmp_path} is no run folder: it has no config.json\n"
+
+
+@pytest.fixture
+def stranded(run, tmp_path):
+    """A copy, to take things from."""
+    return shutil.copytree(run, tmp_path / "stranded")
+
+
+def line(capsys, run):
+    """The one line that the command ends with."""
+    assert main(["render", str(run), "--device", "cpu"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
+
+
+def test_a_run_without_a_checkpoint_ends_the_command_with_a_line(stranded, capsys):
+    shutil.rmtree(stranded / "checkpoints")
+    assert line(capsys, stranded) == f"warpgs: {stranded} has no checkpoint yet\n"
+
+
+def test_a_damaged_checkpoint_ends_the_command_with_a_line(stranded, capsys):
+    path = checkpoint.saved(stranded)[-1]
+    path.write_bytes(path.read_bytes()[:1000])
+    assert f"warpgs: {path} is damaged" in line(capsys, stranded)
+
+
+@pytest.mark.parametrize(("change", "words"), [('"sead": 1, ', "fields of another version: sead"), ("[" * 100_000, "")])
+def test_a_config_of_another_version_or_damaged_ends_the_command_with_a_line(stranded, capsys, change, words):
+    text = (stranded / "config.json").read_text()
+    (stranded / "config.json").write_text("{" + change + text[1:])
+    said = line(capsys, stranded)
+    assert said.startswith(f"warpgs: {stranded / 'config.json'} ")
+    assert words in said
+
+
+def test_a_capture_that_was_moved_is_told_and_can_be_named(stranded, capture, tmp_path, capsys):
+    config = json.loads((stranded / "config.json").read_text())
+    here = config["data"]
+    (stranded / "config.json").write_text(json.dumps({**config, "data": str(tmp_path / "gone")}))
+    assert str(tmp_path / "gone") in line(capsys, stranded)
+    assert f"{len(capture.val)} pictures" in render(stranded, tmp_path, data=Path(here))
+
+
+def test_ctrl_c_ends_a_command_with_a_line(run, monkeypatch, capsys):
+    def stop(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(film, "render_run", stop)
+    assert main(["render", str(run)]) == 130
+    assert capsys.readouterr().err == "warpgs: stopped\n"

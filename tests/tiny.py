@@ -54,11 +54,11 @@ CONFIG = TrainConfig(
 @contextmanager
 def in_haste():
     """Without the checks of annotations, and on one thread: both cost more than they bring in runs this small."""
-    threads = torch.get_num_threads()
+    threads, were_off = torch.get_num_threads(), jaxtyping.config.jaxtyping_disable
     torch.set_num_threads(1)
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", False)
+    jaxtyping.config.update("jaxtyping_disable", were_off)
     torch.set_num_threads(threads)
 
 

@@ -159,7 +159,7 @@ class _Film:
         options = self.options
         factor = options.supersample
         camera = paths.resized(camera, options.scale).to(self.device)
-        rendering = self.render_at(paths.resized(camera, factor), options.layers != "joint")
+        rendering = self.render_at(paths.resized(camera, float(factor)), options.layers != "joint")
         images = [_averaged(image, factor) for image in _images(rendering, options.layers)]
         if options.truth:
             truth = self.capture.frame(name).image.to(self.device).float() / 255.0

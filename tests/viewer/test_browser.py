@@ -16,6 +16,7 @@ sync_api = pytest.importorskip(
 )
 
 from tests.viewer import watched  # noqa: E402
+from warpgs import playback  # noqa: E402
 from warpgs.viewer import source as source_module  # noqa: E402
 from warpgs.viewer.command import training_cameras  # noqa: E402
 from warpgs.viewer.layers import picture  # noqa: E402
@@ -136,6 +137,23 @@ def test_the_picture_is_the_scene_through_the_camera(page, session):
     wished = cv2.resize(wished, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
     assert wished.std() > 10
     assert np.abs(image - wished).mean() < 4.0
+
+
+def test_where_frames_can_be_recorded_whole_joint_pictures_are_replayed(page, session, monkeypatch):
+    """As on a GPU, but for the recording: there is none on the CPU."""
+    before = seen(page, session)
+    player = session._shown[0].player
+    monkeypatch.setattr(playback, "capture", lambda step: step)
+    monkeypatch.setattr(playback.Player, "records", True)
+    session.panel.time.value = 0.9
+    moved = seen(page, session)
+    assert player.is_recorded(session._shown[0].size)
+    assert np.abs(moved - before).max() > 10
+    monkeypatch.undo()
+    session.panel.time.value = 0.1
+    settle(session)
+    session.panel.time.value = 0.9
+    assert np.abs(seen(page, session) - moved).max() < 3
 
 
 def test_a_screenshot_is_written(page, session, tmp_path_factory):
