@@ -7,7 +7,7 @@ import math
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -124,7 +124,9 @@ def evaluate(
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
-    return Evaluation(views, _flicker(render_at, cameras), frame_rate(play, cameras), lpips.net if lpips else None)
+    return Evaluation(
+        views, _flicker(render_at, cameras, quiet), frame_rate(play, cameras), lpips.net if lpips else None
+    )
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
@@ -150,17 +152,16 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
     )
 
 
-def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> Iterator[Camera]:
+def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> list[Camera]:
     """One camera at consecutive times of others."""
     times = sorted({c.time for c in cameras})
-    for moment in times[:most]:
-        yield Camera(camera.viewmat, camera.K, camera.width, camera.height, moment)
+    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, moment) for moment in times[:most]]
 
 
-def _flicker(render_at: RenderAt, cameras: Sequence[Camera]) -> float | None:
+def _flicker(render_at: RenderAt, cameras: Sequence[Camera], quiet: bool) -> float | None:
     changes = []
     before: Rendering | None = None
-    for camera in _at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES):
+    for camera in progress(_at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES), "flicker", quiet):
         after = render_at(camera, True)
         if before is not None:
             assert before.dynamic is not None

@@ -17,6 +17,7 @@ from .data.synthetic import builtin_capture
 from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_text, write_views
 from .lpips import find, locate
 from .playback import Player
+from .progress import progress
 from .render import Rendering
 from .scene.split import SplitScene
 
@@ -171,7 +172,7 @@ def evaluate_run(
             pictures.write_png(path, pictures.comparison(truth, rendering))
 
     evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, render_at.play, quiet)
-    _write_video(folder / "time.mp4", render_at, capture, target)
+    _write_video(folder / "time.mp4", render_at, capture, target, quiet)
     counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
     run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
     totals = {"iterations": run.pop("iteration"), **run, **counts, "commit": _commit()}
@@ -180,12 +181,12 @@ def evaluate_run(
     return _report(evaluation, counts)
 
 
-def _write_video(path: Path, render_at: RenderAt, capture: Capture, device: torch.device) -> None:
+def _write_video(path: Path, render_at: RenderAt, capture: Capture, device: torch.device, quiet: bool) -> None:
     """The middle evaluation camera (else training camera) over time: joint | static | dynamic."""
     names = capture.val or capture.train
     camera = capture.cameras[names[len(names) // 2]].to(device)
     with pictures.Video(path) as video:
-        for k in range(VIDEO_FRAMES):
+        for k in progress(range(VIDEO_FRAMES), "video over time", quiet):
             rendering = render_at(dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1)), True)
             layers = (rendering.joint, rendering.static, rendering.dynamic)
             images = [layer.image for layer in layers if layer is not None]

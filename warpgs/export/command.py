@@ -73,7 +73,7 @@ def export_run(options: Export) -> str:
     folder = options.out or options.run_folder / "export"
     if options.max_gaussians is not None:
         capture, _ = find_capture(moments, options.quiet)
-        moments = moments.lightest_left_out(options.max_gaussians, weighing_cameras(moments, capture))
+        moments = moments.lightest_left_out(options.max_gaussians, weighing_cameras(moments, capture), options.quiet)
     if options.format == "html":
         return _export_page(options, moments, folder)
     return _export_files(options, moments, folder)
@@ -128,6 +128,6 @@ def _export_page(options: Export, moments: Moments, folder: Path) -> str:
     start = opening(moments, capture, options.keys, options.seconds)
     times = progress(paths.evenly(options.keys), "baking", options.quiet)
     baked = bake(moments.at, times)
-    written = write_page(folder / "scene.html", baked, start)
+    written = write_page(folder / "scene.html", baked, start, options.quiet)
     num = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {options.keys} key times"
     return f"{folder / 'scene.html'}: {num}, {written / 1e6:.1f} MB\n{origin}"

@@ -13,6 +13,7 @@ from warpgs import runs
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.playback import Player
+from warpgs.progress import progress
 from warpgs.render import render
 from warpgs.scene.split import SplitScene
 
@@ -56,7 +57,7 @@ class Moments:
         cloud = Cloud.of_splats(Player(self.scene, self.config, self.facts).splats(time))
         return cloud if self.rows is None else cloud.select(self.rows)
 
-    def lightest_left_out(self, most: int, cameras: Sequence[Camera]) -> "Moments":
+    def lightest_left_out(self, most: int, cameras: Sequence[Camera], quiet: bool = True) -> "Moments":
         """The same scene with at most so many Gaussians: those that some camera sees most of.
 
         Raises:
@@ -68,7 +69,7 @@ class Moments:
         weight = np.zeros(len(self.at(0.0)))
         if len(weight) <= most:
             return self
-        for camera in cameras:
+        for camera in progress(cameras, "weighing Gaussians", quiet):
             weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
             assert weights is not None
             weight = np.maximum(weight, weights.numpy())

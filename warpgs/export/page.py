@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from warpgs.progress import progress
+
 from .baking import WORDS, Baked, Bounds, Branch
 from .files import read_bounded, write_whole
 from .packing import from_planes, to_planes
@@ -63,7 +65,7 @@ class Start:
     antialias: bool
 
 
-def write_page(path: Path, baked: Baked, start: Start) -> int:
+def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> int:
     """Writes the page; returns its size [bytes].
 
     Raises:
@@ -84,10 +86,10 @@ def write_page(path: Path, baked: Baked, start: Start) -> int:
         "branches": {name: _facts(branch) for name, branch in branches.items()},
     }
     blocks = [_block("application/json", "scene", json.dumps(facts).replace("<", "\\u003c"))]
-    for name, branch in branches.items():
-        for array in ARRAYS:
-            packed = gzip.compress(to_planes(getattr(branch, array)).tobytes(), 6, mtime=0)
-            blocks.append(_block("application/gzip;base64", f"{name}-{array}", base64.b64encode(packed).decode()))
+    parts = [(name, array) for name in branches for array in ARRAYS]
+    for name, array in progress(parts, "compressing", quiet):
+        packed = gzip.compress(to_planes(getattr(branches[name], array)).tobytes(), 6, mtime=0)
+        blocks.append(_block("application/gzip;base64", f"{name}-{array}", base64.b64encode(packed).decode()))
     return write_whole(path, [_page(start.title, "\n".join(blocks)).encode()])
 
 
