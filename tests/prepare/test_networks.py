@@ -197,11 +197,12 @@ def test_depth_anything_knows_all_pixels_and_metric_depth_is_inverted(depth_anyt
 
 
 @needs_transformers
-def test_a_capture_is_made_with_both_networks(sam2, depth_anything, tmp_path, capsys):
+def test_a_capture_is_made_with_both_networks(sam2, depth_anything, tmp_path, capsys, monkeypatch):
     weights = tmp_path / "weights"
     weights.mkdir()
     for folder in (sam2, depth_anything):
         (weights / folder.name).symlink_to(folder)
+    monkeypatch.setattr("warpgs.prepare.pipeline.WORKING_SIDE", filmed.SIZE[0])
     shots = filmed.write_folder(tmp_path / "shots", filmed.film(16)[0])
     options = ["--masks", "sam2", "--depth", "anything", "--weights", str(weights)]
     assert main(["prepare", str(shots), str(tmp_path / "made"), *options]) == 0

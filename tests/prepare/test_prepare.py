@@ -27,7 +27,9 @@ def shots(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(shots):
     root = shots.parent / "made"
-    prepare(shots, root, holdout=8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warpgs.prepare.pipeline.WORKING_SIDE", filmed.SIZE[0])  # enlarged, it takes four times as long
+        prepare(shots, root, holdout=8)
     return root
 
 
@@ -207,9 +209,14 @@ def test_masks_of_everything_are_refused_with_advice(shots, tmp_path):
 
 
 def test_where_nearly_everything_seems_to_move_masks_are_asked_for(tmp_path, monkeypatch):
+    shapes = set()
+
+    def all_moves(images, *rest):
+        shapes.update(image.shape for image in images)
+        return [np.ones(image.shape[:2], bool) for image in images]
+
     shots = filmed.write_folder(tmp_path / "shots", filmed.film(10)[0])
-    monkeypatch.setattr(
-        "warpgs.prepare.pipeline.find_moving", lambda images, *rest: [np.ones(i.shape[:2], bool) for i in images]
-    )
+    monkeypatch.setattr("warpgs.prepare.pipeline.find_moving", all_moves)
     with pytest.raises(ValueError, match=r"100% of the pixels seem to move.*--masks FOLDER"):
         prepare(shots, tmp_path / "made")
+    assert shapes == {(384, 512, 3)}  # small pictures are enlarged
