@@ -1,0 +1,1 @@
+import warpgs  # noqa: F401  before torch, see there

@@ -7,6 +7,7 @@ import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs.kernels.covariance import covariance as kernel
+from warpgs.ops import tape
 from warpgs.ops.profiling import profile
 from warpgs.ops.tape import Run
 from warpgs.render import render
@@ -37,7 +38,13 @@ def picture(seed: int) -> list[torch.Tensor]:
     return [image.detach(), *gradients(splats).values()]
 
 
-def test_threads_that_render_at_once_draw_what_they_draw_alone():
+@pytest.fixture
+def shared_out(monkeypatch):
+    """Small launches go to all cores, too."""
+    monkeypatch.setattr(tape, "SMALLEST_SHARD", 1)
+
+
+def test_threads_that_render_at_once_draw_what_they_draw_alone(shared_out):
     seeds = list(range(4)) * 8
     alone = [picture(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as pool:
@@ -47,7 +54,7 @@ def test_threads_that_render_at_once_draw_what_they_draw_alone():
             assert torch.equal(value, expected)
 
 
-def test_one_core_draws_what_two_draw():
+def test_one_core_draws_what_two_draw(shared_out):
     cores = torch.get_num_threads()
     try:
         torch.set_num_threads(1)

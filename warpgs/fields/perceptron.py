@@ -77,7 +77,7 @@ class _Perceptron(torch.autograd.Function):
             if k > 0:
                 features = read[k][:, : len(weights[k - 1])]
                 back = torch.mm(gradient, weights[k][:, : features.shape[1]])
-                gradient = torch.ops.aten.threshold_backward(back, features, 0)
+                gradient = torch.ops.aten.threshold_backward(back, features, 0, grad_input=back)
         if unscale is not None:
             torch._foreach_mul_([*v_weights, *v_biases], unscale)
         columns = [v[:, :used] for v, used in zip(v_weights, ctx.columns, strict=True)]

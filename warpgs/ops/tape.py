@@ -24,10 +24,10 @@ from . import profiling
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
-CHUNKS_PER_SHARD = 8
+CHUNKS_PER_SHARD = 16
 """Pieces a core that a CPU launch is cut into and that are dealt out in turn, so that cores get like shares."""
 
-SMALLEST_SHARD = 2048
+SMALLEST_SHARD = 16384
 """Threads below which a CPU launch is not worth another core."""
 
 
