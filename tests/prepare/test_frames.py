@@ -123,3 +123,27 @@ def test_pictures_of_different_sizes_are_refused_by_name(tmp_path, images):
 def test_a_rate_makes_no_sense_for_a_folder(tmp_path, images):
     with pytest.raises(ValueError, match="--fps is for videos"):
         take_frames(write_folder(tmp_path / "shots", images[:5]), tmp_path / "frames", Selection(fps=3.0))
+
+
+def test_numbers_in_names_are_sorted_as_numbers(tmp_path, images):
+    for k in (1, 2, 10, 9, 11):
+        cv2.imwrite(str(tmp_path / f"shot{k}.png"), images[k])
+    taken = take_frames(tmp_path, tmp_path / "frames", Selection())
+    assert [frame.source for frame in taken] == [f"shot{k}.png" for k in (1, 2, 9, 10, 11)]
+
+
+@pytest.mark.parametrize("size", [(256, 15), (900, 40)])
+def test_pictures_too_flat_for_optical_flow_are_refused(size, tmp_path, images):
+    shots = write_folder(tmp_path / "shots", [cv2.resize(image, size) for image in images[:5]])
+    with pytest.raises(ValueError, match=rf"shot000\.png of {size[0]}×{size[1]} pixels is too flat"):
+        take_frames(shots, tmp_path / "frames", Selection())
+
+
+def test_a_video_that_is_cut_off_is_told_of(tmp_path, images):
+    video, notes = write_video(tmp_path / "video.avi", images), []
+    take_frames(video, tmp_path / "whole", Selection(), notes=notes)
+    assert notes == []
+    data = video.read_bytes()
+    video.write_bytes(data[: len(data) // 2])
+    taken = take_frames(video, tmp_path / "part", Selection(), notes=notes)
+    assert notes == [f"{video} promises 20 frames, only {len(taken)} could be decoded: is it cut off?"]

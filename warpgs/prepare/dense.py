@@ -100,6 +100,8 @@ class Flows:
         """[H, W, 2] how far every pixel of frame a has moved in frame b [px]."""
         with self._lock:
             kept = self._kept.get((a, b))
+            if kept is not None:
+                self._kept.move_to_end((a, b))
         if kept is None:
             kept = self.between(self.planes[a], self.planes[b]).astype(np.float16)
             with self._lock:

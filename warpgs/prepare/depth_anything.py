@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch.nn.functional import interpolate
 
+from warpgs.progress import progress
+
 from .networks import DEPTH_ANYTHING, load, normalised
-from .parallel import progress
 
 NEAREST = 1e-3
 """Distance under which metric depth is clamped [m]."""

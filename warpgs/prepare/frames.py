@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,8 +15,7 @@ from jaxtyping import UInt8
 
 from warpgs.data.images import LARGEST_SIDE, decode
 from warpgs.data.writing import write_json, write_png
-
-from .parallel import progress
+from warpgs.progress import progress
 
 FEWEST_FRAMES = 5
 MOST_FRAMES = 1000
@@ -23,6 +23,12 @@ MOST_FRAMES = 1000
 
 DEFAULT_FRAMES = 150
 """Taken from a video when neither a rate nor a count is asked for."""
+
+SMALLEST_SIDE, FLATTEST = 16, 16
+"""Shorter side [px], and largest ratio of the sides: optical flow crashes on less."""
+
+FEWEST_DECODED = 0.95
+"""Share of the frames that a video promises, under which its being cut off is told."""
 
 PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -71,8 +77,17 @@ class Selection:
             raise ValueError(f"--longest-side must be 64 to {LARGEST_SIDE} pixels, got {self.longest_side}")
 
 
-def take_frames(source: Path, folder: Path, selection: Selection, quiet: bool = True) -> list[SourceFrame]:
+def take_frames(
+    source: Path, folder: Path, selection: Selection, quiet: bool = True, notes: list[str] | None = None
+) -> list[SourceFrame]:
     """Writes the chosen frames of a video or a folder into ``folder`` as PNG, and frames.json that lists them.
+
+    Args:
+        source: Video or folder of pictures.
+        folder: Where to write.
+        selection: Which frames.
+        quiet: Whether to show no progress.
+        notes: What to tell the user is appended to it.
 
     Raises:
         ValueError: If the source is missing, no video, no folder of pictures, or has too few or different frames.
@@ -83,15 +98,23 @@ def take_frames(source: Path, folder: Path, selection: Selection, quiet: bool = 
         raise ValueError(f"{source} is missing: expected a video or a folder of pictures")
     taken: list[SourceFrame] = []
     size = None
-    for step, origin, image in (_of_folder if source.is_dir() else _of_video)(source, selection, quiet):
+    notes = [] if notes is None else notes
+    chosen = _of_folder(source, selection, quiet) if source.is_dir() else _of_video(source, selection, quiet, notes)
+    for step, origin, image in chosen:
         if size not in (None, image.shape[1::-1]):
             raise ValueError(
                 f"{source}: {origin} is {image.shape[1]}×{image.shape[0]}, others are {size[0]}×{size[1]}: "
                 "all pictures must be of one camera and size"
             )
         size = image.shape[1::-1]
+        image = _scaled(image, selection.longest_side)
+        if min(image.shape[:2]) < max(SMALLEST_SIDE, max(image.shape[:2]) / FLATTEST):
+            raise ValueError(
+                f"{source}: {origin} of {image.shape[1]}×{image.shape[0]} pixels is too flat: the shorter side must "
+                f"have at least {SMALLEST_SIDE} pixels and 1/{FLATTEST} of the longer one"
+            )
         taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step))
-        write_png(folder / f"{taken[-1].name}.png", _scaled(image, selection.longest_side))
+        write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < FEWEST_FRAMES:
         raise ValueError(
             f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {FEWEST_FRAMES} are needed"
@@ -123,7 +146,8 @@ def _scaled(image: np.ndarray, longest: int) -> np.ndarray:
 def _of_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[tuple[int, str, np.ndarray]]:
     if selection.fps is not None:
         raise ValueError("--fps is for videos: a folder has no rate, use --count")
-    paths = sorted(p for p in source.iterdir() if p.suffix.lower() in PICTURES and not p.name.startswith("."))
+    pictures = (p for p in source.iterdir() if p.suffix.lower() in PICTURES and not p.name.startswith("."))
+    paths = sorted(pictures, key=_natural)
     if not paths:
         raise ValueError(f"{source} holds no {', '.join(PICTURES)} pictures")
     count = min(selection.count or len(paths), len(paths))
@@ -135,6 +159,12 @@ def _of_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[tupl
         yield int(best[0]), paths[best[0]].name, best[1]
 
 
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    """Sorts shot2 before shot10."""
+    parts = re.split(r"([0-9]+)", path.name)  # text and numbers take turns
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
+
+
 def _picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """An RGB picture, turned as its EXIF data say; damaged and huge files are refused before they are decoded."""
     decode(path)
@@ -144,7 +174,9 @@ def _picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _of_video(source: Path, selection: Selection, quiet: bool) -> Iterator[tuple[int, str, np.ndarray]]:
+def _of_video(
+    source: Path, selection: Selection, quiet: bool, notes: list[str]
+) -> Iterator[tuple[int, str, np.ndarray]]:
     video = _open(source)
     try:
         total, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.get(cv2.CAP_PROP_FPS)
@@ -157,20 +189,22 @@ def _of_video(source: Path, selection: Selection, quiet: bool) -> Iterator[tuple
         interval = max(1.0, interval)
         if total / interval > MOST_FRAMES:
             raise ValueError(f"{source} gives {int(total / interval)} frames, at most {MOST_FRAMES} are taken")
-        yield from _sharpest(source, video, total, interval, quiet)
+        yield from _sharpest(source, video, total, interval, quiet, notes)
     finally:
         video.release()
 
 
 def _sharpest(
-    source: Path, video: cv2.VideoCapture, total: int, interval: float, quiet: bool
+    source: Path, video: cv2.VideoCapture, total: int, interval: float, quiet: bool, notes: list[str]
 ) -> Iterator[tuple[int, str, np.ndarray]]:
     """The sharpest frame of each interval; one frame at a time is held besides the best."""
     best: tuple[float, int, np.ndarray] | None = None
     current = 0
     for step in progress(range(total), "frames", quiet):
         whole, image = video.read()
-        if not whole:  # containers often count a few more than there are
+        if not whole:
+            if step < FEWEST_DECODED * total:  # containers often count a few more than there are
+                notes.append(f"{source} promises {total} frames, only {step} could be decoded: is it cut off?")
             break
         if int(step / interval) != current and best is not None:
             yield best[1], f"frame {best[1]}", best[2]

@@ -8,6 +8,8 @@ from jaxtyping import Float
 
 from warpgs.data.capture import Frame
 
+from .frames import SMALLEST_SIDE
+
 LONGEST_SIDE = 512
 """Pictures are compared at this size [px]."""
 
@@ -31,11 +33,13 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     """Optical flow (DIS) from the first frame to the second against the epipolar lines of their cameras.
 
     Returns:
-        None where too few pixels have texture.
+        None where too few pixels have texture, or the pictures are too flat for optical flow.
     """
     height, width = first.image.shape[:2]
     factor = min(1.0, LONGEST_SIDE / max(height, width))
-    size = (max(8, round(width * factor)), max(8, round(height * factor)))
+    size = round(width * factor), round(height * factor)
+    if min(size) < SMALLEST_SIDE:
+        return None
     a, b = (_grey(frame, size) for frame in (first, second))
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(a, b, None)
     distance = _epipolar_distance(first, second, flow)

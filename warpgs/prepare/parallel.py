@@ -1,24 +1,19 @@
 """Work on many frames over the cores of one machine."""
 
 import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import cv2
-from rich.progress import track
+
+from warpgs.progress import progress
 
 MOST_THREADS = 8
 """More than that are limited by memory."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-def progress(items: Sequence[Item], label: str, quiet: bool) -> Iterator[Item]:
-    """The items, under a progress bar where stdout is a terminal."""
-    yield from track(items, label, disable=quiet or not sys.stdout.isatty(), transient=True)
 
 
 def each(job: Callable[[Item], Result], items: Sequence[Item], label: str, quiet: bool) -> list[Result]:

@@ -14,8 +14,9 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from warpgs.progress import progress
+
 from .networks import SAM2, load, normalised
-from .parallel import progress
 
 PROMPTS = 4
 """Parts of the sequence that give a prompt each."""
