@@ -106,8 +106,7 @@ def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
     images, masks = film(num_frames)
     write_folder(root / "frames", images)
     names = [path.stem for path in sorted((root / "frames").iterdir())]
-    colors = np.zeros((400, 3), np.uint8)
-    cameras = Cameras(names, lens(), poses(num_frames), points(), colors, 0.1, 10.0)
+    cameras = Cameras(names, lens(), poses(num_frames), points(), 0.1, 10.0)
     write_frames(root, root / "frames", cameras, masks)
     write_facts(root, cameras, [SourceFrame(name, name, k) for k, name in enumerate(names)], holdout)
     return root

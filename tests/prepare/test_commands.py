@@ -35,7 +35,7 @@ def test_a_wrong_source_ends_with_exit_code_2_and_one_line(tmp_path, capsys):
 
 
 def test_an_interrupt_says_how_to_go_on(tmp_path, capsys, monkeypatch):
-    shots = filmed.write_folder(tmp_path / "shots", filmed.film(6)[0])
+    shots = filmed.write_folder(tmp_path / "shots", filmed.film(10)[0])
 
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt

@@ -77,14 +77,14 @@ def test_a_resized_lens_sees_the_same():
 def test_points_on_what_moves_are_left_out():
     poses = np.tile(np.hstack([np.eye(3), np.zeros((3, 1))]), (4, 1, 1))
     points = np.array([[0.0, 0.0, 2.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]])
-    cameras = Cameras(list("abcd"), filmed.lens(), poses, points, np.zeros((3, 3), np.uint8), 0.1, 9.0)
+    cameras = Cameras(list("abcd"), filmed.lens(), poses, points, 0.1, 9.0)
     moving = np.zeros((4, 192, 256), bool)
     moving[:3, 90:100, 120:136] = True
     assert static_points(cameras, list(moving)).tolist() == [False, True, True]
 
 
 def test_cameras_are_saved_and_loaded(tmp_path):
-    cameras = Cameras(["a", "b"], filmed.lens(), filmed.poses(2), filmed.points(7), np.ones((7, 3), np.uint8), 0.5, 8.0)
+    cameras = Cameras(["a", "b"], filmed.lens(), filmed.poses(2), filmed.points(7), 0.5, 8.0)
     cameras.save(tmp_path / "c.npz")
     loaded = Cameras.load(tmp_path / "c.npz")
     assert (loaded.names, loaded.lens, loaded.angle) == (cameras.names, cameras.lens, cameras.angle)

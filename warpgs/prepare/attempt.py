@@ -14,9 +14,12 @@ REPORT = "prepare.json"
 
 MADE = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "scene.json", "metadata.json", "dataset.json",
-    "masks.png", "depth.png", REPORT, ".prepare",
+    "masks.png", "depth.png", REPORT,
 )  # fmt: skip
-"""All that is made in the capture's folder."""
+"""All that is made in the capture's folder, beside the work folder."""
+
+STATE = "state.json"
+"""In the work folder: options, the steps that are done, and notes."""
 
 
 class Attempt:
@@ -29,10 +32,11 @@ class Attempt:
     """
 
     def __init__(self, root: Path, options: dict[str, Any], force: bool, quiet: bool) -> None:
-        """Starts anew, or takes up what was begun with the same options.
+        """Starts anew, or takes up what was begun with the same options; nothing is changed yet.
 
         Raises:
-            ValueError: If the folder holds something else, or was begun with other options, and ``force`` is not given.
+            ValueError: If the folder holds something else, or a capture that was made with other options, and ``force``
+                is not given.
         """
         self.root, self.work, self.quiet = root, root / ".prepare", quiet
         self._options = options
@@ -40,14 +44,12 @@ class Attempt:
         self.notes: list[str] = []
         if root.exists() and not root.is_dir():
             raise ValueError(f"{root} is a file: choose another folder")
-        if force:
-            self._remove_made()
-        elif root.exists() and any(root.iterdir()):
+        if not force and root.exists() and any(root.iterdir()):
             self._done, self.notes = self._begun()
 
     def _begun(self) -> tuple[dict[str, Any], list[str]]:
         try:
-            state = json.loads((self.work / "state.json").read_text())
+            state = json.loads((self.work / STATE).read_text())
             begun, done, notes = dict(state["options"]), dict(state["done"]), list(state["notes"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             if list(self.root.iterdir()) == [self.work]:  # stopped within the first step
@@ -56,17 +58,23 @@ class Attempt:
                 f"{self.root} exists and was not begun by prepare: choose another folder, or replace the capture in it "
                 "with --force"
             ) from error
-        if changed := [key for key in self._options if begun.get(key) != self._options[key]]:
+        changed = [key for key in self._options if begun.get(key) != self._options[key]]
+        if changed and "capture" in done:
             raise ValueError(
-                f"{self.root} was begun with other options ({', '.join(changed)}): choose another folder, or replace "
+                f"{self.root} was made with other options ({', '.join(changed)}): choose another folder, or replace "
                 "it with --force"
             )
-        return done, notes
+        return ({}, []) if changed else (done, notes)  # what failed may be tried with other options
 
-    def _remove_made(self) -> None:
-        """Removes what prepare makes, and nothing else."""
-        for name in MADE:
-            path = self.root / name
+    def clear(self, keep: Path) -> None:
+        """Removes what prepare makes, and nothing else; ``keep`` within the work folder stays.
+
+        Raises:
+            OSError: If something can't be removed or written.
+        """
+        self._save()  # first: what an interruption leaves must not count as finished
+        leftovers = [path for path in self.work.iterdir() if path.name not in (STATE, keep.name)]
+        for path in [*(self.root / name for name in MADE), *leftovers]:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
@@ -99,10 +107,10 @@ class Attempt:
         self._done["finished"] = {"seconds": 0.0, "result": ""}
         self._save()
         for path in self.work.iterdir():
-            if path.name != "state.json":
+            if path.name != STATE:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _save(self) -> None:
         partial = self.work / "state.partial"
         write_json(partial, {"options": self._options, "done": self._done, "notes": self.notes})
-        partial.replace(self.work / "state.json")
+        partial.replace(self.work / STATE)

@@ -38,6 +38,12 @@ class Options:
         """Whether masks begin with the motion in the pictures."""
         return self.masks in ("motion", "sam2")
 
+    @property
+    def inputs(self) -> dict[str, Path]:
+        """All that is read, by what it is."""
+        masks = {} if self.finds_motion or self.masks == "none" else {"masks": Path(self.masks)}
+        return {"source": self.source, **masks, **({"weights": self.weights} if self.weights else {})}
+
     def check(self) -> None:
         """Refuses options that can't be.
 

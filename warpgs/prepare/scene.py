@@ -71,7 +71,13 @@ def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 
 
 
 def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequence[Bool[np.ndarray, "H W"]]) -> None:
-    """Writes pictures and masks, straightened, in full and in half size, and the camera of every frame.
+    """Writes pictures, straightened, and masks in full and in half size, and the camera of every frame.
+
+    Args:
+        root: The capture.
+        frames_folder: Of the frames as the lens took them.
+        cameras: Of the frames.
+        moving: [H, W] true where each straightened frame moves.
 
     Raises:
         ValueError: If a frame was damaged since it was taken.
@@ -80,7 +86,7 @@ def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequ
     straight = straight_lens(cameras.lens)
     for name, pose, mask in zip(cameras.names, cameras.poses, moving, strict=True):
         image = cv2.cvtColor(decode(frames_folder / f"{name}.png"), cv2.COLOR_BGR2RGB)
-        image, moving_here = straighten(image, cameras.lens), straighten(mask, cameras.lens).astype(np.uint8)
+        image, moving_here = straighten(image, cameras.lens), mask.astype(np.uint8)
         for factor in FACTORS:
             size = round(straight.width / factor), round(straight.height / factor)
             write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -11,7 +11,7 @@ from typing import Any
 import cv2  # noqa: F401  pycolmap before OpenCV breaks OpenCV's PNG files: both bring a zlib (seen with 5.0 and 4.2)
 import numpy as np
 import pycolmap
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from warpgs.data.lens import Lens
 
@@ -48,6 +48,10 @@ LARGEST_ERROR = 2.0
 """Points with a larger mean reprojection error are left out [px]."""
 
 
+class NoCamerasError(ValueError):
+    """The pictures don't tell where they were taken from."""
+
+
 @dataclass(frozen=True)
 class Cameras:
     """What was recovered.
@@ -57,7 +61,6 @@ class Cameras:
         lens: Of them all.
         poses: [F, 3, 4] world to camera, OpenCV axes.
         points: [P, 3] in the world.
-        colors: [P, 3] RGB.
         error: Mean reprojection error [px].
         angle: Median over the points of the largest angle between two rays to one [degrees].
     """
@@ -66,7 +69,6 @@ class Cameras:
     lens: Lens
     poses: Float[np.ndarray, "F 3 4"]
     points: Float[np.ndarray, "P 3"]
-    colors: UInt8[np.ndarray, "P 3"]
     error: float
     angle: float
 
@@ -79,7 +81,6 @@ class Cameras:
             lens=np.array([lens.width, lens.height, *lens.focal, *lens.center, *lens.radial, *lens.tangential]),
             poses=self.poses,
             points=self.points,
-            colors=self.colors,
             quality=np.array([self.error, self.angle]),
         )
 
@@ -90,7 +91,7 @@ class Cameras:
             v = z["lens"].tolist()
             lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
             error, angle = z["quality"].tolist()
-            return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], z["colors"], error, angle)
+            return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle)
 
 
 def recover_cameras(
@@ -114,7 +115,8 @@ def recover_cameras(
         weak: Whether to take features of low contrast too: more on plain walls, less exact ones.
 
     Raises:
-        ValueError: If cameras can't be recovered; says why and what to try.
+        NoCamerasError: If the pictures are not fit; says why and what to try.
+        ValueError: If COLMAP itself failed.
     """
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -128,7 +130,7 @@ def recover_cameras(
         pycolmap.logging.minloglevel = level
         shutil.rmtree(work, ignore_errors=True)
     if best is None:
-        raise ValueError(
+        raise NoCamerasError(
             "no two frames show enough of the same static things from different places: move the camera sideways, "
             "slower and over textured things, or take frames closer in time (--fps, --count)"
         )
@@ -173,7 +175,7 @@ def _check_features(database: Path, count: int) -> None:
     finally:
         opened.close()
     if features < FEWEST_FEATURES:
-        raise ValueError(
+        raise NoCamerasError(
             f"the pictures have hardly any texture where nothing moves: {features:.0f} features a frame, at least "
             f"{FEWEST_FEATURES} are needed; film textured things, in more light, or check the masks"
         )
@@ -195,7 +197,7 @@ def _matched(folder: Path, work: Path, name: str, exhaustive: bool) -> Any:
 def _result(model: Any, names: list[str]) -> Cameras:
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
     if len(images) < max(LEAST_REGISTERED * len(names), 3):
-        raise ValueError(
+        raise NoCamerasError(
             f"only {len(images)} of {len(names)} frames could be placed: too much moves, the camera moves too fast, "
             "or the pictures have too little texture; try more frames (--fps, --count), a slower part of the video, "
             "or masks of what moves (--masks FOLDER)"
@@ -207,12 +209,11 @@ def _result(model: Any, names: list[str]) -> Cameras:
         _lens(images[0].camera),
         poses,
         np.array([p.xyz for p in points]).reshape(-1, 3),
-        np.array([p.color for p in points], np.uint8).reshape(-1, 3),
         float(model.compute_mean_reprojection_error()),
         _angle(model, points),
     )
     if found.angle < LEAST_ANGLE or len(points) < FEWEST_POINTS:
-        raise ValueError(
+        raise NoCamerasError(
             f"the camera hardly changes its place: {len(points)} points could be placed, seen under "
             f"{found.angle:.1f}°; at least {FEWEST_POINTS} and {LEAST_ANGLE}° are needed; walk around the scene "
             "instead of turning in one place"
