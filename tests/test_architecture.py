@@ -11,7 +11,7 @@ from warpgs.ops.covariance import covariance
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    {"config", "progress"},
+    {"config", "files", "memory", "progress"},
     {"kernels"},
     {"ops"},
     {"cameras", "scene", "fields"},

@@ -198,7 +198,10 @@ def test_a_file_of_another_program_is_refused(tmp_path):
         checkpoint.load(tmp_path / "a.safetensors")
 
 
-@pytest.mark.parametrize("facts", [None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
+LONG = '{"iteration": 1' + 5000 * "0" + "}"
+
+
+@pytest.mark.parametrize("facts", [LONG, None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
 def test_facts_that_are_no_object_are_damage(tmp_path, facts):
     path = write_raw(tmp_path / "a.safetensors", metadata(facts=facts))
     with pytest.raises(ValueError, match="is damaged"):
@@ -212,7 +215,15 @@ def test_a_fact_that_is_missing_is_named_with_the_file(path):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("moving", "yes"), ("relit", 1), ("sh_degree", 3), ("sh_degree", 0.5), ("sh_degree", []), ("iteration", -1)],
+    [
+        ("moving", "yes"),
+        ("relit", 1),
+        ("sh_degree", 3),
+        ("sh_degree", 0.5),
+        ("sh_degree", []),
+        ("iteration", -1),
+        ("iteration", 10**400),
+    ],
 )
 def test_facts_that_no_stage_has_are_damage(path, name, value):
     loaded = checkpoint.load(path)
@@ -293,6 +304,13 @@ def test_rows_of_no_width_make_no_gaussians(tmp_path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match="does not hold a scene"):
         checkpoint.load_scene(loaded, tiny.MODEL, tmp_path / "a.safetensors")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+
+
+def test_a_config_that_claims_a_huge_network_takes_no_memory(path):
+    """0.8 GB that the file does not hold."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "does not hold a scene" in refused(tensors_of(scene()), dataclasses.replace(tiny.MODEL, width=4096, depth=8))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
 
 

@@ -33,6 +33,11 @@ def test_presets_are_valid(name):
         ("loss.depth", float("inf")),
         ("schedule.sh_degree_every", 0),
         ("factor", 0),
+        ("model.width", 100_000),
+        ("model.depth", 65),
+        ("model.time_bands", 10**9),
+        ("resident_bytes", 10**400),
+        ("loss.ssim", 1e300),
     ],
 )
 def test_a_number_out_of_its_range_is_refused_by_name(name, value):

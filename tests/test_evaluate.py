@@ -270,20 +270,6 @@ def test_json_has_no_values_that_other_readers_refuse(tmp_path, value):
     assert json.loads(text, parse_constant=refuse) == {"psnr": None, "ssim": 0.5}
 
 
-def test_a_text_that_can_not_be_written_leaves_the_old_one_and_names_it(tmp_path, monkeypatch):
-    path = tmp_path / "views.csv"
-    path.write_text("old")
-
-    def full_disk(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(evaluate.os, "replace", full_disk)
-    with pytest.raises(OSError, match=rf"{path} could not be written: No space left on device$"):
-        evaluate.write_text(path, "new")
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 # A whole run --------------------------------------------------------------------------------------------------------
 
 

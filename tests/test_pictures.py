@@ -156,7 +156,7 @@ def test_a_video_without_frames_is_no_file(tmp_path):
 def test_a_video_that_can_not_be_opened_is_named(tmp_path):
     (tmp_path / "a.mp4").mkdir()
     with (
-        pytest.raises(OSError, match=r"a\.mp4 could not be written as a video: Is a directory"),
+        pytest.raises(OSError, match=r"a\.mp4 could not be written: Is a directory"),
         pictures.Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
@@ -164,9 +164,9 @@ def test_a_video_that_can_not_be_opened_is_named(tmp_path):
 
 def test_a_disk_that_is_full_is_told_and_leaves_no_video(tmp_path):
     """/dev/full says of every write that there is no room."""
-    (tmp_path / "a.mp4").symlink_to("/dev/full")
+    (tmp_path / "a.mp4.partial").symlink_to("/dev/full")
     with (
-        pytest.raises(OSError, match=r"a\.mp4 could not be written as a video: No space left on device"),
+        pytest.raises(OSError, match=r"a\.mp4 could not be written: No space left on device"),
         pictures.Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
@@ -189,6 +189,25 @@ def test_a_video_has_the_rate_asked_for(tmp_path):
             video.add(np.zeros((H, W, 3), np.uint8))
     with av.open(str(tmp_path / "a.mp4")) as file:
         assert float(file.streams[0].average_rate) == pytest.approx(29.97, abs=0.01)
+
+
+@pytest.mark.parametrize("shape", [(1, 32, 3), (20, 1, 3)])
+def test_a_picture_too_small_for_a_video_is_refused(tmp_path, shape):
+    with (
+        pytest.raises(ValueError, match="a video needs two pixels a side"),
+        pictures.Video(tmp_path / "a.mp4") as video,
+    ):
+        video.add(np.zeros(shape, np.uint8))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_video_has_its_name_only_when_it_is_whole(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"old")
+    with pictures.Video(tmp_path / "a.mp4") as video:
+        video.add(np.zeros((H, W, 3), np.uint8))
+        assert (tmp_path / "a.mp4").read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+    assert len(frames_of(tmp_path / "a.mp4")) == 1
 
 
 def test_without_ffmpeg_a_line_says_where_to_get_it(tmp_path, monkeypatch):

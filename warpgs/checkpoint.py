@@ -1,8 +1,8 @@
 """Checkpoints: safetensors files, written so that a crash at any moment leaves a whole one behind."""
 
 import json
-import math
 import os
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from .config import ModelConfig
+from .config import LARGEST, ModelConfig
+from .files import beside
 from .scene.split import SplitScene
 
 VERSION = 1
@@ -55,8 +56,8 @@ class Checkpoint:
             ValueError: If it is missing or something else.
         """
         value = self.facts[name]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
-            raise ValueError(f"{self.path} is damaged: {name} can't be {value!r}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= LARGEST:
+            raise ValueError(f"{self.path} is damaged: {name} can't be {reprlib.repr(value)}")
         return value
 
     def flag(self, name: str) -> bool:
@@ -92,18 +93,15 @@ def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
     Raises:
         OSError: If it can't be written; the message names the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    try:
-        save_file(plain, partial, metadata={"format": "warpgs", "version": str(VERSION), "facts": json.dumps(facts)})
+    metadata = {"format": "warpgs", "version": str(VERSION), "facts": json.dumps(facts)}
+    with beside(path) as partial:
+        try:
+            save_file(plain, partial, metadata=metadata)
+        except SafetensorError as error:
+            raise OSError(str(error)) from error
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
-        os.replace(partial, path)
-    except (OSError, SafetensorError) as error:
-        raise OSError(f"{path} could not be written: {error}") from error
-    finally:
-        partial.unlink(missing_ok=True)  # also after Ctrl-C
 
 
 def load(path: Path) -> Checkpoint:
@@ -120,10 +118,17 @@ def load(path: Path) -> Checkpoint:
             if metadata.get("version") != str(VERSION):
                 raise ValueError(f"{path} has version {metadata.get('version')}, this program reads {VERSION}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Checkpoint(path, _Parts(path, tensors), _Parts(path, json.loads(metadata["facts"])))
+            return Checkpoint(path, _Parts(path, tensors), _Parts(path, _facts(path, metadata["facts"])))
     except FileNotFoundError as error:
         raise ValueError(f"{path} does not exist") from error
-    except (SafetensorError, KeyError, TypeError, RecursionError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _facts(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return json.loads(text)
+    except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
@@ -166,7 +171,10 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig, origin: Path) -> Spl
     try:
         # Rows of three: the size of the file bounds their number, whatever shape it claims.
         static, dynamic = state["static.means"].view(-1, 3), state["dynamic.means"].view(-1, 3)
-        scene = SplitScene.empty(len(static), len(dynamic), config)
+        sizes = len(static), len(dynamic), config
+        with torch.device("meta"):  # where a config that claims too much takes no memory
+            SplitScene.empty(*sizes).load_state_dict(state, assign=True)
+        scene = SplitScene.empty(*sizes)
         scene.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
         reason = str(error).splitlines()[:2][-1].strip()  # torch has the first detail on the second line

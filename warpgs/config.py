@@ -1,7 +1,7 @@
 """Every default, in one place."""
 
 import dataclasses
-import math
+import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -282,6 +282,18 @@ LEAST = {
 }
 """Smallest values of numbers that must not be 0; no number of a config is negative."""
 
+MOST = {
+    "factor": 1024,
+    "model.position_bands": 64,
+    "model.time_bands": 64,
+    "model.depth": 64,
+    "model.width": 4096,
+}
+"""Largest values of numbers that memory is taken by before anything else bounds it."""
+
+LARGEST = 10**15
+"""No number of a config is larger."""
+
 
 def validate(config: TrainConfig) -> None:
     """Refuses numbers that training would stumble over later.
@@ -308,8 +320,10 @@ def _check_numbers(prefix: str, part: Any) -> None:
         name, value = prefix + field_.name, getattr(part, field_.name)
         if dataclasses.is_dataclass(value):
             _check_numbers(f"{name}.", value)
-        elif isinstance(value, int | float) and not LEAST.get(name, 0) <= value < math.inf:
-            raise ValueError(f"{name} must be a number of at least {LEAST.get(name, 0)}, got {value}")
+        elif isinstance(value, int | float):
+            least, most = LEAST.get(name, 0), MOST.get(name, LARGEST)
+            if not least <= value <= most:
+                raise ValueError(f"{name} must be a number between {least} and {most}, got {reprlib.repr(value)}")
 
 
 def scaled(config: TrainConfig) -> TrainConfig:

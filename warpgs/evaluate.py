@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import math
-import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ from torch import Tensor
 from . import metrics
 from .cameras import Camera
 from .data.capture import Capture, Frame
+from .files import write_text
 from .lpips import Lpips
 from .progress import progress
 from .render import Rendering
@@ -206,18 +206,3 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     """Writes a JSON object; what is not finite becomes null, which every reader understands."""
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
     write_text(path, json.dumps(plain, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text beside its place and moves it there.
-
-    Raises:
-        OSError: If it can't be written; the message names the file.
-    """
-    partial = path.with_suffix(".partial")
-    try:
-        partial.write_text(text)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error

@@ -19,6 +19,19 @@ from .data.capture import Capture
 SMOOTHING = 0.02
 """Standard deviation by which a filming camera's path is smoothed, as a share of the film."""
 
+MOST_FRAMES = 100_000
+"""Of a path."""
+
+UP = (0.0, -1.0, 0.0)
+"""Upward direction where nothing tells another: cameras of captures have y down."""
+
+GUESSED_FOCAL = 1.2
+"""Focal length of a guessed camera, in heights of its picture."""
+
+GUESSED_SIZE = (960, 540)
+GUESSED_DISTANCE = 2.0
+"""Distance of a guessed camera from the middle of the scene, in radii of the scene."""
+
 FARTHEST = 4.0
 """A camera further from the middle of the scene than this many of its radii has left it."""
 
@@ -74,6 +87,19 @@ class Ball:
                     f"{name} leaves the scene: camera {k} at ({place}) is {distance:.3g} from its middle, "
                     f"and may be {FARTHEST * self.radius:.3g}"
                 )
+
+
+def upward(capture: Capture) -> Float[Tensor, "3"]:
+    """The direction that is up in the pictures of a capture, on average."""
+    up = -torch.stack([capture.cameras[name].viewmat[1, :3] for name in capture.train]).mean(0)
+    return up if float(up.norm()) > 1e-3 else torch.tensor(UP)
+
+
+def guessed(ball: Ball, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
+    """A camera that sees most of a scene from one side, a direction of x and z, with y pointing down."""
+    position = ball.center + GUESSED_DISTANCE * ball.radius * torch.tensor([side[0], 0.0, side[1]])
+    focal = GUESSED_FOCAL * GUESSED_SIZE[1]
+    return Camera.looking_at(position, ball.center, torch.tensor(UP), focal, GUESSED_SIZE, time)
 
 
 def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:

@@ -1,9 +1,8 @@
 """Pictures and videos for people to look at."""
 
 import importlib
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType, TracebackType
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from .files import beside, partial_of, write_whole
 from .render import Rendering
 
 ERROR_RANGE = 0.25
@@ -21,6 +21,9 @@ ERROR_RANGE = 0.25
 
 CAPTION_HEIGHT = 18
 VIDEO_RATE = 24.0
+VIDEO_RATES = (0.01, 1000.0)
+"""Lowest and highest rate of a video [1/s]."""
+
 CODEC = "libx264"
 VIDEO_LOSS = 18
 """Constant rate factor of H.264: 0 loses nothing, at 18 one hardly sees that anything is lost."""
@@ -64,21 +67,19 @@ def write_png(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
     Raises:
         OSError: If it can't be written; the message names the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     whole, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not whole:
         raise OSError(f"{path} could not be encoded")
-    partial = path.with_suffix(".partial")
-    try:
-        partial.write_bytes(data.tobytes())
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
+    write_whole(path, [data.tobytes()])
 
 
 class Video:
-    """An MP4 file in H.264, written frame by frame; used as a context, and removed again if that ends with an error."""
+    """An MP4 file in H.264, written frame by frame; used as a context, and not there if that ends with an error.
+
+    Args:
+        path: Where it is once it is whole.
+        rate: Frames a second, within ``VIDEO_RATES``.
+    """
 
     def __init__(self, path: Path, rate: float = VIDEO_RATE) -> None:
         self.path, self.rate = path, rate
@@ -92,9 +93,12 @@ class Video:
         """Adds an RGB frame of the size of the first.
 
         Raises:
+            ValueError: If a side of the frame has less than two pixels.
             OSError: If no video can be written there, or nothing here writes H.264.
         """
         height, width = image.shape[0] & ~1, image.shape[1] & ~1  # H.264 with a colour for 2 × 2 pixels: even sizes
+        if not width or not height:
+            raise ValueError(f"{self.path}: a video needs two pixels a side, got {image.shape[1]} × {image.shape[0]}")
         with self._named():
             if self._file is None:
                 self._open(width, height)
@@ -106,24 +110,24 @@ class Video:
     ) -> None:
         if self._file is None:
             return
-        whole = False
-        try:
-            with self._named():
-                if error is None:
-                    self._file.mux(self._stream.encode(None))
+        if error is None:
+            with self._named(), beside(self.path):
+                self._file.mux(self._stream.encode(None))
                 self._file.close()
-            whole = error is None
-        finally:
-            if not whole and not self.path.is_dir():
-                self.path.unlink(missing_ok=True)
+        else:
+            with suppress(_ffmpeg().FFmpegError):
+                self._file.close()
+            partial_of(self.path).unlink(missing_ok=True)
 
     def _open(self, width: int, height: int) -> None:
         av = _ffmpeg()
         if CODEC not in av.codecs_available:
             raise OSError(f"{self.path} can't be written: the FFmpeg that PyAV was built with has no {CODEC}")
+        if self.path.is_dir():
+            raise OSError(f"{self.path} could not be written: Is a directory")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # The index goes first, so that a browser plays a file while it is loading.
-        self._file = av.open(str(self.path), "w", format="mp4", options={"movflags": "faststart"})
+        self._file = av.open(str(partial_of(self.path)), "w", format="mp4", options={"movflags": "faststart"})
         self._stream = self._file.add_stream(CODEC, Fraction(self.rate).limit_denominator(1000))
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         self._stream.options = {"crf": str(VIDEO_LOSS)}
@@ -134,7 +138,7 @@ class Video:
         try:
             yield
         except _ffmpeg().FFmpegError as error:
-            raise OSError(f"{self.path} could not be written as a video: {error.strerror}") from error
+            raise OSError(f"{self.path} could not be written: {error.strerror}") from error
 
 
 def _ffmpeg() -> ModuleType:

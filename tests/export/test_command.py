@@ -3,19 +3,21 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
 from tests import tiny
 from tests.export import scenes
-from warpgs import checkpoint, runs
+from tests.export.pages import read_page
+from warpgs import checkpoint, paths, runs
 from warpgs.cli import main
 from warpgs.data.nerfies import load_capture
-from warpgs.export import opening
+from warpgs.export import command as command_module
+from warpgs.export import opening, page
 from warpgs.export.command import Export, export_run
 from warpgs.export.compressed import read_compressed
 from warpgs.export.moments import Moments
-from warpgs.export.page import read_page
 from warpgs.export.standard import read_standard
 from warpgs.playback import Player
 
@@ -101,6 +103,35 @@ def test_a_sequence_has_a_file_for_every_moment(run, tmp_path):
         assert (read_standard(tmp_path / "out" / names(tmp_path)[k]).means == cloud.means[cloud.is_dynamic]).all()
 
 
+def test_a_shorter_sequence_leaves_nothing_of_a_longer_one(run, tmp_path):
+    export(run, tmp_path, frames=4, layers="dynamic")
+    export(run, tmp_path, frames=2, layers="static")
+    export(run, tmp_path, frames=2, layers="dynamic")
+    assert names(tmp_path) == ["dynamic_00000.ply", "dynamic_00001.ply", "static_00000.ply", "static_00001.ply"]
+
+
+def test_a_run_folder_without_a_name_gives_a_page_its_own(run, monkeypatch):
+    monkeypatch.chdir(run)
+    moments = Moments.of_run(Path())
+    assert opening.opening(moments, None, keys=2, seconds=1.0).title == "the run"
+
+
+@pytest.mark.parametrize("options", [{"max_gaussians": 9}, {}])
+def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
+    opened, open_capture = [], runs.open_capture
+    monkeypatch.setattr(runs, "open_capture", lambda *told: opened.append(told) or open_capture(*told))
+    export(run, tmp_path, format="html", keys=1, **options)
+    assert len(opened) == 1
+
+
+def test_a_page_of_too_many_gaussians_is_refused_before_anything_is_baked(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "MOST_GAUSSIANS", 3)
+    monkeypatch.setattr(command_module, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(command_module, "find_capture", lambda *_: pytest.fail("opened"))
+    with pytest.raises(ValueError, match="a page holds at most 3 static Gaussians"):
+        export(run, tmp_path, format="html")
+
+
 def test_files_go_into_the_run_folder_by_default(run):
     export_run(Export(run, quiet=True))
     assert (run / "export" / "scene.ply").is_file()
@@ -143,7 +174,7 @@ def test_ply_files_need_no_capture(stranded, tmp_path):
 def test_a_page_without_a_capture_begins_at_a_guess_that_sees_the_scene(stranded, tmp_path):
     assert "the cameras are guessed, because the capture is not at hand" in export(stranded, tmp_path, format="html")
     moments = Moments.of_run(stranded)
-    camera = opening.guessed_camera(moments.at(0.0))
+    camera = paths.guessed(paths.Ball.around(moments.scene.static.means.detach()))
     inside = camera.project(moments.scene.static.means.detach())[3]
     assert inside.float().mean() > 0.7
 
@@ -170,9 +201,14 @@ def test_a_capture_may_be_told_anew(stranded, data, tmp_path):
         ({"format": "html", "keys": 257}, "--keys must be between 1 and 256"),
         ({"format": "html", "seconds": 0.0}, "--seconds must be positive"),
         ({"format": "html", "frames": 3}, "--frames is for PLY files"),
+        ({"format": "html", "time": 0.0}, "--time is for PLY files"),
+        ({"frames": 3, "time": 0.5}, "leave out --time"),
+        ({"keys": 30}, "--keys is for --format html"),
+        ({"seconds": 5.0}, "--seconds is for --format html"),
+        ({"max_megabytes": 256.0}, "--max-megabytes is for --format html"),
         ({"format": "html", "layers": "static"}, "--layers is for PLY files"),
         ({"max_gaussians": 0}, "--max-gaussians must be at least 1"),
-        ({"max_megabytes": -1.0}, "--max-megabytes must be positive"),
+        ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),
     ],
 )

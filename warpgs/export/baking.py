@@ -22,6 +22,11 @@ SCALE_BITS = 10
 SCALE_SPAN = 16.0
 """Logarithms of scales are kept within this of the largest one: a Gaussian that is e¹⁶ times thinner is a flat one."""
 
+COLORS = (-1.0, 2.0)
+REST = (-2.0, 2.0)
+"""Colours and coefficients of higher degrees are kept within these, far beyond what a screen shows: else a few that
+training left outside would take the others' bits."""
+
 WORDS = 4
 LOW_X = 11
 """Bits of y that share the first word with x; the other ten share the second with z."""
@@ -135,11 +140,12 @@ def baked_bytes(num_static: int, num_dynamic: int, keys: int, rest: int) -> int:
 def _color(cloud: Cloud) -> np.ndarray:
     """[N, 4] constant colour and opacity."""
     opacities = 1.0 / (1.0 + np.exp(-cloud.logit_opacities[:, None]))
-    return np.concatenate([0.5 + SH_C0 * cloud.sh[:, 0], opacities], 1)
+    return np.concatenate([np.clip(0.5 + SH_C0 * cloud.sh[:, 0], *COLORS), opacities], 1)
 
 
 def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray) -> Branch:
     means, quats, log_scales = geometry
+    rest = np.clip(rest, *REST)
     sizes = _ends(log_scales)
     bounds = Bounds(
         np.stack([_ends(means[..., a]) for a in range(3)], 1),

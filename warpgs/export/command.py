@@ -3,12 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from warpgs import paths
+from warpgs.files import remove_numbered
 from warpgs.progress import progress
 
 from .baking import bake, baked_bytes
@@ -16,10 +18,15 @@ from .cloud import Cloud
 from .compressed import write_compressed
 from .moments import Moments
 from .opening import find_capture, opening, weighing_cameras
-from .page import MOST_KEYS, write_page
+from .page import MOST_KEYS, Start, check_size, write_page
 from .standard import write_standard
 
-MOST_FRAMES = 100_000
+KEYS, SECONDS, MAX_MEGABYTES = 30, 5.0, 256.0
+"""Of a page, where left out."""
+
+OF_FILES, OF_PAGES = ("time", "frames"), ("keys", "seconds", "max_megabytes")
+"""Options that only PLY files, or only a page, have."""
+
 WRITERS: dict[str, tuple[str, Callable[[Path, Cloud], int]]] = {
     "ply": (".ply", write_standard),
     "compressed": (".compressed.ply", write_compressed),
@@ -36,20 +43,20 @@ class Export:
     """PLY as 3DGS has it; the compressed PLY of SuperSplat and PlayCanvas; one HTML file that plays offline."""
     out: Path | None = None
     """Folder to write into; RUN/export if left out."""
-    time: float = 0.0
-    """Moment in [0, 1] of a PLY file."""
+    time: float | None = None
+    """Moment in [0, 1] of a PLY file; 0 if left out."""
     frames: int | None = None
     """Write a PLY file for each of so many moments, evenly spread over [0, 1]."""
     layers: Literal["all", "static", "dynamic", "apart"] = "all"
     """Which Gaussians go into PLY files; apart makes a file of the static and one of the dynamic ones."""
-    keys: int = 30
-    """Key times of a page; it mixes between them."""
-    seconds: float = 5.0
-    """How long a page takes to play the scene."""
+    keys: int | None = None
+    """Key times of a page, which mixes between them; 30 if left out."""
+    seconds: float | None = None
+    """How long a page takes to play the scene; 5 if left out."""
     max_gaussians: int | None = None
     """Keep no more than these, the ones that the filming camera sees most of."""
-    max_megabytes: float = 256.0
-    """Refuse a page whose Gaussians take more than this, before compression [MB]."""
+    max_megabytes: float | None = None
+    """Refuse a page whose Gaussians take more than this, before compression [MB]; 256 if left out."""
     data: Path | None = None
     """Where the capture is now, if it was moved; a page begins at its cameras."""
     quiet: bool = False
@@ -67,67 +74,93 @@ def export_run(options: Export) -> str:
         OSError: If something can't be written.
     """
     _check(options)
-    if options.data is not None and not options.data.is_dir():
-        raise ValueError(f"--data {options.data} is no folder")
     moments = Moments.of_run(options.run_folder, options.data)
     folder = options.out or options.run_folder / "export"
-    if options.max_gaussians is not None:
-        capture, _ = find_capture(moments, options.quiet)
-        moments = moments.lightest_left_out(options.max_gaussians, weighing_cameras(moments, capture), options.quiet)
-    if options.format == "html":
-        return _export_page(options, moments, folder)
-    return _export_files(options, moments, folder)
+    most, is_page = options.max_gaussians, options.format == "html"
+    if is_page and most is None:
+        _check_page(options, moments)  # before the capture is opened: that can take a minute
+    capture, origin = find_capture(moments, options.quiet) if is_page or most is not None else (None, "")
+    if most is not None:
+        moments = moments.lightest_left_out(most, weighing_cameras(moments, capture), options.quiet)
+    if not is_page:
+        return _export_files(options, moments, folder)
+    _check_page(options, moments)
+    start = opening(moments, capture, options.keys or KEYS, options.seconds or SECONDS)
+    return f"{_export_page(options, moments, start, folder)}\n{origin}"
 
 
 def _check(options: Export) -> None:
-    if not 0 <= options.time <= 1:
+    if options.data is not None and not options.data.is_dir():
+        raise ValueError(f"--data {options.data} is no folder")
+    is_page = options.format == "html"
+    for name in OF_FILES if is_page else OF_PAGES:
+        if getattr(options, name) is not None:
+            meant = "PLY files; a page plays all of time" if is_page else "--format html"
+            raise ValueError(f"{_option(name)} is for {meant}")
+    if is_page and options.layers != "all":
+        raise ValueError("--layers is for PLY files; a page has both and shows either")
+    if options.time is not None and options.frames is not None:
+        raise ValueError("--frames are spread over all of time: leave out --time")
+    if options.time is not None and not 0 <= options.time <= 1:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
-    if options.frames is not None and not 1 <= options.frames <= MOST_FRAMES:
-        raise ValueError(f"--frames must be between 1 and {MOST_FRAMES:,}, got {options.frames}")
-    if not 1 <= options.keys <= MOST_KEYS:
+    if options.frames is not None and not 1 <= options.frames <= paths.MOST_FRAMES:
+        raise ValueError(f"--frames must be between 1 and {paths.MOST_FRAMES:,}, got {options.frames}")
+    if options.keys is not None and not 1 <= options.keys <= MOST_KEYS:
         raise ValueError(f"--keys must be between 1 and {MOST_KEYS}, got {options.keys}")
+    if options.max_gaussians is not None and options.max_gaussians < 1:
+        raise ValueError(f"--max-gaussians must be at least 1, got {options.max_gaussians}")
     for name in ("seconds", "max_megabytes"):
         value = getattr(options, name)
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"--{name.replace('_', '-')} must be positive, got {value}")
-    if options.format == "html" and options.frames is not None:
-        raise ValueError("--frames is for PLY files; a page has --keys")
-    if options.format == "html" and options.layers != "all":
-        raise ValueError("--layers is for PLY files; a page has both and shows either")
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{_option(name)} must be positive, got {value}")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _export_files(options: Export, moments: Moments, folder: Path) -> str:
     """One PLY file a moment and a layer."""
-    times = [options.time] if options.frames is None else paths.evenly(options.frames)
+    times = [options.time or 0.0] if options.frames is None else paths.evenly(options.frames)
     names = {"all": ["scene"], "apart": ["static", "dynamic"]}.get(options.layers, [options.layers])
     suffix, write = WRITERS[options.format]
+    if options.frames is not None:
+        for name in names:  # of a longer sequence before this one
+            remove_numbered(folder, partial(_numbered, name, suffix))
     num_files, size, largest = 0, 0, 0
     for k, time in enumerate(progress(times, "exporting", options.quiet or len(times) == 1)):
         cloud = moments.at(time)
         for name in names:
             rows = cloud.finite if name == "scene" else cloud.finite & (cloud.is_dynamic == (name == "dynamic"))
-            numbered = name if options.frames is None else f"{name}_{k:05d}"
-            size += write(folder / (numbered + suffix), cloud.select(rows))
+            file = name + suffix if options.frames is None else _numbered(name, suffix, k)
+            size += write(folder / file, cloud.select(rows))
             num_files, largest = num_files + 1, max(largest, int(rows.sum()))
     files = "1 file" if num_files == 1 else f"{num_files} files"
     return f"{files} of up to {largest:,} Gaussians in {folder}, {size / 1e6:.1f} MB"
 
 
-def _export_page(options: Export, moments: Moments, folder: Path) -> str:
-    """One page that plays the scene."""
-    cloud = moments.at(0.0)
-    counts = (int((~cloud.is_dynamic).sum()), int(cloud.is_dynamic.sum()))
-    size = baked_bytes(*counts, options.keys, cloud.sh.shape[1] - 1)
-    if size > options.max_megabytes * 1e6:
-        fitting = int(len(cloud) * options.max_megabytes * 1e6 / size)
+def _numbered(name: str, suffix: str, number: int) -> str:
+    return f"{name}_{number:05d}{suffix}"
+
+
+def _check_page(options: Export, moments: Moments) -> None:
+    """Refuses a page that would be too large."""
+    cloud, keys = moments.at(0.0), options.keys or KEYS
+    num_static, num_dynamic = int((~cloud.is_dynamic).sum()), int(cloud.is_dynamic.sum())
+    check_size({"static": num_static, "dynamic": num_dynamic}, keys)
+    size = baked_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1)
+    most = options.max_megabytes or MAX_MEGABYTES
+    if size > most * 1e6:
+        fitting = int(len(cloud) * most * 1e6 / size)
         raise ValueError(
-            f"the page would hold {size / 1e6:.0f} MB for {len(cloud):,} Gaussians at {options.keys} key times, more "
-            f"than {options.max_megabytes:g} MB: use about --max-gaussians {fitting}, fewer --keys, or --max-megabytes"
+            f"the page would hold {size / 1e6:.0f} MB for {len(cloud):,} Gaussians at {keys} key times, more "
+            f"than {most:g} MB: use about --max-gaussians {fitting}, fewer --keys, or --max-megabytes"
         )
-    capture, origin = find_capture(moments, options.quiet)
-    start = opening(moments, capture, options.keys, options.seconds)
-    times = progress(paths.evenly(options.keys), "baking", options.quiet)
-    baked = bake(moments.at, times)
+
+
+def _export_page(options: Export, moments: Moments, start: Start, folder: Path) -> str:
+    """One page that plays the scene."""
+    baked = bake(moments.at, progress(paths.evenly(options.keys or KEYS), "baking", options.quiet))
     written = write_page(folder / "scene.html", baked, start, options.quiet)
-    num = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {options.keys} key times"
-    return f"{folder / 'scene.html'}: {num}, {written / 1e6:.1f} MB\n{origin}"
+    num = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
+    return f"{folder / 'scene.html'}: {num}, {written / 1e6:.1f} MB"

@@ -12,13 +12,6 @@ from .cloud import Cloud
 from .moments import Moments
 from .page import Start
 
-GUESSED_FOCAL = 1.2
-"""Focal length of a guessed camera, in heights of its picture."""
-
-GUESSED_SIZE = (960, 540)
-GUESSED_DISTANCE = 2.0
-"""Distance of a guessed camera from the middle of the scene, in radii of the scene."""
-
 SIDES = ((0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))
 """From where guessed cameras look, as directions of x and z."""
 
@@ -41,22 +34,22 @@ def weighing_cameras(moments: Moments, capture: Capture | None) -> list[Camera]:
         chosen = [names[round(share * (len(names) - 1))] for share in paths.evenly(min(len(names), WEIGHING_CAMERAS))]
         return [capture.cameras[name] for name in chosen]
     times = paths.evenly(WEIGHING_CAMERAS)
-    middle = _finite(moments.at(0.5))
-    return [guessed_camera(middle, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
+    scene = paths.Ball.around(_means(moments.at(0.5)))
+    return [paths.guessed(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
 
 
 def opening(moments: Moments, capture: Capture | None, keys: int, seconds: float) -> Start:
     """How a page of a run begins."""
     cloud = _finite(moments.at(0.5))
     track: list[Camera] = []
-    camera = guessed_camera(cloud)
+    camera = paths.guessed(paths.Ball.around(_means(cloud)))
     if capture is not None:
         names = capture.val or capture.train
         camera, track = capture.cameras[names[len(names) // 2]], paths.filming(capture, keys)
     K = camera.K.tolist()
     moving = cloud.select(cloud.is_dynamic) if cloud.is_dynamic.any() else cloud
     return Start(
-        title=moments.config.out.name if moments.config.out else "scene",
+        title=moments.config.out.resolve().name if moments.config.out else "scene",
         size=camera.size,
         intrinsics=(K[0][0], K[1][1], K[0][2], K[1][2]),
         viewmat=camera.viewmat.tolist(),
@@ -65,14 +58,6 @@ def opening(moments: Moments, capture: Capture | None, keys: int, seconds: float
         seconds=seconds,
         antialias=moments.config.antialias,
     )
-
-
-def guessed_camera(cloud: Cloud, side: tuple[float, float] = SIDES[0], time: float = 0.0) -> Camera:
-    """A camera that sees most of a cloud from one side, with y pointing down."""
-    scene = paths.Ball.around(_means(cloud))
-    position = scene.center + GUESSED_DISTANCE * scene.radius * torch.tensor([side[0], 0.0, side[1]])
-    focal = GUESSED_FOCAL * GUESSED_SIZE[1]
-    return Camera.looking_at(position, scene.center, torch.tensor([0.0, -1.0, 0.0]), focal, GUESSED_SIZE, time)
 
 
 def _finite(cloud: Cloud) -> Cloud:

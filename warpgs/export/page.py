@@ -6,36 +6,30 @@ shapes; browsers do not run scripts of such a type.
 """
 
 import base64
-import binascii
 import gzip
 import html
 import json
 import re
-import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from warpgs.files import write_whole
 from warpgs.progress import progress
 
-from .baking import WORDS, Baked, Bounds, Branch
-from .files import read_bounded, write_whole
-from .packing import from_planes, to_planes
+from .baking import Baked, Bounds, Branch
+from .packing import to_planes
 
 VERSION = 1
-LARGEST_PAGE = 2 << 30
 MOST_KEYS = 256
 """Layers of a texture that every browser with WebGL2 has."""
 
 MOST_GAUSSIANS = 1 << 22
 """Texels of 2048 rows of 2048: what every browser with WebGL2 has, a branch."""
 
-ARRAYS: dict[str, np.dtype] = {"geometry": np.dtype("<u4"), "colors": np.dtype("u1"), "rest": np.dtype("u1")}
-BLOCK = re.compile(r'<script type="([a-z+/;0-9]+)" id="([a-z-]+)">([^<]*)</script>')
-
+ARRAYS = ("geometry", "colors", "rest")
 PLACE = re.compile(r"\[\[([a-z.]+)\]\]")
 """Where the player's page takes another of its files, the title or the scene."""
 
@@ -73,11 +67,7 @@ def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> in
         OSError: If it can't be written; the message names the file.
     """
     branches = {"static": baked.static, "dynamic": baked.dynamic}
-    if baked.keys > MOST_KEYS:
-        raise ValueError(f"a page holds at most {MOST_KEYS} key times, got {baked.keys}")
-    for name, branch in branches.items():
-        if len(branch) > MOST_GAUSSIANS:
-            raise ValueError(f"a page holds at most {MOST_GAUSSIANS:,} {name} Gaussians, got {len(branch):,}")
+    check_size({name: len(branch) for name, branch in branches.items()}, baked.keys)
     facts = {
         "format": "warpgs page",
         "version": VERSION,
@@ -85,7 +75,7 @@ def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> in
         "start": {field.name: getattr(start, field.name) for field in fields(start)},
         "branches": {name: _facts(branch) for name, branch in branches.items()},
     }
-    blocks = [_block("application/json", "scene", json.dumps(facts).replace("<", "\\u003c"))]
+    blocks = [_block("application/json", "scene", json.dumps(facts, allow_nan=False).replace("<", "\\u003c"))]
     parts = [(name, array) for name in branches for array in ARRAYS]
     for name, array in progress(parts, "compressing", quiet):
         packed = gzip.compress(to_planes(getattr(branches[name], array)).tobytes(), 6, mtime=0)
@@ -93,30 +83,21 @@ def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> in
     return write_whole(path, [_page(start.title, "\n".join(blocks)).encode()])
 
 
-def read_page(path: Path) -> Baked:
-    """The numbers of a page.
+def check_size(counts: Mapping[str, int], keys: int) -> None:
+    """Refuses what no browser can hold.
+
+    Args:
+        counts: Number of Gaussians of each branch.
+        keys: Key times.
 
     Raises:
-        ValueError: If it is no such page, of another version, or damaged; the message names it.
+        ValueError: If there are too many.
     """
-    try:
-        text = read_bounded(path, LARGEST_PAGE).decode()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is no page of warpgs: it is no text") from error
-    blocks = {name: content for _, name, content in BLOCK.findall(text)}
-    try:
-        facts = json.loads(blocks["scene"])
-        if facts["format"] != "warpgs page" or facts["version"] != VERSION:
-            raise ValueError(f"it has version {facts['version']!r}, this program reads {VERSION}")
-        if not 0 < int(facts["keys"]) <= MOST_KEYS:
-            raise ValueError(f"it says that it has {facts['keys']!r} key times")
-        static, dynamic = (_branch(blocks, name, facts["branches"][name]) for name in ("static", "dynamic"))
-    except RecursionError as error:
-        raise ValueError(f"{path} is no page of warpgs, or damaged: it is nested too deep") from error
-    except (KeyError, TypeError, ValueError, zlib.error, EOFError, OverflowError) as error:
-        reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} is no page of warpgs, or damaged: {reason}") from error
-    return Baked(int(facts["keys"]), static, dynamic)
+    if keys > MOST_KEYS:
+        raise ValueError(f"a page holds at most {MOST_KEYS} key times, got {keys}")
+    for name, count in counts.items():
+        if count > MOST_GAUSSIANS:
+            raise ValueError(f"a page holds at most {MOST_GAUSSIANS:,} {name} Gaussians, got {count:,}")
 
 
 def _page(title: str, blocks: str) -> str:
@@ -138,38 +119,3 @@ def _block(kind: str, name: str, content: str) -> str:
 def _facts(branch: Branch) -> dict[str, Any]:
     shapes = {array: getattr(branch, array).shape for array in ARRAYS}
     return {"shapes": shapes, **{f.name: getattr(branch.bounds, f.name).tolist() for f in fields(Bounds)}}
-
-
-def _branch(blocks: dict[str, str], name: str, facts: dict[str, Any]) -> Branch:
-    bounds = {field.name: np.asarray(facts[field.name], np.float64) for field in fields(Bounds)}
-    if bounds["means"].shape != (2, 3) or any(bounds[f].shape != (2,) for f in ("log_scales", "colors", "rest")):
-        raise ValueError(f"{name} has bounds of another shape")
-    if not all(np.isfinite(values).all() for values in bounds.values()):
-        raise ValueError(f"{name} has bounds that are not finite")
-    arrays = {array: _array(blocks[f"{name}-{array}"], facts["shapes"][array], array) for array in ARRAYS}
-    num = arrays["geometry"].shape[1]
-    if arrays["colors"].shape[1] != num or arrays["rest"].shape[0] != num:
-        raise ValueError(f"{name} has arrays of different lengths")
-    return Branch(Bounds(**bounds), **arrays)
-
-
-def _array(content: str, claimed: Any, name: str) -> np.ndarray:
-    """What a block holds, which must be as much as its shape claims and no more."""
-    shape, dtype = tuple(claimed), ARRAYS[name]
-    most = (MOST_GAUSSIANS, 15, 3) if name == "rest" else (MOST_KEYS, MOST_GAUSSIANS, WORDS)
-    if len(shape) != 3 or any(type(n) is not int or not 0 <= n <= m for n, m in zip(shape, most, strict=True)):
-        raise ValueError(f"{name} has the shape {claimed!r}")
-    if shape[2] != most[2]:
-        raise ValueError(f"{name} has the shape {claimed!r}")
-    size = int(np.prod(shape)) * dtype.itemsize
-    try:
-        packed = base64.b64decode(content, validate=True)
-    except binascii.Error as error:
-        raise ValueError(f"{name} is no base64") from error
-    if size > 1100 * len(packed):  # gzip packs at most 1032 times
-        raise ValueError(f"{name} is too short for its shape")
-    expander = zlib.decompressobj(wbits=31)
-    data = expander.decompress(packed, size + 1)
-    if len(data) != size or not expander.eof:
-        raise ValueError(f"{name} does not hold what its shape says")
-    return from_planes(np.frombuffer(data, np.uint8), shape, dtype)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .files import read_bounded, write_whole
+from warpgs.files import read_bounded, write_whole
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"},

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from warpgs.cameras import Camera
-from warpgs.evaluate import write_text
+from warpgs.files import write_text
 
 FOLDER = "paths"
 """Where a run folder keeps the paths that the viewer saves."""
@@ -48,5 +48,4 @@ def write_path(path: Path, cameras: Sequence[Camera]) -> None:
         }
         for camera in cameras
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps({"keyframes": keyframes}, indent=2) + "\n")
