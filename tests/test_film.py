@@ -39,7 +39,8 @@ def render_at(run):
 
 
 def render(run, tmp_path, **options):
-    return render_run(Render(run, **{"out": tmp_path / "out", "quiet": True, "device": "cpu", "frames": 3, **options}))
+    of_a_path = {} if options.get("path", "views") == "views" and "keyframes" not in options else {"frames": 3}
+    return render_run(Render(run, **{"out": tmp_path / "out", "quiet": True, "device": "cpu", **of_a_path, **options}))
 
 
 def pictures_of(tmp_path):
@@ -132,6 +133,13 @@ def test_keyframes_are_followed(run, capture, render_at, tmp_path):
     assert (pictures_of(tmp_path)["00000"] == shown(render_at, camera)).all()
 
 
+def test_a_shorter_film_leaves_no_picture_of_a_longer_one(run, tmp_path):
+    render(run, tmp_path, path="fixed", frames=4, write="png")
+    (tmp_path / "out" / "00009.png").write_text("of somebody else: there is a gap before it")
+    render(run, tmp_path, path="fixed", frames=2, write="png")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["00000.png", "00001.png", "00009.png"]
+
+
 def test_pictures_are_in_the_run_folder_by_default(run):
     render_run(Render(run, path="fixed", frames=1, quiet=True, device="cpu"))
     assert (run / "render" / "fixed" / "00000.png").is_file()
@@ -184,14 +192,26 @@ def test_progress_is_shown_unless_it_should_be_quiet(run, tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"frames": 0}, "--frames must be between 1 and"),
+        ({"path": "fixed", "frames": 0}, "--frames must be between 1 and"),
+        ({"frames": 3}, "--frames is for .* not for views"),
+        ({"view": "a"}, "--view is for fixed and spiral and bullet, not for views"),
+        ({"path": "frozen", "view": "a"}, "--view is for .* not for frozen"),
+        ({"path": "fixed", "time": 0.0}, "--time is for frozen and spiral and bullet, not for fixed"),
+        ({"path": "moving", "time": 0.5}, "--time is for .* not for moving"),
+        ({"keyframes": Path("a.json"), "time": 0.5}, "--time is for .* not for keyframes"),
+        ({"keyframes": Path("a.json"), "view": "a"}, "--view is for .* not for keyframes"),
+        ({"keyframes": Path("a.json"), "truth": True}, "--truth is for views, not for keyframes"),
+        ({"keyframes": Path("a.json"), "path": "views"}, "leave out --path"),
         ({"supersample": 0}, "--supersample must be between 1 and 8"),
         ({"supersample": 9}, "--supersample must be between 1 and 8"),
-        ({"time": -0.1}, "--time must be in"),
+        ({"path": "frozen", "time": -0.1}, "--time must be in"),
         ({"scale": 0.0}, "--scale must be positive"),
         ({"scale": float("inf")}, "--scale must be positive"),
-        ({"rate": -5.0}, "--rate must be positive"),
-        ({"truth": True, "path": "spiral"}, "--truth is for the evaluation views"),
+        ({"rate": -5.0}, "--rate must be between 0.01 and 1000"),
+        ({"rate": 1e300}, "--rate must be between"),
+        ({"rate": 1e-300}, "--rate must be between"),
+        ({"rate": float("nan")}, "--rate must be between"),
+        ({"truth": True, "path": "spiral"}, "--truth is for views, not for spiral"),
         ({"path": "fixed", "view": "none"}, "has no view 'none'"),
         ({"scale": 0.001}, "has no pixels"),
         ({"scale": 5000.0}, "must be between 0 and 32768 pixels"),
@@ -274,6 +294,31 @@ def test_a_capture_that_was_moved_is_told_and_can_be_named(stranded, capture, tm
     (stranded / "config.json").write_text(json.dumps({**config, "data": str(tmp_path / "gone")}))
     assert str(tmp_path / "gone") in line(capsys, stranded)
     assert f"{len(capture.val)} pictures" in render(stranded, tmp_path, data=Path(here))
+
+
+LACKS = [torch.OutOfMemoryError("CUDA out of memory."), MemoryError("no"), RuntimeError("can't allocate memory:\n9")]
+
+
+@pytest.mark.parametrize("error", LACKS)
+def test_too_little_memory_ends_a_command_with_a_line_that_says_what_to_do(run, monkeypatch, capsys, error):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr(film, "render_run", fail)
+    assert main(["render", str(run)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("warpgs: out of memory (")
+    assert "smaller pictures, fewer Gaussians" in said
+    assert said.count("\n") == 1
+
+
+def test_any_other_error_is_one_of_the_program(run, monkeypatch):
+    def fail(_):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(film, "render_run", fail)
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(["render", str(run)])
 
 
 def test_ctrl_c_ends_a_command_with_a_line(run, monkeypatch, capsys):

@@ -98,7 +98,11 @@ def test_one_keyframe_is_held(path):
         ({"view": "0", "time": 1.5}, r"time must be in \[0, 1\], got 1.5"),
         ({"view": "0", "time": float("nan")}, "time must be a number, got nan"),
         ({"view": "0", "time": 0, "speed": 2}, "unknown field 'speed'"),
-        ({"view": "0", "time": 0, "focal": -1}, "focal must be positive"),
+        ({"view": "0", "time": 0, "focal": -1}, "focal must have a focal length of at least 0.001 px"),
+        ({"view": "0", "time": 0, "focal": 1e-300}, "focal must have a focal length of at least"),
+        ({"view": "0", "time": 10**400}, "time must be a number, got 1000"),
+        ({**SAVED, "K": [[1e-300, 0, 1], [0, 1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
+        ({**SAVED, "K": [[1, 0, 1], [0, -1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
         ({**PLACED, "target": PLACED["position"]}, "its target is nowhere"),
         ({**PLACED, "target": [0.1, 9.0, -1.0]}, "straight up or down"),
         ({**PLACED, "position": [0, 0]}, "position must be three numbers"),
@@ -122,6 +126,7 @@ def test_a_keyframe_that_is_none_is_refused_with_its_number(path, keyframe, word
     [
         ("", "is no JSON"),
         ("{", "is no JSON"),
+        ('{"keyframes": [{"view": "0", "time": ' + 5000 * "1" + "}]}", "is no JSON"),
         ("[" * 100_000, "is no JSON"),
         ("[]", "expected an object with keyframes, got list"),
         ("{}", "has no list of keyframes"),
@@ -131,6 +136,7 @@ def test_a_keyframe_that_is_none_is_refused_with_its_number(path, keyframe, word
         ('{"keyframes": [{"view": "0", "time": 0}], "up": 1}', "up must be three numbers"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0}]}', "every keyframe has a field"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0, "at": 1}]}', "at must grow"),
+        ('{"keyframes": [{"view": "0", "time": 0, "at": 1' + 400 * "0" + "}]}", "at must be a number"),
     ],
 )
 def test_a_file_that_is_no_path_is_refused_in_a_line(path, text, words):
@@ -155,7 +161,14 @@ def test_a_file_that_is_no_text_is_refused(path):
 
 def test_a_huge_file_is_not_read(path):
     path.write_text(" " * ((1 << 20) + 1))
-    with pytest.raises(ValueError, match="is larger than"):
+    with pytest.raises(ValueError, match="has 1,048,577 bytes, more than"):
+        read_path(path, FILM, 3)
+
+
+def test_a_device_is_not_read(path):
+    """It would never end; its size is 0."""
+    path.symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match="is no file"):
         read_path(path, FILM, 3)
 
 
@@ -172,4 +185,7 @@ def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(pat
         path.write_bytes(data[: random.integers(len(data))] if random.random() < 0.2 else data)
         said = refusal(lambda path: read_path(path, FILM, 3), path)
         assert said is None or (str(path) in said and "\n" not in said)
-        assert said is not None or all(bool(c.viewmat.isfinite().all()) for c in read_path(path, FILM, 3))
+        for camera in [] if said is not None else read_path(path, FILM, 3):
+            assert bool(camera.viewmat.isfinite().all())
+            assert bool(camera.K.isfinite().all())
+            assert min(float(camera.K[0, 0]), float(camera.K[1, 1])) > 0

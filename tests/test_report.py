@@ -201,6 +201,15 @@ def test_without_the_capture_pictures_come_from_the_run_folder(tmp_path, run):
     assert {decoded(uri).shape for uri in page.images()} == {(24, 32, 3)}
 
 
+def test_a_run_that_can_not_be_rendered_leaves_the_pictures_of_the_others(tmp_path, run, other):
+    before = report(tmp_path, run, views=1).images()
+    shutil.rmtree(other / "checkpoints")
+    page = report(tmp_path, run, other, views=1)
+    assert set(before) <= set(page.images())
+    assert f"other: only views whose pictures the evaluation kept: {other} has no checkpoint yet" in page.text
+    assert "run: only views" not in page.text
+
+
 def test_without_capture_and_pictures_there_is_still_a_report(tmp_path, run):
     edit_json(run / "config.json", data=str(tmp_path / "gone"))
     shutil.rmtree(run / "pictures")
@@ -364,6 +373,46 @@ def test_a_damaged_file_is_named(capsys, run, name, content):
 def test_metrics_that_are_none_are_named(capsys, run, text):
     (run / "metrics.json").write_text(text)
     assert "metrics.json is damaged: expected an object" in refusal(capsys, run)
+
+
+@pytest.mark.parametrize("number", ["Infinity", "-Infinity", "NaN", "1" + 400 * "0", "1" + 5000 * "0"])
+@pytest.mark.parametrize("name", ["train_seconds", "peak_bytes", "psnr"])
+def test_metrics_that_no_run_has_are_named(capsys, run, name, number):
+    (run / "metrics.json").write_text(f'{{"{name}": {number}}}')
+    assert f"{run / 'metrics.json'} is damaged" in refusal(capsys, run, "--views", 0)
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim", "time"])
+@pytest.mark.parametrize("number", ["1.7e308", "-1.7e308", "-inf"])
+def test_figures_that_no_view_has_are_named(capsys, run, name, number):
+    edit_views(run, lambda rows: rows[1].update({name: number}))
+    assert f"views.csv: line 3: {name} can't be" in refusal(capsys, run)
+
+
+def test_a_perfect_view_is_reported(tmp_path, run):
+    edit_views(run, lambda rows: rows[0].update(psnr="inf"))
+    assert "inf dB" in report(tmp_path, run, views=1).text
+
+
+@pytest.mark.parametrize("number", ["1" + 400 * "0", "1" + 5000 * "0", "Infinity"])
+@pytest.mark.parametrize("name", ["resident_bytes", "seed", "optim.means"])
+def test_settings_that_no_run_has_are_named(capsys, run, name, number):
+    first, _, rest = name.partition(".")
+    values = json.loads((run / "config.json").read_text())
+    if rest:
+        values[first][rest] = "HERE"
+    else:
+        values[first] = "HERE"
+    (run / "config.json").write_text(json.dumps(values).replace('"HERE"', number))
+    assert f"{run / 'config.json'}" in refusal(capsys, run, "--views", 0)
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "views.csv", "config.json"])
+def test_a_device_is_not_read(capsys, run, name):
+    """It would never end; its size is 0."""
+    (run / name).unlink()
+    (run / name).symlink_to("/dev/zero")
+    assert f"{run / name} is no file" in refusal(capsys, run)
 
 
 def test_views_without_a_column_are_of_another_version(capsys, run):

@@ -12,6 +12,7 @@ from . import runs
 from .bench import Bench
 from .export.command import Export
 from .film import Render
+from .memory import is_out_of_memory
 from .prepare.commands import Check, Prepare
 from .report.command import Report
 from .viewer.command import View
@@ -51,6 +52,10 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
 
+ADVICE = "free some, or ask for less: smaller pictures, fewer Gaussians; --device cpu where a GPU has too little"
+"""What to do without enough memory."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="warpgs", description=__doc__, args=arguments)
@@ -62,4 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("warpgs: stopped", file=sys.stderr)
         return INTERRUPTED
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        print(f"warpgs: out of memory ({' '.join(str(error).split())[:200]}); {ADVICE}", file=sys.stderr)
+        return 2
     return 0

@@ -18,13 +18,24 @@ from . import paths, paths_file, pictures, runs
 from .cameras import Camera
 from .data.capture import Capture
 from .evaluate import RenderAt
+from .files import remove_numbered
 from .playback import Player
 from .progress import progress
 from .render import Rendering
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
 
-MOST_FRAMES = 100_000
+FRAMES = 120
+"""Pictures along a path, where left out."""
+
+MEANT_FOR = {
+    "truth": ("views",),
+    "view": ("fixed", "spiral", "bullet"),
+    "time": ("frozen", "spiral", "bullet"),
+    "frames": ("fixed", "frozen", "moving", "spiral", "bullet", "keyframes"),
+}
+"""Options that only some paths have."""
+
 LARGEST_SUPERSAMPLING = 8
 REACH = 0.3
 """Radius of the spiral, as a share of the radius of the filming camera's own path."""
@@ -36,9 +47,9 @@ class Render:
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
     """Run folder."""
-    path: PathName = "views"
-    """What the camera does: the evaluation views; a fixed camera while time runs; the filming camera's path at a frozen
-    moment; the same while time runs; a spiral around the middle view; bullet time around it."""
+    path: PathName | None = None
+    """What the camera does: the evaluation views (if left out); a fixed camera while time runs; the filming camera's
+    path at a frozen moment; the same while time runs; a spiral around the middle view; bullet time around it."""
     keyframes: Path | None = None
     """JSON file of keyframes to follow instead (docs/viewing.md)."""
     out: Path | None = None
@@ -47,8 +58,8 @@ class Render:
     """Id of the view that fixed, spiral and bullet start from; the middle evaluation view if left out."""
     time: float | None = None
     """Moment in [0, 1] at which frozen and bullet stand still (½ if left out); spiral runs through time if left out."""
-    frames: int = 120
-    """Pictures along a path."""
+    frames: int | None = None
+    """Pictures along a path; 120 if left out."""
     rate: float = pictures.VIDEO_RATE
     """Pictures a second of the video."""
     write: Literal["both", "png", "mp4"] = "both"
@@ -71,6 +82,11 @@ class Render:
     def run(self) -> None:
         print(render_run(self))
 
+    @property
+    def kind(self) -> str:
+        """The path, or that there are keyframes instead."""
+        return "keyframes" if self.keyframes is not None else self.path or "views"
+
 
 def render_run(options: Render) -> str:
     """Does what the command was asked; returns a text for people.
@@ -87,34 +103,40 @@ def render_run(options: Render) -> str:
     means = torch.cat([scene.dynamic.means, scene.static.means]).detach()
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
     cameras, names = _cameras(options, capture, scene.dynamic.means.detach(), means)
-    paths.Ball.around(means, centers).check(cameras, str(options.keyframes or options.path))
+    paths.Ball.around(means, centers).check(cameras, str(options.keyframes or options.kind))
     device = torch.device(config.device or "cpu")
     film = _Film(options, capture, Player(scene.to(device), config, facts), device)
-    kind = options.keyframes.stem if options.keyframes else options.path
-    folder = options.out or options.run_folder / "render" / kind
+    name = options.keyframes.stem if options.keyframes else options.kind
+    folder = options.out or options.run_folder / "render" / name
     return _write(options, folder, names, film.pictures(cameras, names))
 
 
 def _check(options: Render) -> None:
-    if not 1 <= options.frames <= MOST_FRAMES:
-        raise ValueError(f"--frames must be between 1 and {MOST_FRAMES:,}, got {options.frames}")
+    if options.keyframes is not None and options.path is not None:
+        raise ValueError("--keyframes are a path of their own: leave out --path")
+    for name, kinds in MEANT_FOR.items():
+        value = getattr(options, name)
+        if value is not None and value is not False and options.kind not in kinds:
+            raise ValueError(f"--{name} is for {' and '.join(kinds)}, not for {options.kind}")
+    if options.frames is not None and not 1 <= options.frames <= paths.MOST_FRAMES:
+        raise ValueError(f"--frames must be between 1 and {paths.MOST_FRAMES:,}, got {options.frames}")
     if not 1 <= options.supersample <= LARGEST_SUPERSAMPLING:
         raise ValueError(f"--supersample must be between 1 and {LARGEST_SUPERSAMPLING}, got {options.supersample}")
     if options.time is not None and not 0 <= options.time <= 1:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
-    for name, value in (("scale", options.scale), ("rate", options.rate)):
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"--{name} must be positive, got {value}")
-    if options.truth and (options.path != "views" or options.keyframes):
-        raise ValueError("--truth is for the evaluation views: nothing was filmed along another path")
+    if not (math.isfinite(options.scale) and options.scale > 0):
+        raise ValueError(f"--scale must be positive, got {options.scale}")
+    slowest, fastest = pictures.VIDEO_RATES
+    if not slowest <= options.rate <= fastest:
+        raise ValueError(f"--rate must be between {slowest:g} and {fastest:g}, got {options.rate}")
 
 
 def _cameras(options: Render, capture: Capture, moving: Tensor, means: Tensor) -> tuple[list[Camera], list[str]]:
     """The cameras of the path, and a name for the picture of each."""
-    frames, moment = options.frames, 0.5 if options.time is None else options.time
+    frames, moment = options.frames or FRAMES, 0.5 if options.time is None else options.time
     if options.keyframes is not None:
         return _numbered(paths_file.read_path(options.keyframes, capture, frames))
-    if options.path == "views":
+    if options.kind == "views":
         if not capture.val:
             raise ValueError(f"{capture.name} has no evaluation views; choose another --path")
         return [capture.cameras[name] for name in capture.val], list(capture.val)
@@ -133,7 +155,11 @@ def _cameras(options: Render, capture: Capture, moving: Tensor, means: Tensor) -
 
 
 def _numbered(path: list[Camera]) -> tuple[list[Camera], list[str]]:
-    return path, [f"{k:05d}" for k in range(len(path))]
+    return path, [_number(k) for k in range(len(path))]
+
+
+def _number(k: int) -> str:
+    return f"{k:05d}"
 
 
 def _view(options: Render, capture: Capture) -> Camera:
@@ -190,6 +216,8 @@ def _fitted(truth: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w
 
 def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:
     """Writes pictures as they come."""
+    if options.kind != "views" and options.write != "mp4":  # of a longer path before this one
+        remove_numbered(folder, lambda k: f"{_number(k)}.png")
     with ExitStack() as stack:
         video = pictures.Video(folder / "video.mp4", options.rate)
         writer = stack.enter_context(video) if options.write != "png" else None

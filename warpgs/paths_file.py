@@ -15,7 +15,7 @@ evenly spread. ``up`` is the capture's own where it is left out.
 import dataclasses
 import itertools
 import json
-import math
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from torch import Tensor
 from . import paths
 from .cameras import Camera
 from .data.capture import Capture
+from .files import read_bounded
 
 POSES = ("view", "position", "viewmat")
 KEYS = {*POSES, "target", "K", "width", "height", "time", "focal", "at"}
@@ -34,6 +35,11 @@ RIGID = 1e-3
 
 LARGEST_FILE = 1 << 20
 LARGEST_SIDE = 32768
+LARGEST = 1e9
+"""Of all numbers."""
+
+SHORTEST = 1e-3
+"""Focal length [px]."""
 
 
 def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
@@ -48,7 +54,7 @@ def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
     keyframes = values.get("keyframes")
     if not isinstance(keyframes, list) or not keyframes:
         raise ValueError(f"{path} has no list of keyframes")
-    up = _vector(f"{path}: up", values["up"]) if "up" in values else upward(capture)
+    up = _vector(f"{path}: up", values["up"]) if "up" in values else paths.upward(capture)
     cameras: list[Camera] = []
     for k, value in enumerate(keyframes):
         size = cameras[0].size if cameras else None
@@ -58,19 +64,11 @@ def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
     return paths.interpolated(cameras, places, at, smooth=True)
 
 
-def upward(capture: Capture) -> Tensor:
-    """The direction that is up in the pictures of a capture, on average."""
-    return -torch.stack([capture.cameras[name].viewmat[1, :3] for name in capture.train]).mean(0)
-
-
 def _load(path: Path) -> dict[str, Any]:
+    data = read_bounded(path, LARGEST_FILE)
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise ValueError(f"{path} is larger than {LARGEST_FILE:,} bytes: it is no file of keyframes")
-        values = json.loads(path.read_text("utf-8"))
-    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-        raise ValueError(f"{path} is no file") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        values = json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object with keyframes, got {type(values).__name__}")
@@ -88,9 +86,7 @@ def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[i
     camera = _placed(name, value, capture, up)
     camera = camera if size is None else _in_size(camera, size)
     if "focal" in value:
-        focal = _number(f"{name}: focal", value["focal"])
-        if focal <= 0:
-            raise ValueError(f"{name}: focal must be positive, got {focal}")
+        focal = _focal(f"{name}: focal", value["focal"])
         K = camera.K.clone()
         K[1, 1] *= focal / float(K[0, 0])
         K[0, 0] = focal
@@ -106,7 +102,7 @@ def _placed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> C
     if "view" in value:
         view = value["view"]
         if not isinstance(view, str) or view not in capture.cameras:
-            raise ValueError(f"{name}: {capture.name} has no view {view!r}")
+            raise ValueError(f"{name}: {capture.name} has no view {reprlib.repr(view)}")
         return capture.cameras[view]
     if "viewmat" in value:
         return _saved(name, value, first)
@@ -130,7 +126,9 @@ def _saved(name: str, value: dict[str, Any], first: Camera) -> Camera:
     if not {"K", "width", "height"} <= value.keys():
         raise ValueError(f"{name} must have all of K, width and height, or none")
     K = _matrix(f"{name}: K", value["K"], 3)
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
+    for axis in range(2):
+        _focal(f"{name}: K", value["K"][axis][axis])
+    if not (K[0, 1] == K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
         raise ValueError(f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
     width, height = value["width"], value["height"]
     if any(type(side) is not int or not 0 < side <= LARGEST_SIDE for side in (width, height)):
@@ -161,14 +159,22 @@ def _places(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > 1e9:
-        raise ValueError(f"{name} must be a number, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise ValueError(f"{name} must be a number, got {reprlib.repr(value)}")
     return float(value)
+
+
+def _focal(name: str, value: Any) -> float:
+    """A focal length that is one in single precision, too, and in a picture of any size."""
+    focal = _number(name, value)
+    if focal < SHORTEST:
+        raise ValueError(f"{name} must have a focal length of at least {SHORTEST} px, got {focal}")
+    return focal
 
 
 def _vector(name: str, value: Any) -> Tensor:
     if not isinstance(value, list) or len(value) != 3:
-        raise ValueError(f"{name} must be three numbers, got {value!r}")
+        raise ValueError(f"{name} must be three numbers, got {reprlib.repr(value)}")
     return torch.tensor([_number(name, v) for v in value])
 
 

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import reprlib
 import subprocess
+import sys
 import typing
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +16,8 @@ from .config import TrainConfig, validate
 from .data.capture import Capture, Frame
 from .data.nerfies import load_capture
 from .data.synthetic import builtin_capture
-from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_text, write_views
+from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_views
+from .files import read_bounded, write_text
 from .lpips import find, locate
 from .playback import Player
 from .progress import progress
@@ -23,6 +26,9 @@ from .scene.split import SplitScene
 
 PICTURES = 6
 """Evaluation views to draw, spread over the capture."""
+
+LARGEST_CONFIG = 1 << 20
+"""Of config.json [bytes]."""
 
 VIDEO_FRAMES = 120
 """Frames of the video over time, at most."""
@@ -80,11 +86,12 @@ def load_config(folder: Path) -> TrainConfig:
         ValueError: If the folder is no run, or its config has unknown or ill-typed fields.
     """
     path = folder / "config.json"
+    if not path.exists():
+        raise ValueError(f"{folder} is no run folder: it has no config.json")
+    data = read_bounded(path, LARGEST_CONFIG)
     try:
-        values = json.loads(path.read_text())
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise ValueError(f"{folder} is no run folder: it has no config.json") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        values = json.loads(data)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     config = dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
     try:
@@ -109,7 +116,7 @@ def _from_plain(kind: Any, values: Any, path: Path) -> Any:
         elif Path in typing.get_args(hint) and isinstance(value, str):
             value = Path(value)
         elif not _fits(value, hint):
-            raise ValueError(f"{path}: {name} can't be {value!r}")
+            raise ValueError(f"{path}: {name} can't be {reprlib.repr(value)}")
         parts[name] = float(value) if hint is float else value
     return kind(**parts)
 
@@ -120,7 +127,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if choices := typing.get_args(hint):
         return any(_fits(value, choice) for choice in choices)
     if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     return type(value) is hint
 
 

@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpgs.evaluate import write_text
+from warpgs.files import write_text
 
 from .page import Gallery, page
 from .record import Record, read_records
-from .strips import available, from_folder, rendered
+from .strips import Strips, available, from_folder, rendered
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,6 @@ class Report:
         moment = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
         made = f"made {moment} by warpgs {importlib.metadata.version('warpgs')}"
         out = self.out or (self.run_folders[0] if len(records) == 1 else Path()) / "report.html"
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_text(out, page(records, [gallery for gallery in galleries if gallery.worst], made))
         print(f"{out}: {out.stat().st_size / 2**20:.1f} MiB")
 
@@ -57,12 +56,18 @@ class Report:
         """Worst and best views of runs that share a capture."""
         chosen = [records[k] for k in group]
         worst, best = extremes(chosen, self.views)
-        try:
-            strips = [rendered(record, [*worst, *best], self.device, self.quiet) for record in chosen]
-        except (ValueError, OSError) as error:
+        strips: list[Strips] = []
+        reasons: dict[int, str] = {}
+        for k, record in enumerate(chosen):
+            try:
+                strips.append(rendered(record, [*worst, *best], self.device, self.quiet))
+            except (ValueError, OSError) as error:
+                reasons[k] = " ".join(str(error).split())
+                strips.append(Strips({}, ""))
+        if len(reasons) == len(chosen):  # then only views of which there are pictures
             worst, best = extremes(chosen, self.views, set.intersection(*map(available, chosen)))
-            reason = " ".join(str(error).split())
-            strips = [from_folder(record, [*worst, *best], reason) for record in chosen]
+        for k, reason in reasons.items():
+            strips[k] = from_folder(chosen[k], [*worst, *best], reason)
         return Gallery(group, worst, best, strips)
 
 

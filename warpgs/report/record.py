@@ -4,6 +4,7 @@ import csv
 import json
 import logging
 import math
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,16 @@ from tensorboard.backend.event_processing.event_accumulator import SCALARS, Even
 
 from warpgs import runs
 from warpgs.config import TrainConfig
+from warpgs.files import read_bounded
 
 Curve = list[tuple[float, float]]
 """(iteration, value), in order."""
+
+LARGEST_FILE = 64 << 20
+"""Of metrics.json and of views.csv [bytes]."""
+
+LARGEST = 1e18
+"""Of their numbers; bytes are the largest."""
 
 NEEDED = ("name", "time", "psnr")
 """Columns of views.csv that a report can't do without; all others are figures like psnr."""
@@ -75,22 +83,30 @@ def _read(label: str, folder: Path) -> Record:
 
 def _read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / "metrics.json"
+    data = _of_evaluation(path)
     try:
-        values = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise ValueError(f"{folder} has no metrics.json: evaluate it with warpgs eval {folder}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        values = json.loads(data)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(values, dict) or any(isinstance(v, dict | list) for v in values.values()):
         raise ValueError(f"{path} is damaged: expected an object of numbers and texts")
+    for name, value in values.items():
+        if isinstance(value, int | float) and not abs(value) <= LARGEST:
+            raise ValueError(f"{path} is damaged: {reprlib.repr(name)} can't be {reprlib.repr(value)}")
     return values
 
 
+def _of_evaluation(path: Path) -> bytes:
+    """A file that the evaluation leaves in a run folder."""
+    if not path.exists():
+        raise ValueError(f"{path.parent} has no {path.name}: evaluate it with warpgs eval {path.parent}")
+    return read_bounded(path, LARGEST_FILE)
+
+
 def _read_views(path: Path) -> list[View]:
+    data = _of_evaluation(path)
     try:
-        lines = list(csv.reader(path.read_text().splitlines(), strict=True))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path.parent} has no views.csv: evaluate it with warpgs eval {path.parent}") from error
+        lines = list(csv.reader(data.decode().splitlines(), strict=True))
     except (csv.Error, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     header, *rows = lines or [[]]
@@ -105,15 +121,23 @@ def _view(path: Path, line: int, header: list[str], row: list[str]) -> View:
     texts = dict(zip(header, row, strict=True))
     name = texts.pop("name")
     figures = {key: _figure(f"{path}: line {line}: {key}", text) for key, text in texts.items()}
-    return View(name, figures.pop("time") or 0.0, figures)
+    time = figures.pop("time") or 0.0
+    if math.isinf(time):
+        raise ValueError(f"{path}: line {line}: time can't be infinite")
+    return View(name, time, figures)
 
 
 def _figure(name: str, text: str) -> float | None:
+    """A figure; the PSNR of a perfect picture is infinite."""
     try:
         value = float(text) if text else math.nan
     except ValueError as error:
-        raise ValueError(f"{name} can't be {text!r}") from error
-    return None if math.isnan(value) else value
+        raise ValueError(f"{name} can't be {reprlib.repr(text)}") from error
+    if math.isnan(value):
+        return None
+    if value != math.inf and not abs(value) <= LARGEST:
+        raise ValueError(f"{name} can't be {reprlib.repr(text)}")
+    return value
 
 
 def _read_curves(folder: Path) -> dict[str, Curve]:
@@ -127,4 +151,4 @@ def _read_curves(folder: Path) -> dict[str, Curve]:
     except Exception as error:  # of a damaged file it raises whatever its parser does
         raise ValueError(f"{folder} is damaged: {error}") from error
     curves = {tag: [(float(e.step), float(e.value)) for e in events.Scalars(tag)] for tag in events.Tags()[SCALARS]}
-    return {tag: [(x, y) for x, y in curve if math.isfinite(y)] for tag, curve in curves.items()}
+    return {tag: [(x, y) for x, y in curve if abs(y) <= LARGEST] for tag, curve in curves.items()}
