@@ -38,9 +38,9 @@ def parse(arguments: Sequence[str]) -> TrainConfig:
     return tyro.cli(TrainConfig, default=PRESETS[preset], args=list(arguments), prog="train.py")
 
 
-def checked(capture: Capture) -> Capture:
+def checked(capture: Capture, config: TrainConfig) -> Capture:
     """The capture, after its warnings; one that would be trained on in vain ends the program with exit code 1."""
-    findings = quick_findings(capture)
+    findings = quick_findings(capture, all_static=config.assume == "static")
     for finding in findings:
         print(finding, file=sys.stderr if finding.level == "error" else sys.stdout)
     if any(finding.level == "error" for finding in findings):
@@ -52,14 +52,14 @@ def start(config: TrainConfig) -> Trainer:
     """A trainer at the start of a new run, or where an earlier run stopped."""
     if config.resume is None:
         config = scaled(runs.resolve(config))
-        capture = checked(runs.open_capture(config))
+        capture = checked(runs.open_capture(config), config)
         trainer = Trainer(config, capture, runs.new_folder(config, capture))
         runs.create(trainer.run, config)  # now that nothing has been refused
         return trainer
     folder, device = config.resume, config.device
     config = runs.load_config(folder)
     config = runs.resolve(dataclasses.replace(config, device=device or config.device))
-    trainer = Trainer(config, checked(runs.open_capture(config)), folder)
+    trainer = Trainer(config, checked(runs.open_capture(config), config), folder)
     trainer.restore_newest()
     return trainer
 

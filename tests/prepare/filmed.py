@@ -66,6 +66,19 @@ def _draw(image: np.ndarray, board: tuple, paint: np.ndarray, view: np.ndarray) 
     return where
 
 
+def depth(view: np.ndarray) -> np.ndarray:
+    """[H, W] depth of the planes that stand as a camera sees them, along its axis."""
+    x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
+    rays = np.stack([(x - SIZE[0] / 2) / FOCAL, (y - SIZE[1] / 2) / FOCAL, np.ones_like(x)], -1) @ view[:, :3]
+    center, nearest = -view[:, :3].T @ view[:, 3], np.full(x.shape, np.inf)
+    for middle, half in PLANES:
+        distance = (middle[2] - center[2]) / rays[..., 2]
+        place = center + distance[..., None] * rays
+        hit = (np.abs(place[..., :2] - middle[:2]) <= half).all(-1)
+        nearest = np.where(hit, np.minimum(nearest, distance), nearest)
+    return nearest
+
+
 def film(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """[H, W, 3] RGB pictures, and [H, W] true where the board that moves is."""
     paints = [texture(0, COLORS[0], 512, (20, 60)), *(texture(k, COLORS[k], 128, (5, 14)) for k in (1, 2, 3))]

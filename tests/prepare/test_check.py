@@ -3,6 +3,7 @@
 import json
 import shutil
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from tests.data.captures import edit_json, write_array
 from tests.prepare import filmed
 from warpgs.data.nerfies import load_capture
 from warpgs.prepare.check import check_capture, quick_findings
+from warpgs.prepare.motion_check import motion_between
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +41,19 @@ def test_a_good_capture_is_fit_without_warnings(root):
     assert str(report).endswith("fit to train on")
 
 
-@pytest.mark.parametrize("kind", ["nerfds", "hypernerf", "iphone"])
-def test_every_layout_is_read(tmp_path, kind):
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        ("nerfds", "6 of 6 frames have masks, 0"),
+        ("hypernerf", "0 of 6 frames have masks, 0"),
+        ("iphone", "0 of 6 frames have masks, 4"),
+    ],
+)
+def test_every_layout_is_read_whole(tmp_path, kind, files):
     report = check_capture(captures.write_capture(tmp_path / "toy", kind))
-    assert f"read as {kind}" in texts(report, "note")
+    notes = texts(report, "note")
+    assert f"read as {kind} | 4 frames to train on, 2 to evaluate" in notes
+    assert f"{files} have depth" in notes
 
 
 def test_masks_that_are_turned_around_are_an_error(root):
@@ -103,19 +114,53 @@ def test_points_at_the_cameras_are_warned_of(root):
     assert "no surfaces" in texts(check_capture(root), "warning")
 
 
+def write_depth(root, of_depth):
+    for k, view in enumerate(filmed.poses(16)):
+        write_array(root / f"depth/1x/shot{k:03d}.npy", of_depth(filmed.depth(view)).astype(np.float32))
+
+
+def test_inverse_depth_of_any_scale_is_fit(root):
+    write_depth(root, lambda depth: 30.0 / depth + 2.0)
+    report = check_capture(root)
+    assert texts(report, "warning") == ""
+    assert "off at the points" in texts(report, "note")
+
+
 def test_depth_that_grows_with_distance_is_warned_of(root):
-    for k in range(16):
-        x, y = np.meshgrid(np.arange(256.0), np.arange(192.0))
-        noise = np.random.default_rng(k).uniform(0, 1, x.shape)
-        write_array(root / f"depth/1x/shot{k:03d}.npy", (noise + 0 * y).astype(np.float32))
-    text = texts(check_capture(root), "warning")
-    assert "can't be aligned" in text or "off at the points" in text
+    write_depth(root, lambda depth: depth)
+    assert "the depth of 12 of 12 frames can't be aligned" in texts(check_capture(root), "warning")
+
+
+def test_depth_is_not_held_against_points_that_are_not_there(root):
+    write_depth(root, lambda depth: 1.0 / depth)
+    (root / "points.npy").unlink()
+    report = check_capture(root)
+    assert "there are no sparse points" in texts(report, "warning")
+    assert "aligned" not in str(report)
 
 
 def test_one_time_for_all_frames_is_an_error(root):
     names = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
     assert "one time" in texts(check_capture(root), "error")
+    assert "one time" in " ".join(f.text for f in quick_findings(load_capture(root)) if f.level == "error")
+
+
+def test_one_time_does_where_all_is_learnt_as_static(root):
+    names = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
+    findings = quick_findings(load_capture(root), all_static=True)
+    assert ["one time" in f.text for f in findings if f.topic == "time"] == [True]
+    assert {f.level for f in findings} == {"warning"}
+
+
+def test_flat_pictures_are_checked_without_optical_flow(film):
+    """It crashes on pictures that are less than 16 pixels high."""
+    capture = load_capture(film)
+    frames = [capture.frame(name) for name in capture.train[:2]]
+    assert motion_between(*frames) is not None
+    flat = [replace(f, image=f.image[90:102], static_mask=f.static_mask[90:102]) for f in frames]
+    assert motion_between(*flat) is None
 
 
 def test_the_report_is_plain_json(root):

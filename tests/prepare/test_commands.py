@@ -6,6 +6,7 @@ import pytest
 
 from tests.prepare import filmed
 from warpgs.cli import main
+from warpgs.prepare.sfm import Cameras
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +46,13 @@ def test_an_interrupt_says_how_to_go_on(tmp_path, capsys, monkeypatch):
         main(["prepare", str(shots), str(tmp_path / "capture")])
     assert stop.value.code == 130
     assert "goes on from here" in capsys.readouterr().err
+
+
+def test_only_the_contact_sheets_that_there_are_are_named(tmp_path, capsys, monkeypatch):
+    def recover(folder, names, *rest):
+        return Cameras(names, filmed.lens(), filmed.poses(len(names)), filmed.points(), 0.1, 10.0)
+
+    monkeypatch.setattr("warpgs.prepare.pipeline.recover_cameras", recover)
+    shots = filmed.write_folder(tmp_path / "shots", filmed.film(6)[0])
+    assert main(["prepare", str(shots), str(tmp_path / "made"), "--masks", "none", "--depth", "none"]) == 0
+    assert "look at masks.png in it" in capsys.readouterr().out

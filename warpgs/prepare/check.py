@@ -105,13 +105,17 @@ def check_capture(root: Path, dataset: Dataset | None = None, factor: int | None
     return Report(root, findings)
 
 
-def quick_findings(capture: Capture) -> list[Finding]:
+def quick_findings(capture: Capture, all_static: bool = False) -> list[Finding]:
     """The errors and warnings that cameras, points and three frames of an opened capture tell, in less than a second.
+
+    Args:
+        capture: It.
+        all_static: Whether it will be learnt as static, whatever the masks say: then one time does for all frames.
 
     Raises:
         ValueError: If one of the three frames can't be read.
     """
-    findings = [*_counts(capture), *_geometry(capture, QUICK_SAMPLES)]
+    findings = [*_counts(capture, all_static), *_geometry(capture, QUICK_SAMPLES)]
     return [f for f in findings if f.level != "note"]
 
 
@@ -120,7 +124,7 @@ def _sampled(names: tuple[str, ...], count: int) -> list[str]:
     return [names[k] for k in places]
 
 
-def _counts(capture: Capture) -> Iterator[Finding]:
+def _counts(capture: Capture, all_static: bool = False) -> Iterator[Finding]:
     sizes = sorted({camera.size for camera in capture.cameras.values()})
     shown = ", ".join(f"{w}×{h}" for w, h in sizes[:4])
     yield Finding("note", "counts", f"{len(capture.train)} frames to train on, {len(capture.val)} to evaluate, {shown}")
@@ -128,9 +132,9 @@ def _counts(capture: Capture) -> Iterator[Finding]:
     distinct = len(set(times))
     yield Finding("note", "time", f"times from {times[0]:.3f} to {times[-1]:.3f}, {distinct} moments")
     if distinct == 1 and len(times) > 1:
-        yield Finding(
-            "error", "time", "all training frames have one time: time_id (or warp_id) in metadata.json is wrong"
-        )
+        text = "all training frames have one time: time_id (or warp_id) in metadata.json is wrong"
+        hint = "" if all_static else "; a scene in which nothing moves can be trained with --assume static"
+        yield Finding("warning" if all_static else "error", "time", text + hint)
     elif times[-1] - times[0] < 0.5:
         yield Finding("warning", "time", "training frames cover less than half of the time range")
     late = [n for n in capture.val if not times[0] <= capture.cameras[n].time <= times[-1]]
@@ -198,9 +202,9 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
 
 
 def _at_cameras(capture: Capture, cameras: list[Camera]) -> Iterator[Finding]:
-    positions = torch.stack([camera.position for camera in cameras])
+    positions = torch.stack([camera.position for camera in cameras[:: max(1, len(cameras) // 200)]])
     points = capture.points[:: max(1, len(capture.points) // 20_000)]
-    nearest = torch.cat([torch.cdist(part, positions[:400]).amin(1) for part in points.split(2000)])
+    nearest = torch.cat([torch.cdist(part, positions).amin(1) for part in points.split(2000)])
     share = float((nearest < NEAREST_POINT * capture.extent).float().mean())
     if share > MOST_AT_CAMERAS:
         yield Finding("warning", "points", f"{share:.1%} of the points lie at the cameras' places and are no surfaces")
@@ -223,6 +227,8 @@ def _contrast_at_points(frame: Frame, points: torch.Tensor) -> float | None:
 
 def _depth(capture: Capture) -> Iterator[Finding]:
     """How well each sampled frame's depth fits the points once it is aligned to them."""
+    if len(capture.points) == 0:
+        return
     errors, failed, looked = [], 0, 0
     for name in _sampled(capture.train, SAMPLES):
         frame = capture.frame(name)
@@ -280,7 +286,7 @@ def _motion(capture: Capture) -> Iterator[Finding]:
 
 
 def _pairs(capture: Capture) -> list[tuple[str, str]]:
-    """Frames of one camera that follow each other, spread over the capture."""
+    """Frames that follow each other in time, whatever camera took them, spread over the capture."""
     names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
     pairs = list(itertools.pairwise(names))
     return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, min(SAMPLES, len(pairs))).astype(int))]

@@ -35,8 +35,8 @@ class Prepare:
     lens: LensModel = "SIMPLE_RADIAL"
     """COLMAP's model of the lens."""
     masks: str = "motion"
-    """What moves: found by motion, that followed by a network (sam2), none, or a folder of masks named as the frames,
-    0 = moving."""
+    """What moves: found by motion, that followed by a network (sam2), none, or a folder of masks, 0 = moving, named as
+    the source's pictures or as the capture's frames."""
     depth: Literal["flow", "anything", "none"] = "flow"
     """Depth of the static scene by optical flow between frames, of all by a network (anything), or none."""
     holdout: int = 0
@@ -67,9 +67,8 @@ class Prepare:
         if was_finished:
             print(f"{self.capture} is finished already; --force makes it anew")
         else:
-            print(
-                f"{self.capture} is made: look at masks.png and depth.png in it, then run warpgs check {self.capture}"
-            )
+            sheets = "masks.png" if self.depth == "none" else "masks.png and depth.png"
+            print(f"{self.capture} is made: look at {sheets} in it, then run warpgs check {self.capture}")
 
 
 @dataclass(frozen=True)
