@@ -12,7 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+import train as script
+from tests.prepare import filmed
 from warpgs import checkpoint
+from warpgs.config import TrainConfig
+from warpgs.data.nerfies import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 
 SCRIPT = str(Path(__file__).parent.parent / "train.py")
@@ -126,6 +130,18 @@ def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
     ]
     assert "Traceback" not in run.stderr
     assert not (tmp_path / "run").exists()
+
+
+def test_one_time_for_all_frames_is_only_warned_of_where_all_is_static(tmp_path, capsys):
+    root = filmed.write_capture(tmp_path / "film")
+    names = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({name: {"time_id": 0} for name in names}))
+    capture = load_capture(root)
+    assert script.checked(capture, TrainConfig(assume="static")) is capture
+    assert "warning: all training frames have one time" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        script.checked(capture, TrainConfig())
+    assert stop.value.code == 1
 
 
 def test_what_training_would_suffer_from_is_told_and_what_is_well_is_not(finished):
