@@ -322,8 +322,10 @@ def _check_numbers(prefix: str, part: Any) -> None:
             _check_numbers(f"{name}.", value)
         elif isinstance(value, int | float):
             least, most = LEAST.get(name, 0), MOST.get(name, LARGEST)
-            if not least <= value <= most:
-                raise ValueError(f"{name} must be a number between {least} and {most}, got {reprlib.repr(value)}")
+            if not value >= least:
+                raise ValueError(f"{name} must be a number of at least {least}, got {value}")
+            if value > most:
+                raise ValueError(f"{name} must be a number of at most {most}, got {reprlib.repr(value)}")
 
 
 def scaled(config: TrainConfig) -> TrainConfig:
