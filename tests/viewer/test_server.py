@@ -3,6 +3,8 @@
 import importlib.util
 import shutil
 import socket
+import urllib.request
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,7 +12,7 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs
 
 from tests.viewer import watched
 from warpgs.cli import main
-from warpgs.viewer import command
+from warpgs.viewer import command, server
 from warpgs.viewer.command import View, training_cameras
 from warpgs.viewer.server import Viewer, check_address
 from warpgs.viewer.source import open_source
@@ -41,13 +43,62 @@ def test_only_this_machine_can_connect_unless_told_otherwise(run):
     with Viewer(open_source(run, "cpu", False), None, View(run).host, 0) as viewer:
         listening = viewer._server._websock_server
         assert listening._host == "127.0.0.1"
-        with socket.create_connection(("127.0.0.1", viewer.port), timeout=5):
-            pass
+        with urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}", timeout=30) as page:
+            assert page.status == 200
 
 
 def test_no_browser_can_ask_for_a_public_address(run):
     with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
         assert viewer._server.request_share_url() is None
+
+
+class Watched:
+    """A session that only says whether it was stopped; the browser leaves while it is being made, if it does."""
+
+    leaves = None
+
+    def __init__(self, client, *_):
+        self.stopped = False
+        made.append(self)
+        if Watched.leaves is not None:
+            Watched.leaves(client)
+
+    def stop(self):
+        self.stopped = True
+
+    def join(self):
+        pass
+
+
+made: list[Watched] = []
+
+
+@pytest.fixture
+def viewer(run, monkeypatch, contracts_off):
+    made.clear()
+    monkeypatch.setattr(server, "Session", Watched)
+    monkeypatch.setattr(server, "aim", lambda *_: None)
+    with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
+        yield viewer
+
+
+def test_a_browser_that_leaves_while_its_session_is_made_leaves_no_session(viewer, monkeypatch):
+    monkeypatch.setattr(Watched, "leaves", viewer._end)  # viser forgets a client before it says that it left
+    viewer._begin(SimpleNamespace(client_id=7, camera=None))
+    assert viewer.sessions == {}
+    assert [session.stopped for session in made] == [True]
+
+
+def test_a_session_that_is_made_while_the_viewer_stops_is_stopped_too(viewer, monkeypatch):
+    client = SimpleNamespace(client_id=7, camera=None)
+    monkeypatch.setattr(viewer._server, "get_clients", lambda: {7: client})
+    viewer._begin(client)
+    assert list(viewer.sessions) == [7]
+    assert [session.stopped for session in made] == [False]
+    viewer._take_all()
+    viewer._begin(client)
+    assert viewer.sessions == {}
+    assert made[1].stopped
 
 
 def test_a_port_is_free_again_after_the_viewer(run):

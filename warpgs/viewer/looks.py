@@ -7,19 +7,11 @@ import numpy as np
 import torch
 import viser
 
-from warpgs.scene.split import SplitScene
+from warpgs.paths import UP, Ball, guessed
 
+from .pose import pose_of
 from .source import Source
 from .training_cameras import TrainingCameras
-
-FOV = 0.9
-"""Vertical field of view without training cameras [rad]."""
-
-AWAY = np.array([0.0, 0.0, -2.0])
-"""Place of the camera without training cameras, from the middle of the scene: captures are about [-1, 1]."""
-
-UP = np.array([0.0, -1.0, 0.0])
-"""Upward direction without training cameras."""
 
 
 class Look(NamedTuple):
@@ -56,14 +48,13 @@ def first_look(source: Source, training: TrainingCameras | None) -> Look:
     if training is not None:
         return look_through(training, len(training.views) // 2)
     player = None if source.follow else source.current()
-    center = np.zeros(3) if player is None else _middle(player.scene)
-    return Look(center + AWAY, center, UP, FOV)
-
-
-def _middle(scene: SplitScene) -> np.ndarray:
-    """Median of the Gaussians' centres; zero without Gaussians."""
-    means = torch.cat([scene.static.means, scene.dynamic.means]).detach()
-    return means.median(0).values.double().cpu().numpy() if len(means) else np.zeros(3)
+    ball = Ball(torch.zeros(3), 1.0)
+    if player is not None:
+        means = torch.cat([player.scene.static.means, player.scene.dynamic.means]).detach().cpu()
+        ball = Ball.around(means) if len(means) else ball
+    camera = guessed(ball)
+    position, target = camera.position.double().numpy(), ball.center.double().numpy()
+    return Look(position, target, np.array(UP), pose_of(camera).fov)
 
 
 def aim(camera: viser.CameraHandle, look: Look) -> None:

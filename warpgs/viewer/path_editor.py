@@ -13,6 +13,8 @@ from .frustums import ORANGE, add_frustum
 from .panel import Panel, plain
 from .pose import camera_of, pose_of
 
+MOST_KEYFRAMES = 1000
+
 
 class PathEditor:
     """Adds, removes and saves keyframes as the panel's buttons say.
@@ -40,6 +42,9 @@ class PathEditor:
         pose = pose_of(seen)
         even = (max(2, seen.width & ~1), max(2, seen.height & ~1))  # video codecs want even sizes
         with self._changing:
+            if len(self.cameras) >= MOST_KEYFRAMES:
+                self._panel.path_note.content = f"a path has at most {MOST_KEYFRAMES} keyframes"
+                return
             size = self.cameras[0].size if self.cameras else even  # a film has one
             self.cameras.append(camera_of(pose, size, seen.time))
             add_frustum(self._scene, self._name(), pose, size[0] / size[1], self._scale, ORANGE)
@@ -54,8 +59,9 @@ class PathEditor:
 
     def _save(self) -> None:
         try:
-            path = keyframes.path_of(self._run, self._panel.path_name.value)
-            keyframes.write_path(path, self.cameras)
+            with self._changing:  # two clicks would have one name
+                path = keyframes.path_of(self._run, self._panel.path_name.value)
+                keyframes.write_path(path, self.cameras)
         except (ValueError, OSError) as error:
             self._panel.path_note.content = plain(str(error))
         else:

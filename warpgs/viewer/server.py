@@ -8,6 +8,7 @@ import threading
 import viser
 
 from .looks import aim, first_look
+from .origin import refuse_foreign_pages
 from .session import Session
 from .source import Source
 from .training_cameras import TrainingCameras
@@ -53,6 +54,7 @@ class Viewer:
         check_address(host, port)
         self._source, self._training = source, training
         self._rendering, self._changing = threading.Lock(), threading.Lock()
+        self._stopped = False
         self.sessions: dict[int, Session] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host, port, label=LABEL, verbose=False)
@@ -61,6 +63,7 @@ class Viewer:
             self.stop()
             raise OSError(f"can't listen on {host}, port {port}: Address already in use; choose another --port")
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        refuse_foreign_pages(self._server, host)
         self._start = first_look(source, training)
         self._place_camera()
         self._server.on_client_connect(self._begin)
@@ -82,6 +85,7 @@ class Viewer:
 
     def _take_all(self) -> list[Session]:
         with self._changing:
+            self._stopped = True
             sessions = list(self.sessions.values())
             self.sessions.clear()
         return sessions
@@ -91,7 +95,11 @@ class Viewer:
         aim(client.camera, self._start)
         session = Session(client, self._source, self._training, self._rendering, width)
         with self._changing:
-            self.sessions[client.client_id] = session
+            stays = not self._stopped and client.client_id in self._server.get_clients()
+            if stays:
+                self.sessions[client.client_id] = session
+        if not stays:  # it left while its session was made, and ``_end`` was there before us
+            session.stop()
 
     def _end(self, client: viser.ClientHandle) -> None:
         with self._changing:

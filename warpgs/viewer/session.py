@@ -41,6 +41,12 @@ QUALITY, QUALITY_AT_REST = 80, 92
 RATE_SECONDS = 2.0
 """Pictures of the last seconds that count for frames a second; at rest it is what the last one would allow."""
 
+LARGEST_CANVAS = (4096, 2160)
+"""Width and height to draw for [px]."""
+
+MOST_UPRIGHT = 4
+"""Height over width of a keyframe, at most."""
+
 KEYFRAME_SCALE = 0.1
 """Size to draw keyframes at where there are no training cameras [scene units]."""
 
@@ -86,6 +92,7 @@ class Session:
         self._client, self._source, self._training, self._rendering = client, source, training, rendering
         self._pace, self._clock = Pace(), Clock()
         self._stopped, self._wake = threading.Event(), threading.Event()
+        self._changing = threading.Lock()  # every event of the panel comes on a thread of its own
         self._wished: Wish | None = None
         self._changed = 0.0
         self._shown: tuple[Wish, float] | None = None
@@ -125,35 +132,39 @@ class Session:
             panel.show_cameras.on_update(lambda _: self._show_cameras(training))
 
     def _toggle(self) -> None:
-        self._clock.toggle()
-        self.panel.play.label = PAUSE if self._clock.playing else PLAY
+        with self._changing:
+            self._clock.toggle()
+            self.panel.play.label = PAUSE if self._clock.playing else PLAY
         self._wake.set()
 
     def _snap(self, training: TrainingCameras) -> None:
         """Looks through the training camera that the slider is at, at its time."""
-        number = min(int(self.panel.view.value), len(training.views)) - 1
-        view, camera = training.views[number], self._client.camera
-        width, height = self._canvas()
-        with self._client.atomic():
-            aim(camera, look_through(training, number, width / height))
-            camera.wxyz = np.array(view.pose.wxyz)
-        put(self.panel.time, view.time)
-        image = training.picture(number)
-        self._note = f"the picture of {view.name} can't be read" if image is None else ""
-        if image is not None:
-            self.panel.truth.image = image
+        with self._changing:
+            number = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+            view, camera = training.views[number], self._client.camera
+            width, height = self._canvas()
+            with self._client.atomic():
+                aim(camera, look_through(training, number, width / height))
+                camera.wxyz = np.array(view.pose.wxyz)
+            put(self.panel.time, view.time)
+            image = training.picture(number)
+            self._note = f"the picture of {view.name} can't be read" if image is None else ""
+            if image is not None:
+                self.panel.truth.image = image
         self._wake.set()
 
     def _show_cameras(self, training: TrainingCameras) -> None:
-        """Draws training cameras into the scene, or takes them away."""
-        if not self.panel.show_cameras.value:
-            self._client.scene.remove_by_name("/training")
-            return
-        for number in training.spread():
-            view, image = training.views[number], training.picture(number)
-            name, scale = f"/training/{number}", training.frustum_scale
-            frustum = add_frustum(self._client.scene, name, view.pose, view.aspect, scale, BLUE, image)
-            frustum.on_click(partial(self._look_through, training, number))
+        """Draws training cameras into the scene, or takes them away, as the panel says by now."""
+        with self._changing:
+            for number in training.spread():
+                if not self.panel.show_cameras.value:
+                    break
+                view, image = training.views[number], training.picture(number)
+                name, scale = f"/training/{number}", training.frustum_scale
+                frustum = add_frustum(self._client.scene, name, view.pose, view.aspect, scale, BLUE, image)
+                frustum.on_click(partial(self._look_through, training, number))
+            if not self.panel.show_cameras.value:
+                self._client.scene.remove_by_name("/training")
 
     def _look_through(self, training: TrainingCameras, number: int, _: object) -> None:
         if self.panel.view.value == number + 1:
@@ -178,7 +189,7 @@ class Session:
         now = time.monotonic()
         panel = self.panel
         if self._clock.playing:
-            put(panel.time, self._clock.advance(float(panel.time.value), float(panel.speed.value), now))
+            put(panel.time, self._clock.advance(panel.moment, panel.pace, now))
         wish = self._wish()
         if wish is None:
             return IDLE_SECONDS
@@ -197,8 +208,8 @@ class Session:
         player, panel = self._source.current(), self.panel
         if player is None:
             return None
-        looks = (panel.layer.value, bool(panel.residual.value), float(panel.time.value))
-        return Wish(player, self._pose(), self._canvas(), int(panel.width.value), *looks)
+        looks = (panel.layer.value, bool(panel.residual.value), panel.moment)
+        return Wish(player, self._pose(), self._canvas(), panel.across, *looks)
 
     def _draw(self, wish: Wish, scale: float, size: tuple[int, int]) -> None:
         replays = scale == 1 and wish.layer == "joint" and wish.residual and wish.player.records
@@ -236,14 +247,18 @@ class Session:
         return Pose(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov))
 
     def _canvas(self) -> tuple[int, int]:
+        """Size of the canvas, no larger than any screen: the browser may claim what it likes."""
         camera = self._client.camera
-        return max(1, camera.image_width), max(1, camera.image_height)
+        width, height = max(1, camera.image_width), max(1, camera.image_height)
+        factor = min(1.0, LARGEST_CANVAS[0] / width, LARGEST_CANVAS[1] / height)
+        return max(1, round(width * factor)), max(1, round(height * factor))
 
     def _look(self) -> Camera:
         """What is seen, as wide as the slider says: the browser changes the size of its canvas as it likes."""
         width, height = self._canvas()
-        across = int(self.panel.width.value)
-        return camera_of(self._pose(), (across, max(1, round(height * across / width))), float(self.panel.time.value))
+        across = self.panel.across
+        high = min(max(1, round(height * across / width)), MOST_UPRIGHT * across)
+        return camera_of(self._pose(), (across, high), self.panel.moment)
 
     def _say(self) -> None:
         """Shows counts, speed and what is wrong."""

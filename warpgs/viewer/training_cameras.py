@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from warpgs.data.capture import Capture
-from warpgs.paths import focus
+from warpgs.paths import focus, upward
 
 from .pose import Pose, pose_of
 
@@ -49,8 +48,7 @@ class TrainingCameras:
     @property
     def up(self) -> np.ndarray:
         """Mean upward direction of the cameras, which nobody else knows in a capture."""
-        upward = torch.stack([-self._capture.cameras[view.name].viewmat[1, :3] for view in self.views]).mean(0)
-        return upward.numpy() if float(upward.norm()) > 1e-3 else np.array([0.0, -1.0, 0.0])
+        return upward(self._capture).numpy()
 
     @property
     def frustum_scale(self) -> float:
