@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.prepare import filmed
-from warpgs.prepare.dense import Footage, Sighting, filled, triangulate
+from warpgs.prepare.dense import Flows, Footage, Sighting, filled, triangulate
 from warpgs.prepare.depth import static_depth, write_depth
 from warpgs.prepare.motion_masks import find_moving, lift, outline, tidy, vote
 
@@ -66,6 +66,15 @@ def test_neighbours_lie_on_both_sides_and_are_near(footage):
     assert {k < 12 for k in footage.neighbours(12)} == {True, False}
     assert max(abs(k - 12) for k in footage.neighbours(12)) <= 4
     assert min(footage.neighbours(0)) > 0
+
+
+def test_the_flows_asked_for_last_are_kept(film, monkeypatch):
+    monkeypatch.setattr("warpgs.prepare.dense.CACHED_FLOWS", 2)
+    flows, made = Flows(film[0][:3]), []
+    monkeypatch.setattr(flows, "between", lambda a, b: made.append(1) or np.zeros((*a.shape, 2), np.float32))
+    for pair in ((0, 1), (1, 2), (0, 1), (2, 0), (0, 1)):
+        flows.flow(*pair)
+    assert len(made) == 3
 
 
 def test_the_board_that_moves_is_masked(film, footage):

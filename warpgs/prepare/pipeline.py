@@ -42,7 +42,7 @@ DOUBTFUL_MOVING, MOST_MOVING = 0.4, 0.6
 """Shares of the pixels with more of which the cameras are tried again, and taken for wrong."""
 
 FEWEST_FOR_MOTION = 10
-"""Frames under which none has three others far enough off in time to compare with (``revisits``)."""
+"""Frames under which some lack three others far enough off in time to compare with (``revisits``)."""
 
 WEAK = "weak-features"
 """File that says that features of low contrast are needed."""
@@ -168,8 +168,9 @@ class Preparation:
                 text = self._find_masks(self._load("first"))
         if (share := self._moving_share()) > MOST_MOVING:
             raise ValueError(
-                f"{share:.0%} of the pixels seem to move: the cameras that were found fit little of the pictures; film "
-                "more of what stands still and has texture, or give masks of what moves (--masks FOLDER)"
+                f"{share:.0%} of the pixels seem to move: the cameras that were found fit little of the pictures; take "
+                "more frames (--fps, --count), film more of what stands still and has texture, or give masks of what "
+                "moves (--masks FOLDER)"
             )
         return text
 
