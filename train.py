@@ -5,7 +5,6 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 
-import torch
 import tyro
 
 from warpgs import runs
@@ -13,6 +12,7 @@ from warpgs.config import PRESETS, TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.interrupt import Interrupt
 from warpgs.logbook import Logbook
+from warpgs.memory import is_out_of_memory
 from warpgs.prepare.check import quick_findings
 from warpgs.trainer import Trainer
 
@@ -83,11 +83,6 @@ def main(config: TrainConfig) -> int:
     print(runs.evaluate_run(folder, trainer.capture, device=trainer.config.device))
     print(f"metrics.json, views.csv, pictures/ and time.mp4 are in {folder}")
     return 0
-
-
-def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error is the lack of memory; on the CPU, torch and Warp say so only in words."""
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "allocate" in str(error)
 
 
 if __name__ == "__main__":
