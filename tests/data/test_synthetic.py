@@ -1,7 +1,7 @@
 import errno
 import json
+import os
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -174,7 +174,7 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OSError, match=r"left_000000\.png could not be written: No space left"):
         builtin_capture(tmp_path, SMALL, quiet=True)
     assert [p for p in tmp_path.rglob("*") if p.is_file() or p.name.startswith("partial")] == []

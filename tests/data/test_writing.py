@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.writing import write_array, write_json, write_png
+from warpgs.files import partial_of
 
 WRITERS = [(write_png, np.zeros((4, 5, 3), np.uint8)), (write_json, {"a": 1}), (write_array, np.zeros(3))]
 
@@ -29,6 +30,6 @@ def test_arrays_and_json_are_read_back(tmp_path):
 
 @pytest.mark.parametrize(("write", "values"), WRITERS)
 def test_a_full_disk_is_told_with_the_files_name(write, values, tmp_path):
-    (tmp_path / "file").symlink_to("/dev/full")
+    partial_of(tmp_path / "file").symlink_to("/dev/full")
     with pytest.raises(OSError, match="file could not be written: No space left on device"):
         write(tmp_path / "file", values)

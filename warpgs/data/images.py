@@ -19,8 +19,8 @@ FILL_RADIUS = 3
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
-def decode(path: Path) -> Shaped[np.ndarray, "H W ..."]:
-    """The values of a PNG or JPEG file as stored, in OpenCV's order of channels.
+def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> Shaped[np.ndarray, "H W ..."]:
+    """The values of a PNG or JPEG file as stored, or as OpenCV's flags say, in OpenCV's order of channels.
 
     OpenCV decodes what it can of a damaged file, fills the rest with grey and complains on stderr, depending on its
     version; so the file is checked before.
@@ -38,7 +38,7 @@ def decode(path: Path) -> Shaped[np.ndarray, "H W ..."]:
     if not 0 < min(size) <= max(size) <= LARGEST_SIDE:
         raise ValueError(f"{path} claims {size[0]}×{size[1]} pixels, expected 1 to {LARGEST_SIDE} a side")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:

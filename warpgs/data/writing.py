@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt
 
+from warpgs.files import write_whole
+
 
 def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W 3"]) -> None:
     """Writes grey levels or RGB, and makes the folders above.
@@ -16,7 +18,7 @@ def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W
         OSError: If it can't be written.
     """
     _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
-    _write(path, data.tobytes())
+    write_whole(path, [data.tobytes()])
 
 
 def write_json(path: Path, values: object) -> None:
@@ -25,7 +27,7 @@ def write_json(path: Path, values: object) -> None:
     Raises:
         OSError: If it can't be written.
     """
-    _write(path, json.dumps(values).encode())
+    write_whole(path, [json.dumps(values).encode()])
 
 
 def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
@@ -36,12 +38,4 @@ def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
     """
     data = io.BytesIO()  # numpy's own writing to a file forgets why it failed
     np.save(data, values)
-    _write(path, data.getvalue())
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
+    write_whole(path, [data.getvalue()])

@@ -111,6 +111,4 @@ class Attempt:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _save(self) -> None:
-        partial = self.work / "state.partial"
-        write_json(partial, {"options": self._options, "done": self._done, "notes": self.notes})
-        partial.replace(self.work / STATE)
+        write_json(self.work / STATE, {"options": self._options, "done": self._done, "notes": self.notes})

@@ -167,11 +167,7 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 
 def _picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """An RGB picture, turned as its EXIF data say; damaged and huge files are refused before they are decoded."""
-    decode(path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"{path} can't be decoded as a picture")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def _of_video(
