@@ -13,10 +13,17 @@ import math
 
 import warp as wp
 
+CUDA_LANES = 8
+"""Threads that share the frequencies of a value on CUDA."""
+
 
 @functools.cache
 def make_encode(half: bool) -> wp.Kernel:
-    """Kernel that writes the columns of x, y, z or t of a row, one thread each, in half or single precision."""
+    """Kernel that writes the columns of x, y, z or t of a row, in half or single precision.
+
+    ``lanes`` threads share them, a frequency each: neighbours on CUDA, where they write what lies side by side, one
+    thread on CPU.
+    """
     number = wp.float16 if half else wp.float32
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -29,11 +36,13 @@ def make_encode(half: bool) -> wp.Kernel:
         position_bands: int,
         time_bands: int,
         room: int,
+        lanes: int,
         encoding: wp.array2d[number],
     ):
         thread = first + wp.tid()
-        row = thread >> 2
-        axis = thread & 3
+        lane = thread % lanes
+        row = (thread // lanes) >> 2
+        axis = (thread // lanes) & 3
         dims = 3
         bands = position_bands
         begin = room
@@ -45,15 +54,16 @@ def make_encode(half: bool) -> wp.Kernel:
             dims = 1
             bands = time_bands
             begin = room + 3 + 6 * position_bands
-            for column in range(begin + 1 + 2 * bands, encoding.shape[1]):
+            for column in range(begin + 1 + 2 * bands + lane, encoding.shape[1], lanes):
                 encoding[row, column] = number(0.0)
-        encoding[row, begin + axis] = number(p)
+        if lane == 0:
+            encoding[row, begin + axis] = number(p)
         column = begin + dims + axis * bands
-        for _ in range(bands):
+        p *= float(1 << lane)
+        for band in range(lane, bands, lanes):
             angle = wp.static(math.pi) * (p - 2.0 * wp.round(0.5 * p))
-            encoding[row, column] = number(wp.sin(angle))
-            encoding[row, column + dims * bands] = number(wp.cos(angle))
-            p *= 2.0
-            column += 1
+            encoding[row, column + band] = number(wp.sin(angle))
+            encoding[row, column + band + dims * bands] = number(wp.cos(angle))
+            p *= float(1 << lanes)
 
     return encode

@@ -10,7 +10,7 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
 from warpgs.kernels.rows import make_pack, make_unpack
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
-from warpgs.ops.compositing import CUDA_PIXELS
+from warpgs.ops.compositing import CUDA_PIXELS, CUDA_PIXELS_OF_SMALL
 
 ARCH = 90
 IMAGES = [(1, 1), (1, 3), (3, 3)]
@@ -23,7 +23,7 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-@pytest.mark.parametrize("name", ["activation", "adam", "covariance", "projection", "raytrace", "sh", "tiles"])
+@pytest.mark.parametrize("name", ["activation", "adam", "covariance", "projection", "raytrace", "relu", "sh", "tiles"])
 def test_a_module_of_kernels_compiles(name, tmp_path):
     assert_compiles(importlib.import_module(f"warpgs.kernels.{name}"), tmp_path)
 
@@ -48,8 +48,9 @@ def test_ssim_compiles(make, with_mask, tmp_path):
 @pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])
 @pytest.mark.parametrize("flag", [False, True])
 @pytest.mark.parametrize(("images", "outputs"), IMAGES)
-def test_compositing_compiles(make, flag, images, outputs, tmp_path):
-    assert_compiles(make(3, images, outputs, CUDA_PIXELS, flag).module, tmp_path)
+@pytest.mark.parametrize("pixels", [CUDA_PIXELS, CUDA_PIXELS_OF_SMALL])
+def test_compositing_compiles(make, flag, images, outputs, pixels, tmp_path):
+    assert_compiles(make(3, images, outputs, pixels, flag).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])

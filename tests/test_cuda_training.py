@@ -36,12 +36,13 @@ def parameters_after_steps(data, run, **changes):
 
 
 def test_replayed_steps_change_parameters_as_eager_ones_do(data, tmp_path):
-    """Not to the bit: the GPU adds gradients up in another order every time."""
-    eager = parameters_after_steps(data, tmp_path / "eager", graph=False)
+    """Not to the bit: the GPU adds gradients up in another order every time, and Adam makes much of tiny ones."""
+    eager, again = (parameters_after_steps(data, tmp_path / f"eager{k}", graph=False) for k in range(2))
     replayed = parameters_after_steps(data, tmp_path / "replayed", graph=True)
     for name, expected in eager.items():
         if expected.any():
-            assert relative_error(replayed[name], expected) < 1e-3, name
+            noise = relative_error(again[name], expected)
+            assert relative_error(replayed[name], expected) < max(1e-3, 4.0 * noise), name
 
 
 def test_a_run_with_graphs_goes_through_all_stages(data, tmp_path):
@@ -59,27 +60,43 @@ def test_a_played_frame_is_the_rendered_one(data, tmp_path):
         assert relative_error(player.play(camera), player(camera, False).joint.image) < 1e-5
 
 
-def layers(widths, extra, skip):
-    g = generator()
-    reads = [w + (extra if k == skip else 0) for k, w in enumerate([extra, *widths[:-1]])]
-    weights = [torch.randn(w, r, generator=g) / r**0.5 for w, r in zip(widths, reads, strict=True)]
-    return weights, [0.1 * torch.randn(w, generator=g) for w in widths]
+def rounded(x):
+    """In half precision, as seen on the way forth; the way back does not notice."""
+    return x + (x.detach().half().double() - x.detach())
+
+
+def plain(encoding, weights, biases, skip):
+    """The layers in double precision, with what is kept in half precision rounded: else units near zero, which pass
+    gradients in the one case and not in the other, would be most of the difference."""
+    encoding = values = rounded(encoding)
+    for k, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
+        values = torch.cat([values, encoding], 1) if k == skip else values
+        values = rounded((values @ rounded(weight).T + rounded(bias)).clamp_min(0.0))
+    return values @ rounded(weights[-1]).T + biases[-1]
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])
 @pytest.mark.parametrize("num", [0, 1, 1000])
-def test_half_precision_loses_little_whatever_the_size_of_gradients(num, scale):
-    encoding = torch.rand(num, 21, generator=generator()) * 2 - 1
-    cotangent = scale * torch.randn(num, 10, generator=generator(1))
-    results = []
-    for dtype, device in ((torch.float64, "cpu"), (torch.float16, "cuda")):
-        weights, biases = layers([64, 64, 64, 64, 10], 21, skip=2)
-        kind = torch.float32 if device == "cuda" else dtype
-        parameters = [p.to(device, kind).requires_grad_() for p in (*weights, *biases)]
-        inputs = torch.nn.functional.pad(encoding.to(device, dtype), (64, 3))  # room before, padding behind
-        outputs = perceptron(inputs, parameters[:5], parameters[5:], skip=2)
-        outputs.backward(cotangent.to(device, kind))
-        results.append([outputs.detach().cpu().double(), *(p.grad.cpu().double() for p in parameters)])
-    for expected, actual in zip(*results, strict=True):
-        assert actual.shape == expected.shape
-        assert (actual - expected).norm() <= 5e-3 * expected.norm()
+@pytest.mark.parametrize("outputs", [3, 10])
+def test_half_precision_loses_little_whatever_the_size_of_gradients(num, scale, outputs):
+    g = generator()
+    encoding = torch.rand(num, 21, generator=g).double() * 2 - 1
+    shapes = [(64, 21), (64, 64), (64, 85), (64, 64), (outputs, 64)]
+    weights = [torch.randn(*shape, generator=g) / shape[1] ** 0.5 for shape in shapes]
+    biases = [0.1 * torch.randn(rows, generator=g) for rows, _ in shapes]
+    cotangent = scale * torch.randn(num, outputs, generator=g)
+
+    expected = [p.double().requires_grad_() for p in (*weights, *biases)]
+    values = plain(encoding, expected[:5], expected[5:], skip=2)
+    values.backward(cotangent.double())
+
+    actual = [p.cuda().requires_grad_() for p in (*weights, *biases)]
+    inputs = torch.nn.functional.pad(encoding.half().cuda(), (64, 3))  # room before, padding behind
+    ours = perceptron(inputs, actual[:5], actual[5:], skip=2)
+    ours.backward(cotangent.cuda())
+
+    assert ours.is_contiguous()
+    pairs = [(values.detach(), ours.detach()), *((e.grad, a.grad) for e, a in zip(expected, actual, strict=True))]
+    for e, a in pairs:
+        assert a.shape == e.shape
+        assert (a.cpu().double() - e).norm() <= 5e-3 * e.norm()

@@ -50,7 +50,8 @@ class ModelConfig:
     """Whether the appearance network changes opacities, too (paper Eq. 8); off, because seen from one camera at a time
     they fit shadows by making Gaussians at wrong depths come and go."""
     half: bool = True
-    """On CUDA, multiply matrices of the networks in half precision, with sums and weights in single precision."""
+    """On CUDA, multiply matrices of the networks in half precision, with sums and weights in single precision; only if
+    ``width`` is a multiple of 8."""
     max_static_points: int = 100_000
     """Static Gaussians to begin with, at most."""
     dynamic_points: int = 20_000

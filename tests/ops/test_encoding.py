@@ -7,7 +7,9 @@ import torch
 
 from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
+from warpgs.kernels.encoding import CUDA_LANES, make_encode
 from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
+from warpgs.ops.tape import Run
 
 TIME = torch.tensor([0.3])
 BOX = (torch.zeros(3), torch.ones(3))
@@ -64,6 +66,15 @@ def test_room_is_left_before_the_encoding(half):
     means = random_means(5)
     with_room = encode_plainly(means, 4, 2, room=16, half=half)
     assert torch.equal(with_room[:, 16:], encode_plainly(means, 4, 2, half=half))
+
+
+def test_threads_that_share_a_row_write_what_one_thread_writes():
+    means = random_means(5)
+    expected = encode_plainly(means, 10, 3, room=8)
+    encoding = torch.empty_like(expected)
+    run = Run(means.device, [])
+    run.launch(make_encode(False), 5 * 4 * CUDA_LANES, means, TIME, *BOX, 10, 3, 8, CUDA_LANES, encoding)
+    assert torch.equal(encoding[:, 8:], expected[:, 8:])
 
 
 def test_without_bands_the_values_are_the_encoding():

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from warpgs.config import ModelConfig
 from warpgs.ops.encoding import encode, encoded_size
 
-from .perceptron import perceptron
+from .perceptron import ALIGNMENT, perceptron
 
 
 class Trunk(nn.Module):
@@ -28,7 +28,7 @@ class Trunk(nn.Module):
         self.bands = (config.position_bands, config.time_bands)
         self.skip = config.skip if config.skip < config.depth else 0
         self.room = config.width if self.skip else 0
-        self.uses_half = config.half
+        self.uses_half = config.half and config.width % ALIGNMENT == 0
         self.register_buffer("center", center.clone())
         self.register_buffer("half_size", half_size.clone())
         encoded = encoded_size(*self.bands)

@@ -25,6 +25,11 @@ NUM_BRANCH_IMAGES = 3
 CUDA_PIXELS = (1, 2)
 """Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""
 
+CUDA_PIXELS_OF_SMALL = (1, 1)
+"""The same in images of at most ``SMALL`` pixels, which else have too few lanes to keep a GPU busy."""
+
+SMALL = 1 << 18
+
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
 
@@ -58,12 +63,24 @@ class Composite(NamedTuple):
         return Composite(images, alphas, norms, contributed, weights)
 
 
+def cuda_pixels(size: tuple[int, int]) -> tuple[int, int]:
+    """Columns and rows of pixels that a lane composites on CUDA in an image of ``size``."""
+    return CUDA_PIXELS_OF_SMALL if size[0] * size[1] <= SMALL else CUDA_PIXELS
+
+
 def _launch(
-    run: Run, make_kernel: Callable[..., Any], channels: int, images: int, flag: bool, tiles: Tiles, *arguments: Any
+    run: Run,
+    make_kernel: Callable[..., Any],
+    channels: int,
+    images: int,
+    flag: bool,
+    size: tuple[int, int],
+    tiles: Tiles,
+    *arguments: Any,
 ) -> None:
     """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
     lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    pixels = CUDA_PIXELS if run.is_cuda else CPU_PIXELS
+    pixels = cuda_pixels(size) if run.is_cuda else CPU_PIXELS
     blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
 
     def walk(walked: int) -> None:
@@ -112,6 +129,7 @@ def record_composite(
         C,
         images,
         statistics,
+        size,
         tiles,
         ends,
         tiles.gaussian_from_isect,
@@ -156,6 +174,7 @@ def record_composite(
             C,
             images,
             absgrad,
+            size,
             tiles,
             ends,
             tiles.gaussian_from_isect,

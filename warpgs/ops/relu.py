@@ -1,0 +1,49 @@
+"""The way back through ReLU and the bias before it (kernels/relu.py)."""
+
+import torch
+from jaxtyping import Float16, Float32
+from torch import Tensor
+
+from warpgs.kernels import relu as kernels
+
+from .contracts import check_same_device, check_tensor
+from .tape import Run
+
+MOST_CHUNKS = 4096
+"""Sums that the rows are divided among: enough threads to keep memory busy, few enough to be quickly added up."""
+
+ROWS_PER_CHUNK = 4
+"""Rows of one sum, at least."""
+
+
+def relu_backward(
+    features: Float16[Tensor, "N read"], gradients: Float16[Tensor, "N columns"]
+) -> Float32[Tensor, "chunks columns"]:
+    """Sets gradients to zero, in place, where features are not positive, and adds them up over the rows.
+
+    Args:
+        features: [N, ≥ columns] what ReLU made, in the first columns.
+        gradients: [N, columns] with respect to it; a multiple of 8 columns.
+
+    Returns:
+        [chunks, columns] partial sums of the masked gradients; their sum over the chunks is the gradient of the bias.
+
+    Raises:
+        ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
+    """
+    sizes: dict[str, int] = {}
+    check_tensor("features", features, ("N", "read"), sizes, (torch.float16,))
+    check_tensor("gradients", gradients, ("N", "columns"), sizes, (torch.float16,))
+    check_same_device({"features": features, "gradients": gradients})
+    N, columns = gradients.shape
+    if columns % kernels.PIECE or columns > features.shape[1]:
+        raise ValueError(
+            f"gradients must have a multiple of {kernels.PIECE} columns, "
+            f"{features.shape[1]} at most as features have, got {columns}"
+        )
+    run = Run(gradients.device, [])
+    chunks = min(MOST_CHUNKS, -(-N // ROWS_PER_CHUNK))
+    sums = run.empty(chunks, columns)
+    pieces = columns // kernels.PIECE
+    run.launch(kernels.relu_bwd, chunks * pieces, features, gradients, sums, work=N // max(chunks, 1))
+    return sums
