@@ -25,6 +25,10 @@ MANY_TILES = wp.constant(24)
 """Intersections above which a Gaussian's are written by a whole lane group instead of one thread."""
 
 
+LOOKS = wp.constant(4)
+"""Intersections that a lane looks at in one go when it looks for a tile's last ones: they are on their way together."""
+
+
 @wp.func
 def tile_index(position: float, num_tiles: int) -> int:
     """Tile of a pixel coordinate, clamped to one beyond the image on either side."""
@@ -218,16 +222,17 @@ def tile_ends(
     end_dynamic = begin
     base = ranges[tile, 1]
     while base > begin and (end_static == begin or end_dynamic == begin):
-        isect = base - 1 - lane
         is_last_static = begin
         is_last_dynamic = begin
-        if isect >= begin:
-            if is_dynamic[gaussian_from_isect[isect]] != wp.uint8(0):
-                is_last_dynamic = isect + 1
-            else:
-                is_last_static = isect + 1
+        for k in range(LOOKS):
+            isect = base - 1 - lane - k * lane_count()
+            if isect >= begin:
+                if is_dynamic[gaussian_from_isect[isect]] != wp.uint8(0):
+                    is_last_dynamic = wp.max(is_last_dynamic, isect + 1)
+                else:
+                    is_last_static = wp.max(is_last_static, isect + 1)
         end_static = wp.max(end_static, lane_max(is_last_static))
         end_dynamic = wp.max(end_dynamic, lane_max(is_last_dynamic))
-        base -= lane_count()
+        base -= LOOKS * lane_count()
     if lane == 0:
         ends[tile] = wp.vec2i(end_static, end_dynamic)

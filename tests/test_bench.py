@@ -133,7 +133,7 @@ def test_the_scene_to_time_steps_of_has_both_branches_and_the_papers_networks():
     scene = random_scene(splats, camera)
     assert 100 < len(scene.dynamic) < 300
     assert len(scene.static) + len(scene.dynamic) == 1000
-    assert len(scene.deformation.trunk.layers) == 8
+    assert len(scene.deformation.trunk.sizes) == 9
     again = scene.splats(torch.zeros(1))
     assert torch.allclose(again.scales.sort(0).values, splats.scales.sort(0).values, rtol=1e-5)
 

@@ -17,7 +17,7 @@ from .config import LARGEST, ModelConfig
 from .files import beside
 from .scene.split import SplitScene
 
-VERSION = 1
+VERSION = 2
 FOLDER = "checkpoints"
 
 

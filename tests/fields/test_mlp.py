@@ -24,8 +24,8 @@ def model(**changes):
 
 def woken(trunk):
     """Gives the last layer, which begins at zero, values that show."""
-    for parameter in trunk.head.parameters():
-        parameter.data = torch.randn(parameter.shape, generator=generator())
+    for part in trunk.layers(trunk.values.data)[-1]:
+        part.copy_(torch.randn(part.shape, generator=generator()))
 
 
 def make_trunk(**changes):
@@ -64,7 +64,7 @@ def plain_trunk(parameters, means, skip):
 
 
 def double_parameters(trunk):
-    return [p.detach().double().requires_grad_() for layer in (*trunk.layers, trunk.head) for p in layer.parameters()]
+    return [part.double().requires_grad_() for layer in trunk.layers(trunk.values.detach()) for part in layer]
 
 
 @pytest.mark.parametrize(("depth", "skip"), SHAPES)
@@ -82,23 +82,42 @@ def test_gradients_of_the_trunk_are_those_of_the_chain_of_layers(depth, skip):
     outputs.backward(cotangent)
     parameters = double_parameters(trunk)
     plain_trunk(parameters, random_means(), skip).backward(cotangent.double())
-    ours = [p for layer in (*trunk.layers, trunk.head) for p in layer.parameters()]
-    for parameter, expected in zip(ours, parameters, strict=True):
-        assert relative_error(parameter.grad, expected.grad) < 1e-5
+    ours = [part for layer in trunk.layers(trunk.values.grad) for part in layer]
+    for gradient, expected in zip(ours, parameters, strict=True):
+        assert relative_error(gradient, expected.grad) < 1e-5
+
+
+def test_nothing_flows_to_the_weights_of_padding():
+    trunk = make_trunk()
+    trunk(random_means(), TIME).square().sum().backward()
+    counted = torch.zeros_like(trunk.values)
+    for part in (part for layer in trunk.layers(counted) for part in layer):
+        part.fill_(1.0)
+    assert 0 < int((counted == 0).sum()) < len(counted) / 2
+    assert not trunk.values.grad[counted == 0].any()
+    assert not trunk.values[counted == 0].any()
+
+
+def test_layers_begin_as_those_of_torch_do():
+    trunk = Trunk(model(width=64), CENTER, HALF_SIZE, OUTPUTS)
+    for weight, bias in trunk.layers(trunk.values.detach())[:-1]:
+        most = weight.shape[1] ** -0.5
+        assert 0.95 * most < float(weight.abs().max()) <= most
+        assert 0.5 * most < float(bias.abs().max()) <= most
 
 
 def test_the_papers_trunk_has_eight_layers_of_256_units():
     trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, OUTPUTS)
     encoded = 3 * 21 + 21
-    assert [layer.out_features for layer in trunk.layers] == [256] * 8
-    assert [layer.in_features for layer in trunk.layers] == [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
+    shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
+    columns = [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
+    assert shapes == [*((256, c) for c in columns), (OUTPUTS, 256)]
 
 
 def test_positions_are_seen_relative_to_the_box():
     trunk = make_trunk()
     twin = Trunk(model(), torch.zeros(3), torch.ones(3), OUTPUTS)
-    for mine, its in ((twin.layers, trunk.layers), (twin.head, trunk.head)):
-        mine.load_state_dict(its.state_dict())
+    twin.values.data.copy_(trunk.values.data)
     means = random_means()
     assert relative_error(twin((means - CENTER) / HALF_SIZE, TIME), trunk(means, TIME)) < 1e-6
 
@@ -119,8 +138,9 @@ def test_networks_begin_as_no_change(kind):
 def test_a_network_that_begins_as_no_change_can_learn(kind):
     field = kind(model(), CENTER, HALF_SIZE)
     sum(output.sum() for output in field(random_means(), TIME)).backward()
-    assert field.trunk.head.weight.grad.any()
-    assert field.trunk.head.bias.grad.all()
+    head = field.trunk.layers(field.trunk.values.grad)[-1]
+    assert head.weight.any()
+    assert head.bias.all()
 
 
 @pytest.mark.parametrize("kind", FIELDS)
@@ -138,7 +158,7 @@ def test_positions_get_no_gradient_from_networks(kind):
     field, means = make_field(kind), random_means().requires_grad_()
     sum(output.square().sum() for output in field(means, TIME)).backward()
     assert means.grad is None
-    assert all(parameter.grad.any() for parameter in field.parameters())
+    assert all(part.any() for layer in field.trunk.layers(field.trunk.values.grad) for part in layer)
 
 
 @pytest.mark.parametrize("kind", FIELDS)

@@ -7,7 +7,7 @@ import torch
 
 from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
-from warpgs.kernels.encoding import CUDA_LANES, make_encode
+from warpgs.kernels.encoding import CUDA_LANES_LOG2, make_encode
 from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
 from warpgs.ops.tape import Run
 
@@ -73,7 +73,8 @@ def test_threads_that_share_a_row_write_what_one_thread_writes():
     expected = encode_plainly(means, 10, 3, room=8)
     encoding = torch.empty_like(expected)
     run = Run(means.device, [])
-    run.launch(make_encode(False), 5 * 4 * CUDA_LANES, means, TIME, *BOX, 10, 3, 8, CUDA_LANES, encoding)
+    threads = 5 * 4 << CUDA_LANES_LOG2
+    run.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, CUDA_LANES_LOG2, encoding)
     assert torch.equal(encoding[:, 8:], expected[:, 8:])
 
 

@@ -4,11 +4,15 @@ import pytest
 import torch
 
 from tests.scenes import generator
-from warpgs.ops.relu import MOST_CHUNKS, ROWS_PER_CHUNK, relu_backward
+from warpgs.ops.relu import MOST_CHUNKS, ROWS_PER_CHUNK, num_sums, relu_backward
 
 
 def random_half(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed)).half()
+
+
+def room(gradients):
+    return torch.full((num_sums(len(gradients)), gradients.shape[1]), torch.nan)
 
 
 def relu_of(x):
@@ -24,21 +28,27 @@ def test_gradients_pass_where_features_are_positive_and_are_added_up(num, column
     features[0, 0] = 0.0
     gradients = random_half(num, columns, seed=1)
     expected = torch.where(features[:, :columns] > 0, gradients, 0.0)
-    sums = relu_backward(features, gradients)
+    sums = room(gradients)
+    relu_backward(features, gradients, sums)
     assert torch.equal(gradients, expected)
-    assert len(sums) == min(MOST_CHUNKS, -(-num // ROWS_PER_CHUNK))
     assert torch.allclose(sums.double().sum(0), expected.double().sum(0), rtol=1e-6, atol=1e-5)
 
 
 def test_the_smallest_positive_number_counts_and_what_is_not_a_number_stays_visible():
     features = torch.tensor([[6e-8, 0.0, torch.nan, torch.inf, 1.0, 0.0, 0.0, 0.0]]).half()
     gradients = torch.arange(1, 9).half()[None]
-    relu_backward(features, gradients)
+    relu_backward(features, gradients, room(gradients))
     assert gradients.tolist() == [[1, 0, 3, 4, 5, 0, 0, 0]]
 
 
 def test_no_rows_have_no_sums():
-    assert relu_backward(random_half(0, 8), random_half(0, 8)).shape == (0, 8)
+    assert num_sums(0) == 0
+    relu_backward(random_half(0, 8), random_half(0, 8), torch.zeros(0, 8))
+
+
+def test_sums_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="sums must"):
+        relu_backward(random_half(9, 8), random_half(9, 8), torch.zeros(2, 8))
 
 
 @pytest.mark.parametrize(
@@ -54,4 +64,4 @@ def test_no_rows_have_no_sums():
 @pytest.mark.usefixtures("contracts_off")
 def test_what_the_kernel_cannot_read_is_refused(features, gradients, words):
     with pytest.raises(ValueError, match=words):
-        relu_backward(features, gradients)
+        relu_backward(features, gradients, room(gradients))

@@ -39,8 +39,8 @@ def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, awake=True, **cha
     scene = SplitScene(static, dynamic, model(**changes), torch.zeros(3), torch.full((3,), 3.0))
     if awake:
         for network in (scene.deformation, scene.appearance):
-            for parameter in network.trunk.head.parameters():
-                parameter.data = 0.2 * torch.randn(parameter.shape, generator=generator())
+            for parameter in network.trunk.layers(network.trunk.values.data)[-1]:
+                parameter.copy_(0.2 * torch.randn(parameter.shape, generator=generator()))
     return scene
 
 
@@ -135,7 +135,7 @@ def test_residuals_of_opacity_are_added_to_its_logit():
 def test_opacities_stay_within_zero_and_one_whatever_their_residuals():
     scene = make_scene(appearance_opacity=True)
     for bias in (-1e6, 1e6):
-        scene.appearance.trunk.head.bias.data.fill_(bias)
+        scene.appearance.trunk.layers(scene.appearance.trunk.values.data)[-1].bias.fill_(bias)
         opacities = static_part(scene.splats(TIME))["opacities"]
         assert ((opacities >= 0) & (opacities <= 1)).all()
 
@@ -217,7 +217,7 @@ def test_no_gradient_flows_to_positions_through_the_networks():
     assert not scene.static.means.grad.any()
     assert not scene.dynamic.means.grad.any()
     for network in (scene.deformation, scene.appearance):
-        assert network.trunk.layers[0].weight.grad.any()
+        assert network.trunk.layers(network.trunk.values.grad)[0].weight.any()
 
 
 def test_the_gradient_of_moved_positions_is_that_of_positions():

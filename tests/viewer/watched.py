@@ -5,7 +5,9 @@ from pathlib import Path
 
 import torch
 
+from tests import tiny
 from warpgs import checkpoint
+from warpgs.scene.split import SplitScene
 
 
 def copy(finished: Path, folder: Path) -> Path:
@@ -24,9 +26,8 @@ def _brighten(run: Path) -> None:
         tensors[f"scene.{branch}.log_scales"] = tensors[f"scene.{branch}.log_scales"].clamp(-3.0, -1.5)
     tensors["scene.dynamic.sh_dc"] = tensors["scene.dynamic.sh_dc"] + torch.tensor([1.0, -1.0, -1.0])
     for network in ("deformation", "appearance"):
-        tensors[f"scene.{network}.trunk.head.weight"] = 0.3 * torch.ones_like(
-            tensors[f"scene.{network}.trunk.head.weight"]
-        )
+        trunk = getattr(SplitScene.empty(1, 1, tiny.MODEL), network).trunk
+        trunk.layers(tensors[f"scene.{network}.trunk.values"])[-1].weight.fill_(0.3)
     checkpoint.save(newest.path, tensors, dict(newest.facts))
 
 

@@ -4,18 +4,20 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
-from warpgs.ops.encoding import encode, encoded_size
+from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
 
-from .perceptron import ALIGNMENT, perceptron
+from .perceptron import Layer, num_values, perceptron, split
 
 
 class Trunk(nn.Module):
     """[γ(μ), γ(t)] → outputs: ``depth`` ReLU layers of ``width`` units, the encoding entering again after ``skip``.
 
-    The last layer, the head, starts at zero, so that a network starts as "no change".
+    The last layer, the head, starts at zero, so that a network starts as "no change"; the others as ``nn.Linear`` does.
 
     Attributes:
         center, half_size: [3] box of the scene; positions are normalised by it to about [-1, 1].
+        values: Weights and biases of all layers, see ``layers``. Those that the padding of the encoding and of the
+            outputs is multiplied by are and stay 0.
     """
 
     center: Tensor
@@ -32,18 +34,27 @@ class Trunk(nn.Module):
         self.register_buffer("center", center.clone())
         self.register_buffer("half_size", half_size.clone())
         encoded = encoded_size(*self.bands)
-        sizes = [encoded] + [config.width + (encoded if k == config.skip else 0) for k in range(1, config.depth)]
-        self.layers = nn.ModuleList([nn.Linear(size, config.width) for size in sizes])
-        self.head = nn.Linear(config.width, outputs)
-        nn.init.zeros_(self.head.weight)
-        nn.init.zeros_(self.head.bias)
+        columns = [encoded] + [config.width + (encoded if k == self.skip else 0) for k in range(1, config.depth)]
+        self.sizes = [*((config.width, c) for c in columns), (outputs, config.width)]
+        padding = -encoded % ALIGNMENT
+        self.shapes = [(rows, c + (padding if k in (0, self.skip) else 0)) for k, (rows, c) in enumerate(self.sizes)]
+        self.shapes[-1] = (outputs + -outputs % ALIGNMENT, config.width)
+        self.values = nn.Parameter(center.new_zeros(num_values(self.shapes)))
+        for layer, (rows, c) in zip(self.layers(self.values.data)[:-1], self.sizes, strict=False):
+            start = nn.Linear(c, rows)
+            layer.weight.copy_(start.weight.data)
+            layer.bias.copy_(start.bias.data)
+
+    def layers(self, values: Float[Tensor, " values"]) -> list[Layer]:
+        """The layers in ``values`` or in its gradient, as views without padding; the last one is the head."""
+        layers = split(values, self.shapes)
+        return [Layer(weight[:r, :c], bias[:r]) for (weight, bias), (r, c) in zip(layers, self.sizes, strict=True)]
 
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N outputs"]:
         """Evaluates the network at N positions and one time. No gradient flows to the positions."""
         half = self.uses_half and means.is_cuda
         inputs = encode(means.detach(), time, self.bands, self.center, self.half_size, self.room, half)
-        layers = [*self.layers, self.head]
-        return perceptron(inputs, [layer.weight for layer in layers], [layer.bias for layer in layers], self.skip)
+        return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0])
 
 
 class DeformationField(nn.Module):

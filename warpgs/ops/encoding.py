@@ -49,9 +49,9 @@ def encode(
         columns = encoded_size(*bands)
         columns += -columns % ALIGNMENT
         encoding = run.empty(len(means), room + columns, dtype=torch.float16 if half else torch.float32)
-        lanes = kernels.CUDA_LANES if run.is_cuda else 1
-        arguments = (means, time, center, half_size, *bands, room, lanes, encoding)
-        run.launch(kernels.make_encode(half), 4 * lanes * len(means), *arguments)
+        lanes_log2 = kernels.CUDA_LANES_LOG2 if run.is_cuda else 0
+        arguments = (means, time, center, half_size, *bands, room, lanes_log2, encoding)
+        run.launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
 
 

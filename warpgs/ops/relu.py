@@ -16,34 +16,38 @@ ROWS_PER_CHUNK = 4
 """Rows of one sum, at least."""
 
 
+def num_sums(num_rows: int) -> int:
+    """Partial sums to divide so many rows among."""
+    return min(MOST_CHUNKS, -(-num_rows // ROWS_PER_CHUNK))
+
+
 def relu_backward(
-    features: Float16[Tensor, "N read"], gradients: Float16[Tensor, "N columns"]
-) -> Float32[Tensor, "chunks columns"]:
+    features: Float16[Tensor, "N read"],
+    gradients: Float16[Tensor, "N columns"],
+    sums: Float32[Tensor, "chunks columns"],
+) -> None:
     """Sets gradients to zero, in place, where features are not positive, and adds them up over the rows.
 
     Args:
         features: [N, ≥ columns] what ReLU made, in the first columns.
         gradients: [N, columns] with respect to it; a multiple of 8 columns.
-
-    Returns:
-        [chunks, columns] partial sums of the masked gradients; their sum over the chunks is the gradient of the bias.
+        sums: [num_sums(N), columns] to be filled with partial sums of the masked gradients; their sum over the first
+            axis is the gradient of the bias.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
     """
-    sizes: dict[str, int] = {}
+    sizes: dict[str, int] = {"chunks": num_sums(len(gradients))}
     check_tensor("features", features, ("N", "read"), sizes, (torch.float16,))
     check_tensor("gradients", gradients, ("N", "columns"), sizes, (torch.float16,))
-    check_same_device({"features": features, "gradients": gradients})
-    N, columns = gradients.shape
+    check_tensor("sums", sums, ("chunks", "columns"), sizes)
+    check_same_device({"features": features, "gradients": gradients, "sums": sums})
+    columns = gradients.shape[1]
     if columns % kernels.PIECE or columns > features.shape[1]:
         raise ValueError(
             f"gradients must have a multiple of {kernels.PIECE} columns, "
             f"{features.shape[1]} at most as features have, got {columns}"
         )
     run = Run(gradients.device, [])
-    chunks = min(MOST_CHUNKS, -(-N // ROWS_PER_CHUNK))
-    sums = run.empty(chunks, columns)
     pieces = columns // kernels.PIECE
-    run.launch(kernels.relu_bwd, chunks * pieces, features, gradients, sums, work=N // max(chunks, 1))
-    return sums
+    run.launch(kernels.relu_bwd, len(sums) * pieces, features, gradients, sums, work=ROWS_PER_CHUNK)

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from warpgs.config import ModelConfig
 from warpgs.fields.mlp import AppearanceField, DeformationField
 from warpgs.ops.activation import NO_CHANGES, Changes, activate
+from warpgs.ops.streams import side_by_side
 
 from .gaussians import Gaussians
 from .splats import Splats
@@ -60,12 +61,16 @@ class SplitScene(nn.Module):
             time_noise: Added to the time that the deformation network sees (Deformable-3DGS, annealed smoothing).
         """
         static, dynamic = self.static, self.dynamic
-        relit_by = moved_by = NO_CHANGES
-        if relit and len(static):
-            relit_by = Changes(None, *self.appearance(static.means, time))
-        if moving and len(dynamic):
-            moment = time if time_noise is None else time + time_noise
-            moved_by = Changes(self.deformation(dynamic.means, moment))
+        moment = time if time_noise is None else time + time_noise
+
+        def move() -> Changes:
+            return Changes(self.deformation(dynamic.means, moment)) if moving and len(dynamic) else NO_CHANGES
+
+        def relight() -> Changes:
+            return Changes(None, *self.appearance(static.means, time)) if relit and len(static) else NO_CHANGES
+
+        # The dynamic Gaussians are the fewer: their network alone leaves most of a GPU idle.
+        moved_by, relit_by = side_by_side(static.means.device, move, relight)
         activated = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=static.means.device) >= len(static)
         return Splats(**activated._asdict(), is_dynamic=is_dynamic, sh_degree=sh_degree)
