@@ -5,12 +5,11 @@ kernels on torch's current stream, and records how to go back; ``differentiable`
 ``differentiable`` call share one ``wp.Tape``, so a whole render crosses between torch and Warp once each way.
 """
 
-import contextlib
 import functools
 import os
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -50,19 +49,24 @@ class _Command:
     """
 
     def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
-        self.arguments = kernel.adj.args
-        blank = [None if hasattr(a.type, "ndim") else 0 for a in self.arguments]
+        blank = [None if hasattr(a.type, "ndim") else 0 for a in kernel.adj.args]
         self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
         self.dim = 1
-        self.slots = self.launch.params[1:]
-        self.shapes: list[Any] = [None] * len(blank)
+        _bounds, self.first, *self.slots = self.launch.params
+        self.arguments = kernel.adj.args[1:]
+        self.shapes: list[Any] = [None] * len(self.slots)
 
-    def __call__(self, dim: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
+    def __call__(
+        self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None, shard: int = 0
+    ) -> None:
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
+        self.first.value = first
         shapes = self.shapes
         for index, (slot, value) in enumerate(zip(self.slots, arguments, strict=True)):
+            if type(value) is PerShard:
+                value = value.tensor[shard]
             if isinstance(value, Tensor):
                 slot.data = value.data_ptr()
                 shape = value.shape
@@ -202,9 +206,8 @@ class Run:
         """
         if dim == 0:
             return
-        run = self._launch_cuda if self.is_cuda else self._launch_cpu
         with profiling.span(kernel.func.__name__, self.device):
-            run(kernel, dim, arguments, block_dim, work)
+            self._launch(kernel, dim, arguments, block_dim, work)
 
     def side_by_side(self, first: Callable[[], None], second: Callable[[], None]) -> None:
         """Runs two functions that launch kernels, on CUDA at the same time: neither may need what the other writes."""
@@ -242,19 +245,17 @@ class Run:
             stream=self.stream,
         )
 
-    def _launch_cuda(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int) -> None:
-        values = [a.tensor[0] if type(a) is PerShard else a for a in arguments]
-        _command(kernel, self.device, block_dim)(dim, [0, *values], self.stream)
-
-    def _launch_cpu(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], _block_dim: int, work: int) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int) -> None:
+        if self.is_cuda:
+            _command(kernel, self.device, block_dim)(dim, 0, arguments, self.stream)
+            return
         shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
         chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
         def run_shard(shard: int) -> None:
-            values = [a.tensor[shard] if isinstance(a, PerShard) else a for a in arguments]
             command = _command(kernel, self.device, 1)
             for first in range(shard * chunk, dim, shards * chunk):
-                command(min(chunk, dim - first), [first, *values], None)
+                command(min(chunk, dim - first), first, arguments, None, shard)
 
         if shards == 1:
             run_shard(0)
@@ -273,22 +274,19 @@ class Run:
 
     def sort_pairs(self, keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
         """Stable radix sort of the first ``count`` int32 pairs by the low bits of the keys; buffers hold twice that."""
-        arrays = [_int_array(t.data_ptr(), t.numel(), self._warp_device.alias) for t in (keys, values)]
-        with profiling.span("sort_pairs", self.device), self._warp_stream():
-            wp.utils.radix_sort_pairs(*arrays, count, 0, num_bits)
-
-    @contextlib.contextmanager
-    def _warp_stream(self) -> Iterator[None]:
-        """Makes torch's stream Warp's own. No event is waited for, which a CUDA graph capture would not allow."""
-        if not self.is_cuda:
-            yield
-            return
-        previous = self._warp_device.stream
-        self._warp_device.set_stream(self.stream, sync=False)
-        try:
-            yield
-        finally:
-            self._warp_device.set_stream(previous, sync=False)
+        device = self._warp_device
+        pairs = (_int_array(t.data_ptr(), t.numel(), device.alias) for t in (keys, values))
+        with profiling.span("sort_pairs", self.device):
+            if not self.is_cuda:
+                wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
+                return
+            # Warp sorts on its own stream. No event is waited for, which a CUDA graph capture would not allow.
+            previous = device.stream
+            device.set_stream(self.stream, sync=False)
+            try:
+                wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
+            finally:
+                device.set_stream(previous, sync=False)
 
 
 _streams: dict[tuple[int, int], wp.Stream] = {}
