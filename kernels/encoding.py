@@ -62,7 +62,7 @@ def make_encode(half: bool) -> wp.Kernel:
         column = begin + dims + axis * bands
         p *= float(1 << lane)
         for band in range(lane, bands, lanes):
-            angle = wp.static(math.pi) * (p - 2.0 * wp.round(0.5 * p))
+            angle = wp.static(math.pi) * (p - 2.0 * wp.rint(0.5 * p))
             encoding[row, column + band] = number(wp.sin(angle))
             encoding[row, column + band + dims * bands] = number(wp.cos(angle))
             p *= float(1 << lanes)

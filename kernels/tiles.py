@@ -208,19 +208,22 @@ def tile_ends(
     ranges: wp.array2d[int],
     gaussian_from_isect: wp.array[int],
     is_dynamic: wp.array[wp.uint8],
-    ends: wp.array[wp.vec2i],
+    groups: int,
+    ends: wp.array2d[int],
 ):
     """One past the last static and the last dynamic intersection of each tile: where each branch's walk may end.
 
-    ``lane_count()`` threads for each tile, which look from the end of its list.
+    ``groups`` lane groups for each tile look from the end of its list, in turn, each until it has found both.
+    ``ends`` holds where the tile begins before.
     """
     thread = first + wp.tid()
     lane = thread % lane_count()
-    tile = thread / lane_count()
+    group = (thread / lane_count()) % groups
+    tile = thread / lane_count() / groups
     begin = ranges[tile, 0]
     end_static = begin
     end_dynamic = begin
-    base = ranges[tile, 1]
+    base = ranges[tile, 1] - group * LOOKS * lane_count()
     while base > begin and (end_static == begin or end_dynamic == begin):
         is_last_static = begin
         is_last_dynamic = begin
@@ -233,6 +236,7 @@ def tile_ends(
                     is_last_static = wp.max(is_last_static, isect + 1)
         end_static = wp.max(end_static, lane_max(is_last_static))
         end_dynamic = wp.max(end_dynamic, lane_max(is_last_dynamic))
-        base -= LOOKS * lane_count()
+        base -= groups * LOOKS * lane_count()
     if lane == 0:
-        ends[tile] = wp.vec2i(end_static, end_dynamic)
+        wp.atomic_max(ends, tile, 0, end_static)
+        wp.atomic_max(ends, tile, 1, end_dynamic)

@@ -22,6 +22,9 @@ DECAY = 0.999
 
 DEPTH_BITS = 31
 
+GROUPS_PER_TILE = 4
+"""Lane groups on CUDA that look for a tile's last intersections: one of one branch is looked through to its begin."""
+
 
 class Tiles(NamedTuple):
     """Which Gaussians each tile of 16×16 pixels looks at, in row-major order of tiles.
@@ -132,14 +135,15 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
 
 def record_tile_ends(run: Run, tiles: Tiles, is_dynamic: Tensor) -> Tensor:
     """[num_tiles, 2] int32: one past each tile's last static and last dynamic intersection."""
-    ends = run.empty(*tiles.ranges.shape, dtype=torch.int32)
-    lanes = WARP_SIZE if run.is_cuda else 1
+    ends = tiles.ranges[:, :1].repeat(1, 2)
+    lanes, groups = (WARP_SIZE, GROUPS_PER_TILE) if run.is_cuda else (1, 1)
     run.launch(
         kernels.tile_ends,
-        tiles.ranges.shape[0] * lanes,
+        tiles.ranges.shape[0] * lanes * groups,
         tiles.ranges,
         tiles.gaussian_from_isect,
         is_dynamic,
+        groups,
         ends,
         block_dim=BLOCK_DIM,
     )
