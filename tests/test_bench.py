@@ -93,6 +93,10 @@ def test_a_missing_folder_is_refused_before_anything_is_measured(capsys, tmp_pat
     assert "no such folder" in error_line(capsys, "--device", "cpu", "--json", str(path))
 
 
+def test_a_folder_as_a_file_is_refused_before_anything_is_measured(capsys, tmp_path):
+    assert "it is a folder" in error_line(capsys, "--device", "cpu", "--profile", str(tmp_path))
+
+
 @pytest.mark.parametrize(
     "arguments", [["bench", "--no-such-option"], ["bench", "--scenes", "huge"], ["no-such-command"]]
 )

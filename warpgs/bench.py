@@ -116,6 +116,8 @@ class Bench:
         for path in (self.json, self.profile):
             if path is not None and not path.absolute().parent.is_dir():
                 raise ValueError(f"cannot write {path}: no such folder")
+            if path is not None and path.is_dir():
+                raise ValueError(f"cannot write {path}: it is a folder")
 
 
 def bench(options: Bench, scenes: Iterable[Scene]) -> None:

@@ -74,7 +74,8 @@ def print_result(result: dict[str, Any]) -> None:
         f"{result['name']}: {result['width']}x{result['height']}, {result['num_gaussians']:,} Gaussians, "
         f"{result['intersections']:,} intersections"
     )
-    table = Table("", title=title, title_justify="left", box=box.SIMPLE if console.is_terminal else None)
+    console.print(f"\n{title}", highlight=False, soft_wrap=True)
+    table = Table("", box=box.SIMPLE if console.is_terminal else None)
     for name in names:
         table.add_column(name, justify="right")
     for figure in dict.fromkeys(figure for column in columns for figure in column):
@@ -85,7 +86,8 @@ def print_result(result: dict[str, Any]) -> None:
 def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
     """Prints a table with one line for each row; all rows have the same figures."""
     console = _console()
-    table = Table(title=title, title_justify="left", box=box.SIMPLE if console.is_terminal else None)
+    console.print(f"\n{title}", highlight=False, soft_wrap=True)
+    table = Table(box=box.SIMPLE if console.is_terminal else None)
     for name in rows[0]:
         table.add_column(name, justify="right")
     for row in rows:
