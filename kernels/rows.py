@@ -59,62 +59,78 @@ def gradient_stride(num_channels: int) -> int:
     return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
 
 
-@functools.cache
-def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the rows of splats, one thread each; depth, if wanted, is the channel after the features.
+@wp.kernel(enable_backward=False)
+def pack(
+    first: int,
+    means2d: wp.array[wp.vec2],
+    conics: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    depths: wp.array[float],
+    radii: wp.array[wp.vec2i],
+    rows: wp.array2d[wp.vec4],
+    depth_keys: wp.array[int],
+    gaussian_from_rank: wp.array[int],
+    norms: wp.array[wp.vec2],
+):
+    """Writes the geometry of the rows of splats, one thread each.
 
     It also writes what the depth sort starts from, a key and the splat's own index, and clears ``norms``.
+    """
+    i = first + wp.tid()
+    mean = means2d[i]
+    conic = conics[i]
+    opacity = opacities[i]
+    radius = radii[i]
+    depth = depths[i]
+    # A sum is finite only where all of its terms are, and a comparison with NaN fails.
+    total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
+    drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
+    drawn = drawn and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+    key = CULLED_DEPTH
+    row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
+    row1 = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
+    if drawn and wp.isfinite(total):
+        key = wp.cast(depth, wp.int32)  # the bits of positive floats are in the order of the floats
+        row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
+        row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+    row_store(rows, i, 0, row0)
+    row_store(rows, i, 1, row1)
+    depth_keys[i] = key
+    gaussian_from_rank[i] = i
+    if norms.shape[0] > 0:
+        norms[i] = wp.vec2(0.0)
+
+
+@functools.cache
+def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that writes the features of the rows, one thread each; depth, if wanted, is the channel after them.
+
+    A splat with a feature that is not finite is not drawn from then on.
     """
     num_channels = num_features + int(with_depth)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def pack(
+    def pack_features(
         first: int,
-        means2d: wp.array[wp.vec2],
-        conics: wp.array[wp.vec3],
-        opacities: wp.array[float],
         features: wp.array2d[float],
         depths: wp.array[float],
-        radii: wp.array[wp.vec2i],
         rows: wp.array2d[wp.vec4],
-        depth_keys: wp.array[int],
-        gaussian_from_rank: wp.array[int],
-        norms: wp.array[wp.vec2],
     ):
         i = first + wp.tid()
-        mean = means2d[i]
-        conic = conics[i]
-        opacity = opacities[i]
-        radius = radii[i]
-        depth = depths[i]
-        # A sum is finite only where all of its terms are, and a comparison with NaN fails.
-        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
+        total = float(0.0)
         for part in range(wp.static((num_channels + 3) // 4)):
             value = wp.vec4(0.0)
             for k in range(4):
                 if part * 4 + k < wp.static(num_features):
                     value[k] = features[i, part * 4 + k]
                 elif part * 4 + k < wp.static(num_channels):
-                    value[k] = depth
+                    value[k] = depths[i]
             total += value[0] + value[1] + value[2] + value[3]
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
-        drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
-        drawn = drawn and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
-        key = CULLED_DEPTH
-        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
-        row1 = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
-        if drawn and wp.isfinite(total):
-            key = wp.cast(depth, wp.int32)  # the bits of positive floats are in the order of the floats
-            row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
-            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
-        row_store(rows, i, 0, row0)
-        row_store(rows, i, 1, row1)
-        depth_keys[i] = key
-        gaussian_from_rank[i] = i
-        if norms.shape[0] > 0:
-            norms[i] = wp.vec2(0.0)
+        if not wp.isfinite(total):
+            row_store(rows, i, 1, wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0))
 
-    return pack
+    return pack_features
 
 
 sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE, dtype=float)
@@ -122,7 +138,7 @@ sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE, dtype=float)
 
 @functools.cache
 def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that turns gradient rows into the gradients of what ``make_pack``'s kernel read, one thread each.
+    """Kernel that turns gradient rows into the gradients of what packing read, one thread each.
 
     ``gradients`` has one slice for each CPU shard; on CUDA there is one. ``norms`` gets the length of the gradient of
     the mean and its absolute-value variant, both scaled per axis by ``half_width`` and ``half_height``.

@@ -69,7 +69,7 @@ def test_spherical_harmonics_agree(degree):
 def test_tiles_are_those_of_the_box_less_those_that_the_ellipse_misses():
     _, ours, _ = splats_and_theirs()
     run = Run(torch.device("cpu"), [])
-    result = tiles.record_tiles(run, Rows(run, ours, torch.zeros(200, 3), False, CAMERA.size), CAMERA.size)
+    result = tiles.record_tiles(run, Rows(run, ours, 3, False, CAMERA.size), CAMERA.size)
     columns, rows = tiles.num_tiles(*CAMERA.size)
     _, isect_ids, gaussians = theirs._isect_tiles(
         ours.means2d[None], ours.radii[None], ours.depths[None], 16, columns, rows

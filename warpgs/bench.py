@@ -36,7 +36,7 @@ VISIBLE_DIFFERENCE = 1e-3
 """Pixels that differ by more than this in any channel are counted."""
 
 STAGES = {
-    "project": ("project_fwd", "sh_fwd", "pack"),
+    "project": ("project_fwd", "sh_fwd", "pack", "pack_features"),
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "tile_ends"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
@@ -230,8 +230,7 @@ def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings
     run = Run(splats.means.device, [])
     geometry = (splats.means, splats.quats, splats.scales, splats.opacities, camera.viewmat, camera.K)
     projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
-    # Any features will do: what tiles a splat touches does not depend on them.
-    rows = Rows(run, projection, splats.means, settings.depth, camera.size)
+    rows = Rows(run, projection, splats.num_channels, settings.depth, camera.size)
     begins, ends = record_tiles(run, rows, camera.size).ranges.unbind(-1)
     return int((ends - begins).sum())
 

@@ -59,7 +59,8 @@ class Player:
     @torch.no_grad()
     def splats(self, moment: float, residual: bool = True) -> Splats:
         """The scene at a moment in [0, 1], with or without the appearance residual."""
-        return self._splats(torch.tensor([moment], device=self.device), residual)
+        time = torch.tensor([moment], device=self.device)
+        return self.scene.splats(time, self._moving, self._relit and residual, self._degree)
 
     def __call__(self, camera: Camera, branches: bool) -> Rendering:
         """Renders through a camera at the camera's time, with or without the images of the branches."""
@@ -84,10 +85,8 @@ class Player:
         recording = self._recordings[camera.size] = _Recording(seen, time, replay)
         return recording
 
-    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
-        return self.scene.splats(time, self._moving, self._relit and residual, self._degree)
-
     @torch.no_grad()
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
         settings = RenderSettings(branches=branches, antialias=self.config.antialias)
-        return render(self._splats(time), camera, settings=settings)
+        splats = self.scene.splats(time, self._moving, self._relit, self._degree, late_sh=True)
+        return render(splats, camera, settings=settings)

@@ -109,11 +109,14 @@ def render(
     ) -> tuple[Tensor, ...]:
         geometry = (means, quats, scales, opacities, camera.viewmat, camera.K)
         projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
+        rows = Rows(run, projection, C, settings.depth, camera.size)
+        tiles = record_tiles(run, rows, camera.size)
+        if splats.sh_stream is not None:
+            torch.cuda.current_stream(means.device).wait_stream(splats.sh_stream)
         features = appearance
         if degree is not None:
             features = record_sh(run, means, appearance, camera.viewmat, projection.radii, degree)
-        rows = Rows(run, projection, features, settings.depth, camera.size)
-        tiles = record_tiles(run, rows, camera.size)
+        rows.add_features(run, features)
         composite = record_composite(
             run, rows, tiles, camera.size, behind, branch, settings.statistics, settings.absgrad
         )

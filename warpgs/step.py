@@ -98,7 +98,7 @@ class Step:
 
     def _run(self, moment: Moment, view: View) -> None:
         self._choose_trained(moment)
-        splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, self._noise)
+        splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, self._noise, late_sh=True)
         settings = RenderSettings(branches=True, depth=moment.depth_weight > 0, antialias=self.config.antialias)
         rendering = render(splats, view.camera, settings=settings)
         terms = self._loss_terms(moment, view, rendering)

@@ -1,13 +1,14 @@
 """From raw Gaussians and what the networks say to splats (paper Eq. 5, 8 and 11)."""
 
+from itertools import chain
+
 import pytest
 import torch
 
-from tests.reference.activation import activate as reference
-from tests.reference.activation import multiply
+from tests.reference import activation as reference
 from tests.reference.covariance import rotation
 from tests.scenes import error, generator, random_like
-from warpgs.ops.activation import NO_CHANGES, Changes, Raw, activate
+from warpgs.ops.activation import NO_CHANGES, NUM_GEOMETRY, Changes, Raw, activate, join_sh
 
 SIZES = [(5, 3), (0, 3), (5, 0), (0, 0), (1, 1)]
 
@@ -17,36 +18,59 @@ def random_raw(num, rest=3, seed=0):
     return Raw(*(torch.randn(shape, generator=generator(seed)) for shape in shapes))
 
 
-def random_changes(num, bases=2, seed=5):
-    shapes = [(num, 10), (num, bases, 3), (num,)]
-    return Changes(*(0.3 * torch.randn(shape, generator=generator(seed)) for shape in shapes))
+def random_changes(num, seed=5):
+    return Changes(*(0.3 * torch.randn(shape, generator=generator(seed)) for shape in [(num, 10), (num,)]))
+
+
+def random_residuals(num, bases):
+    return 0.3 * torch.randn(num, bases, 3, generator=generator(6))
+
+
+def leaves(tensors):
+    return [None if t is None else t.requires_grad_() for t in tensors]
 
 
 def doubles(tensors):
     return [None if t is None else t.detach().double().requires_grad_() for t in tensors]
 
 
+def assert_same(ours, expected, inputs, twins):
+    """Compares values, and gradients of whatever has any."""
+    for value, wanted in zip(ours, expected, strict=True):
+        assert torch.allclose(value.double(), wanted, rtol=2e-6, atol=2e-6)
+    cotangents = random_like(ours)
+    torch.autograd.backward(ours, cotangents)
+    torch.autograd.backward(expected, [c.double() for c in cotangents])
+    for tensor, wanted in zip(inputs, twins, strict=True):
+        if tensor is not None and wanted.grad is not None:
+            assert torch.allclose(tensor.grad.double(), wanted.grad, rtol=2e-6, atol=5e-6)
+
+
 @pytest.mark.parametrize(("num_static", "num_dynamic"), SIZES)
 @pytest.mark.parametrize("changed", [(False, False), (True, False), (False, True), (True, True)])
+def test_geometry_and_its_gradients_are_those_of_the_reference(num_static, num_dynamic, changed):
+    static, dynamic = random_raw(num_static), random_raw(num_dynamic, seed=1)
+    relit = random_changes(num_static) if changed[0] else NO_CHANGES
+    moved = random_changes(num_dynamic, seed=7) if changed[1] else NO_CHANGES
+    parts = [static, dynamic, relit, moved]
+    twins = [doubles(part) for part in parts]
+    inputs = [leaves(part) for part in parts]
+    assert_same(activate(*parts), reference.activate(*twins), [*chain(*inputs)], [*chain(*twins)])
+    assert all(t.grad is not None for part in inputs for t in part[:NUM_GEOMETRY] if t is not None)
+
+
+@pytest.mark.parametrize(("num_static", "num_dynamic"), SIZES)
 @pytest.mark.parametrize("rest", [0, 3])
-def test_values_and_gradients_are_those_of_the_reference(num_static, num_dynamic, changed, rest):
+@pytest.mark.parametrize("changed", [0, 1])
+def test_colours_and_their_gradients_are_those_of_the_reference(num_static, num_dynamic, rest, changed):
     static, dynamic = random_raw(num_static, rest), random_raw(num_dynamic, rest, seed=1)
-    relit = random_changes(num_static, bases=1 + rest // 3) if changed[0] else NO_CHANGES
-    moved = random_changes(num_dynamic, bases=1, seed=7) if changed[1] else NO_CHANGES
-    inputs = [static, dynamic, relit, moved]
-    for tensor in (t for part in inputs for t in part if t is not None):
-        tensor.requires_grad_()
-    twins = [doubles(part) for part in inputs]
-    outputs, expected = activate(*inputs), reference(*twins)
-    for value, wanted in zip(outputs, expected, strict=True):
-        assert torch.allclose(value.double(), wanted, rtol=2e-6, atol=2e-6)
-    cotangents = random_like(outputs)
-    torch.autograd.backward(outputs, cotangents)
-    torch.autograd.backward(expected, [c.double() for c in cotangents])
-    for part, twin in zip(inputs, twins, strict=True):
-        for tensor, wanted in zip(part, twin, strict=True):
-            if tensor is not None:
-                assert torch.allclose(tensor.grad.double(), wanted.grad, rtol=2e-6, atol=5e-6)
+    residuals = random_residuals(num_static, 1 + rest // 3) if changed else None
+    inputs = leaves([*static, *dynamic, residuals])
+    twins = doubles(inputs)
+    expected = reference.join_sh(Raw(*twins[:6]), Raw(*twins[6:12]), twins[12])
+    assert_same([join_sh(static, dynamic, residuals)], [expected], inputs, twins)
+    assert static.sh_dc.grad is not None
+    assert dynamic.sh_rest.grad is not None
 
 
 def test_what_gets_no_gradient_hands_none_back():
@@ -60,7 +84,7 @@ def test_what_gets_no_gradient_hands_none_back():
 
 def test_products_of_quaternions_turn_first_by_the_right_one():
     a, b = (torch.randn(6, 4, generator=generator(seed)).double() for seed in (0, 1))
-    assert error(rotation(multiply(a, b)), rotation(a) @ rotation(b)) < 1e-12
+    assert error(rotation(reference.multiply(a, b)), rotation(a) @ rotation(b)) < 1e-12
 
 
 def test_opacities_stay_within_zero_and_one():
@@ -72,10 +96,15 @@ def test_opacities_stay_within_zero_and_one():
 
 
 def test_more_residuals_than_bases_are_refused():
-    with pytest.raises(ValueError, match="static: sh_residuals has 5 bases, but there are only 4"):
-        activate(random_raw(2), random_raw(2), relit=random_changes(2, bases=5))
+    with pytest.raises(ValueError, match="sh_residuals has 5 bases, but there are only 4"):
+        join_sh(random_raw(2), random_raw(2), random_residuals(2, 5))
 
 
 def test_branches_of_different_degrees_are_refused():
     with pytest.raises(ValueError, match=r"dynamic.sh_rest must have shape \[N, rest, 3\] with rest = 3"):
-        activate(random_raw(2), random_raw(2, rest=8))
+        join_sh(random_raw(2), random_raw(2, rest=8))
+
+
+def test_offsets_of_another_number_of_gaussians_are_refused():
+    with pytest.raises(ValueError, match=r"dynamic: offsets must have shape \[N, 10\] with N = 2"):
+        activate(random_raw(2), random_raw(2), moved=random_changes(3))

@@ -23,7 +23,7 @@ def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
 def binned(splats: Projection, width=WIDTH, height=HEIGHT) -> tuple[list[list[int]], int]:
     """Each tile's list, and how many intersections were counted."""
     run = Run(torch.device("cpu"), [])
-    rows = Rows(run, splats, torch.zeros(splats.depths.shape[0], 3), False, (width, height))
+    rows = Rows(run, splats, 3, False, (width, height))
     result = tiles.record_tiles(run, rows, (width, height))
     isects = result.gaussian_from_isect.tolist()
     return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.demand.item())

@@ -23,19 +23,24 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
 
 def activate(static, dynamic, relit, moved):
     """Paper Eq. 5, 8 and 11; arguments and results as those of ``warpgs.ops.activation.activate``."""
-    branches = [_branch(*static, *relit), _branch(*dynamic, *moved)]
+    branches = [_branch(*static[:4], *relit), _branch(*dynamic[:4], *moved)]
     return tuple(torch.cat(parts) for parts in zip(*branches, strict=True))
 
 
-def _branch(means, quats, log_scales, logits, sh_dc, sh_rest, offsets, sh_residuals, logit_residuals):
+def join_sh(static, dynamic, residuals):
+    """Paper Eq. 8; arguments and result as those of ``warpgs.ops.activation.join_sh``."""
+    sh = torch.cat([static.sh_dc, static.sh_rest], 1)
+    if residuals is not None:
+        changed = residuals.shape[1]
+        sh = torch.cat([sh[:, :changed] + residuals, sh[:, changed:]], 1)
+    return torch.cat([sh, torch.cat([dynamic.sh_dc, dynamic.sh_rest], 1)])
+
+
+def _branch(means, quats, log_scales, logits, offsets, logit_residuals):
     if offsets is not None:
         means = means + offsets[:, :3]
         quats = multiply(offsets[:, 3:7] + IDENTITY.to(offsets.dtype), quats)
         log_scales = log_scales + offsets[:, 7:]
     if logit_residuals is not None:
         logits = logits + logit_residuals
-    sh = torch.cat([sh_dc, sh_rest], 1)
-    if sh_residuals is not None:
-        changed = sh_residuals.shape[1]
-        sh = torch.cat([sh[:, :changed] + sh_residuals, sh[:, changed:]], 1)
-    return means, quats, log_scales.exp(), logits.sigmoid(), sh
+    return means, quats, log_scales.exp(), logits.sigmoid()

@@ -253,8 +253,9 @@ def composite(
         behind: Tensor | None,
     ) -> tuple[Tensor, ...]:
         projection = Projection(means2d, conics, depths, opacities, splats.radii)
-        rows = Rows(run, projection, features, False, size)
+        rows = Rows(run, projection, features.shape[1], False, size)
         tiles = record_tiles(run, rows, size)
+        rows.add_features(run, features)
         return record_composite(run, rows, tiles, size, behind, branch, statistics, absgrad).flat()
 
     tensors = differentiable(op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background)

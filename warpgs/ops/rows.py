@@ -20,20 +20,20 @@ class Rows:
         depth_keys, gaussian_from_rank: [2 N] int32, first half filled: what the depth sort starts from.
     """
 
-    def __init__(self, run: Run, splats: Projection, features: Tensor, with_depth: bool, size: tuple[int, int]):
-        N, num_features = features.shape
+    def __init__(self, run: Run, splats: Projection, num_features: int, with_depth: bool, size: tuple[int, int]):
+        N = len(splats.depths)
+        self._splats, self._num_features, self._with_depth, self._size = splats, num_features, with_depth, size
         self.num_channels = num_features + int(with_depth)
         self.packed = run.empty(N, kernels.row_parts(self.num_channels), 4)
         self.norms = run.empty(N, 2)
         self.depth_keys = run.empty(2 * N, dtype=int32)
         self.gaussian_from_rank = run.empty(2 * N, dtype=int32)
         run.launch(
-            kernels.make_pack(num_features, with_depth),
+            kernels.pack,
             N,
             splats.means2d,
             splats.conics,
             splats.opacities,
-            features,
             splats.depths,
             splats.radii,
             self.packed,
@@ -41,6 +41,13 @@ class Rows:
             self.gaussian_from_rank,
             self.norms,
         )
+
+    def add_features(self, run: Run, features: Tensor) -> None:
+        """Writes [N, num_features] features beside the geometry, which binning does without."""
+        splats, num_features, with_depth, size = self._splats, self._num_features, self._with_depth, self._size
+        N = len(features)
+        depths = splats.depths if with_depth else None
+        run.launch(kernels.make_pack_features(num_features, with_depth), N, features, depths, self.packed)
 
         packed, norms = self.packed, self.norms
 

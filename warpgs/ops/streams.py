@@ -1,39 +1,30 @@
 """Work that the GPU does at the same time."""
 
+import contextlib
 import threading
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Iterator
 
 import torch
 
 from . import profiling
 
-A = TypeVar("A")
-B = TypeVar("B")
-
 _streams = threading.local()
 
 
-def side_by_side(device: torch.device, first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-    """Runs two functions, on CUDA at the same time; autograd goes their ways back at the same time, too.
+@contextlib.contextmanager
+def beside(device: torch.device) -> Iterator[torch.cuda.Stream | None]:
+    """What is done inside runs beside what comes after it; autograd goes the ways back at the same time, too.
 
-    For work of many small launches beside work that fills the GPU. What the first reads must stay alive until both are
-    done, and neither may change what the other reads.
-
-    Args:
-        device: Where both work.
-        first: Runs on a stream of its own.
-        second: Runs on the current stream.
+    Gives the stream that the current one has to wait for before it uses what was made inside; None where it need not:
+    on CPU, or while a profile is taken. What was read inside must stay alive until then, and unchanged.
     """
     if device.type != "cuda" or profiling.is_on():
-        return first(), second()
-    main, side = torch.cuda.current_stream(device), _side_stream(device)
-    side.wait_stream(main)
-    with torch.cuda.stream(side):
-        one = first()
-    other = second()
-    main.wait_stream(side)
-    return one, other
+        yield None
+        return
+    stream = _side_stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(stream):
+        yield stream
 
 
 def _side_stream(device: torch.device) -> torch.cuda.Stream:

@@ -24,6 +24,8 @@ class Splats:
         sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
         sh_degree: Highest degree of ``sh`` to use; all by default.
+        sh_stream: CUDA stream that ``sh`` is still being computed on; ``render`` waits for it where it needs colours.
+            None if it is there, or as soon as the current stream comes to it.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -37,6 +39,7 @@ class Splats:
     sh: Float[Tensor, "N bases 3"] | None = None
     is_dynamic: Bool[Tensor, " N"] | None = None
     sh_degree: int | None = None
+    sh_stream: torch.cuda.Stream | None = None
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}

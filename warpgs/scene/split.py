@@ -6,8 +6,8 @@ from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
 from warpgs.fields.mlp import AppearanceField, DeformationField
-from warpgs.ops.activation import NO_CHANGES, Changes, activate
-from warpgs.ops.streams import side_by_side
+from warpgs.ops.activation import Changes, activate, join_sh
+from warpgs.ops.streams import beside
 
 from .gaussians import Gaussians
 from .splats import Splats
@@ -50,6 +50,7 @@ class SplitScene(nn.Module):
         relit: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, "1"] | None = None,
+        late_sh: bool = False,
     ) -> Splats:
         """The scene at a moment, static Gaussians first.
 
@@ -59,21 +60,25 @@ class SplitScene(nn.Module):
             relit: Whether the appearance network changes the static ones (paper Eq. 8).
             sh_degree: Highest degree of spherical harmonics in use; all that there are if None.
             time_noise: Added to the time that the deformation network sees (Deformable-3DGS, annealed smoothing).
+            late_sh: Whether ``sh`` may still be on its way on ``sh_stream``, for ``render`` to wait for; ``time`` must
+                stay alive until then.
         """
-        static, dynamic = self.static, self.dynamic
-        moment = time if time_noise is None else time + time_noise
-
-        def move() -> Changes:
-            return Changes(self.deformation(dynamic.means, moment)) if moving and len(dynamic) else NO_CHANGES
-
-        def relight() -> Changes:
-            return Changes(None, *self.appearance(static.means, time)) if relit and len(static) else NO_CHANGES
-
-        # The dynamic Gaussians are the fewer: their network alone leaves most of a GPU idle.
-        moved_by, relit_by = side_by_side(static.means.device, move, relight)
-        activated = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
-        is_dynamic = torch.arange(len(static) + len(dynamic), device=static.means.device) >= len(static)
-        return Splats(**activated._asdict(), is_dynamic=is_dynamic, sh_degree=sh_degree)
+        static, dynamic, device = self.static, self.dynamic, self.static.means.device
+        residuals = logit_residuals = None
+        with beside(device) as stream:
+            if relit and len(static):
+                residuals, logit_residuals = self.appearance(static.means, time)
+            sh = join_sh(static.raw(), dynamic.raw(), residuals)
+        if stream is not None and not (late_sh and logit_residuals is None):
+            torch.cuda.current_stream(device).wait_stream(stream)
+            stream = None
+        offsets = None
+        if moving and len(dynamic):
+            offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
+        relit_by, moved_by = Changes(logit_residuals=logit_residuals), Changes(offsets)
+        geometry = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
+        is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
+        return Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, sh_stream=stream)
 
     def static_splats(self, sh_degree: int | None = None) -> Splats:
         """The static Gaussians alone, with their own appearance w⁰."""
