@@ -7,6 +7,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
+PRIORITY = -1
+"""Of the stream that is captured: before that of work beside it (``ops.streams.beside``), whose large matrix products
+would else let none of its many small kernels in."""
+
 WARM_UPS = 3
 """Runs before the capture: they compile kernels, allocate scratch memory and learn how many intersections to expect."""
 
@@ -32,7 +36,7 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
         nonlocal outputs
         outputs = step()
 
-    stream = torch.cuda.Stream()
+    stream = torch.cuda.Stream(priority=PRIORITY)
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         for _ in range(WARM_UPS):
@@ -60,7 +64,7 @@ def record(
         pool: From ``torch.cuda.graph_pool_handle()``. Graphs that share one share memory: only one of them may be in
             use, and a new one takes over what the one before it had, which spares the driver's slow allocation.
     """
-    stream = stream or torch.cuda.Stream()
+    stream = stream or torch.cuda.Stream(priority=PRIORITY)
     warp_stream = wp.stream_from_torch(stream)
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
