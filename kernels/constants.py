@@ -34,3 +34,6 @@ NEVER_DRAWN = wp.constant(-1.0e30)
 
 CULLED_DEPTH = wp.constant(0x7F7FFFFF)
 """Sort key of a Gaussian that is not drawn: the bits of the largest float."""
+
+SMALLEST_ALPHA = wp.constant(1.0e-6)
+"""Opacity that depth is at least divided by: keeps it finite where nothing was drawn."""

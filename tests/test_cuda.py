@@ -13,6 +13,7 @@ SETTINGS = [
     RenderSettings(),
     RenderSettings(branches=True, statistics=True, absgrad=True),
     RenderSettings(depth=True, antialias=True),
+    RenderSettings(depth=True, branches=True),
 ]
 
 
@@ -24,13 +25,14 @@ def drawn(device, settings, channels=None):
     layers = [layer for layer in (result.joint, result.static, result.dynamic) if layer is not None]
     outputs = [value for layer in layers for value in layer if value is not None]
     if settings.depth:  # where hardly anything was drawn, depth divides by next to nothing
-        outputs[-1] = outputs[-1] * layers[0].alpha.detach()
+        outputs = [value * layer.alpha.detach() for layer in layers for value in (layer.depth, layer.alpha)]
+        outputs += [layer.image for layer in layers]
     pulled(outputs, [c.to(device) for c in random_like(outputs)]).backward()
     statistics = [result.gradient_norms, *([result.weights] if settings.statistics else [])]
     return [t.detach().cpu() for t in (*outputs, *statistics, *gradients(splats).values())]
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth"])
+@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth", "all depths"])
 def test_images_and_gradients_are_those_of_the_cpu(settings):
     for actual, expected in zip(drawn("cuda", settings), drawn("cpu", settings), strict=True):
         assert relative_error(actual, expected) < 1e-5

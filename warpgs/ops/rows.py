@@ -14,6 +14,7 @@ class Rows:
     Attributes:
         packed: [N, parts, 4] rows.
         num_channels: Features, and depth where it is one of them.
+        with_depth: Whether it is.
         norms: [N, 2] length of the gradient of the screen-space mean and its absolute-value variant (the lengths'
             terms summed over pixels before squaring), in normalised device coordinates (pixels × size / 2) as the
             densification of 3DGS expects; zero until the way back has been gone.
@@ -22,7 +23,7 @@ class Rows:
 
     def __init__(self, run: Run, splats: Projection, features: Tensor, with_depth: bool, size: tuple[int, int]):
         N, num_features = features.shape
-        self.num_channels = num_features + int(with_depth)
+        self.num_channels, self.with_depth = num_features + int(with_depth), with_depth
         self.packed = run.empty(N, kernels.row_parts(self.num_channels), 4)
         self.norms = run.empty(N, 2)
         self.depth_keys = run.empty(2 * N, dtype=int32)

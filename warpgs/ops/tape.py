@@ -30,6 +30,9 @@ CHUNKS_PER_SHARD = 16
 SMALLEST_SHARD = 16384
 """Threads below which a CPU launch is not worth another core."""
 
+LITTLE_WORK = 1 / 16
+"""What a thread that only moves a few numbers does of a plain thread's work."""
+
 
 @dataclass(frozen=True)
 class PerShard:
@@ -195,7 +198,7 @@ class Run:
 
     # Launching --------------------------------------------------------------------------------------------------------
 
-    def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int = 1) -> None:
+    def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int | float = 1) -> None:
         """Runs ``dim`` threads of a kernel; ``arguments`` follow its first parameter, ``first``.
 
         ``work`` says how many times a plain thread's work one of these does, for sharing out CPU launches.
@@ -242,11 +245,15 @@ class Run:
             stream=self.stream,
         )
 
-    def _launch_cuda(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int) -> None:
+    def _launch_cuda(
+        self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, _work: int | float
+    ) -> None:
         values = [a.tensor[0] if type(a) is PerShard else a for a in arguments]
         _command(kernel, self.device, block_dim)(dim, [0, *values], self.stream)
 
-    def _launch_cpu(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], _block_dim: int, work: int) -> None:
+    def _launch_cpu(
+        self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], _block_dim: int, work: int | float
+    ) -> None:
         shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
         chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
