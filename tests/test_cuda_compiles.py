@@ -24,7 +24,7 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-MODULES = ["activation", "adam", "covariance", "projection", "raytrace", "relu", "sh", "tiles"]
+MODULES = ["activation", "adam", "covariance", "depth_error", "projection", "raytrace", "relu", "sh", "tiles"]
 
 
 @pytest.mark.parametrize("name", MODULES)
