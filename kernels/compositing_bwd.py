@@ -62,7 +62,7 @@ def make_composite_bwd(
         gaussian_from_isect: wp.array[int],
         rows: wp.array2d[wp.vec4],
         is_dynamic: wp.array[wp.uint8],
-        background: wp.array[float],
+        background: wp.array2d[float],
         width: int,
         height: int,
         transmittance: wp.array[float],
@@ -95,6 +95,7 @@ def make_composite_bwd(
         n = integers()
         v_color = colors()
         n_last = wp.vec3i(0, 0, 0)
+        num_behind = wp.where(background.shape[0] > 0, background.shape[1], 0)
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
@@ -114,8 +115,8 @@ def make_composite_bwd(
                             for c in range(wp.static(C)):
                                 v = v_image[p, c]
                                 v_color[k * wp.static(C) + c] += v
-                                if background.shape[0] > 0:
-                                    behind += background[c] * v
+                                if c < num_behind:
+                                    behind += background[wp.min(m, background.shape[0] - 1), c] * v
                             R[k] += T[k] * behind
         for m in range(wp.static(images)):
             n_last[m] = lane_max(n_last[m])  # from here on the lane group's

@@ -6,6 +6,8 @@ Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
     image = Σ_i alpha_i T_i feature_i + T_end background.
 
+A channel that the image does not have is depth, which is normalised instead: divided by max(alpha, SMALLEST_ALPHA).
+
 Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one walk, each with its own
 transmittance. A tile whose Gaussians all belong to one branch needs no walk for it: that branch's image is the joint
 one and the other is background. So there are two kernels: ``images`` = 1 walks for the joint image, alone or in tiles
@@ -19,7 +21,7 @@ import functools
 import warp as wp
 
 from .blocks import block_box, block_corner, module_options, stage_survivors, state_types
-from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -50,6 +52,8 @@ def make_composite_fwd(
         outputs: How many it writes, 1 or 3, at least ``images``; ``tile_ends`` is only read for 3.
         pixels: Columns and rows of pixels that a lane owns.
         statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
+
+    The kernel's ``background`` has a row for each image or one for all; there is none behind depth.
     """
     C = num_channels
     columns, rows_per_lane = pixels
@@ -64,10 +68,11 @@ def make_composite_fwd(
         gaussian_from_isect: wp.array[int],
         rows: wp.array2d[wp.vec4],
         is_dynamic: wp.array[wp.uint8],
-        background: wp.array[float],
+        background: wp.array2d[float],
         width: int,
         height: int,
         image: wp.array2d[float],
+        depth: wp.array[float],
         alpha_image: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
@@ -184,6 +189,7 @@ def make_composite_fwd(
             lane_sync()
             base += lane_count()
 
+        num_behind = wp.where(background.shape[0] > 0, background.shape[1], 0)
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
@@ -202,8 +208,11 @@ def make_composite_fwd(
                         last[p] = n[k] * int(kept)
                         for c in range(wp.static(C)):
                             value = kept * color[k * wp.static(C) + c]
-                            if background.shape[0] > 0:
-                                value += t * background[c]
-                            image[p, c] = value
+                            if c < num_behind:
+                                value += t * background[wp.min(m, background.shape[0] - 1), c]
+                            if c < image.shape[1]:
+                                image[p, c] = value
+                            else:
+                                depth[p] = value / wp.max(1.0 - t, SMALLEST_ALPHA)
 
     return composite_fwd

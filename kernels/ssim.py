@@ -1,13 +1,20 @@
-"""Structural similarity (Wang et al. 2004) as 3DGS uses it: 11×11 Gaussian window, σ = 1.5, zero padding, per channel.
+"""Structural similarity (Wang et al. 2004) as 3DGS uses it: 11×11 Gaussian window, σ = 1.5, zero padding, per channel;
+alone, or in one pass with the absolute difference that losses have beside it.
 
 With x, y the two images (each times a mask, if there is one) and E[·] the windowed mean, μ_x = E[x], μ_y = E[y],
 σ_x² = E[x²] - μ_x², σ_xy = E[xy] - μ_x μ_y:
 
     SSIM = (2 μ_x μ_y + C1)(2 σ_xy + C2) / ((μ_x² + μ_y² + C1)(σ_x² + σ_y² + C2)),  C1 = 0.01², C2 = 0.03².
 
-Gradient with respect to x, with v the cotangent of the map and ∂ taken at fixed other moments:
+What is written for each pixel and channel is, with three weights,
 
-    v_x = E[v ∂SSIM/∂μ_x] + 2 x E[v ∂SSIM/∂E[x²]] + y E[v ∂SSIM/∂E[xy]]        (the window is symmetric).
+    value = base + l1 |x - y| + similarity SSIM.
+
+Gradient with respect to x, with ∂ taken at fixed other moments and v the cotangent of the sum of all values:
+
+    v_x = v (l1 sign(x - y) + similarity (E[∂SSIM/∂μ_x] + 2 x E[∂SSIM/∂E[x²]] + y E[∂SSIM/∂E[xy]])),
+
+for the window is symmetric. Where each pixel has a cotangent of its own, the three ∂ are multiplied by it beforehand.
 
 The window is separable. One thread slides down a strip of one column and channel: it filters each new line
 horizontally and adds the result to the eleven lines that it reaches vertically, so a pixel costs 22 taps instead of
@@ -74,7 +81,10 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
         image: wp.array3d[float],
         target: wp.array3d[float],
         mask: wp.array2d[wp.uint8],
-        similarity: wp.array3d[float],
+        base: float,
+        l1: float,
+        similarity: float,
+        values: wp.array3d[float],
         partials: wp.array4d[float],
     ):
         """``partials`` [3, H, W, C]: ∂SSIM/∂μ_x, ∂SSIM/∂E[x²], ∂SSIM/∂E[xy]; not written where its first size is 0."""
@@ -124,7 +134,8 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
                 cross_contrast = 2.0 * (pending_xy[0] - mu_x * mu_y) + C2
                 scale = 1.0 / (luminance * contrast)
                 value = cross_luminance * cross_contrast * scale
-                similarity[y, x, c] = value
+                difference = pixel(image, mask, y, x, c) - pixel(target, mask, y, x, c)
+                values[y, x, c] = base + l1 * wp.abs(difference) + similarity * value
                 if partials.shape[0] > 0:
                     partials[0, y, x, c] = (
                         2.0 * mu_y * (cross_contrast - cross_luminance) * scale
@@ -148,10 +159,13 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
         image: wp.array3d[float],
         target: wp.array3d[float],
         mask: wp.array2d[wp.uint8],
+        l1: float,
+        similarity: float,
         partials: wp.array4d[float],
-        v_similarity: wp.array3d[float],
+        v_sum: wp.array[float],
         v_image: wp.array3d[float],
     ):
+        """``v_sum`` [1]: cotangent of the sum of all values."""
         thread = first + wp.tid()
         height = image.shape[0]
         width = image.shape[1]
@@ -171,10 +185,10 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
             if line >= 0 and line < height:
                 for k in range(WINDOW):
                     column = wp.clamp(x + k - RADIUS, 0, width - 1)
-                    v = wp.where(column == x + k - RADIUS, TAPS[k] * v_similarity[line, column, c], 0.0)
-                    sum_mean += v * partials[0, line, column, c]
-                    sum_square += v * partials[1, line, column, c]
-                    sum_cross += v * partials[2, line, column, c]
+                    tap = wp.where(column == x + k - RADIUS, TAPS[k], 0.0)
+                    sum_mean += tap * partials[0, line, column, c]
+                    sum_square += tap * partials[1, line, column, c]
+                    sum_cross += tap * partials[2, line, column, c]
             pending_mean = advanced(pending_mean, sum_mean)
             pending_square = advanced(pending_square, sum_square)
             pending_cross = advanced(pending_cross, sum_cross)
@@ -182,7 +196,9 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
             if y >= top:
                 p = pixel(image, mask, y, x, c)
                 q = pixel(target, mask, y, x, c)
-                value = pending_mean[0] + 2.0 * p * pending_square[0] + q * pending_cross[0]
+                sign = wp.where(p > q, 1.0, 0.0) - wp.where(p < q, 1.0, 0.0)
+                steepness = pending_mean[0] + 2.0 * p * pending_square[0] + q * pending_cross[0]
+                value = v_sum[0] * (l1 * sign + similarity * steepness)
                 if wp.static(with_mask):
                     if mask[y, x] == wp.uint8(0):
                         value = 0.0

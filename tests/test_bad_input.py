@@ -118,6 +118,12 @@ def test_a_background_that_does_not_fit_is_refused(background):
         render(make_splats(), CAMERA, background)
 
 
+@pytest.mark.parametrize(("branches", "shape"), [(False, (3, 3)), (True, (1, 3)), (True, (3, 4)), (True, (3, 3, 1))])
+def test_backgrounds_that_do_not_fit_the_images_are_refused(branches, shape):
+    with pytest.raises(ValueError, match="background must"):
+        render(make_splats(), CAMERA, torch.zeros(shape), RenderSettings(branches=branches))
+
+
 @pytest.mark.parametrize(("name", "shape"), [("viewmat", (3, 4)), ("K", (4, 4))])
 def test_a_camera_matrix_that_does_not_fit_is_refused(name, shape):
     with pytest.raises(ValueError, match=f"{name} must"):

@@ -3,9 +3,20 @@
 import pytest
 import torch
 
-from tests.scenes import as_leaves, gradients, make_camera, make_splats, pulled, random_like, relative_error
+from tests.reference.depth_error import random_inputs
+from tests.scenes import (
+    as_leaves,
+    generator,
+    gradients,
+    make_camera,
+    make_splats,
+    pulled,
+    random_like,
+    relative_error,
+)
 from warpgs.config import RenderSettings
-from warpgs.ops.ssim import ssim_map
+from warpgs.ops.depth_error import depth_error
+from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.render import render
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -13,6 +24,7 @@ SETTINGS = [
     RenderSettings(),
     RenderSettings(branches=True, statistics=True, absgrad=True),
     RenderSettings(depth=True, antialias=True),
+    RenderSettings(depth=True, branches=True),
 ]
 
 
@@ -24,13 +36,14 @@ def drawn(device, settings, channels=None):
     layers = [layer for layer in (result.joint, result.static, result.dynamic) if layer is not None]
     outputs = [value for layer in layers for value in layer if value is not None]
     if settings.depth:  # where hardly anything was drawn, depth divides by next to nothing
-        outputs[-1] = outputs[-1] * layers[0].alpha.detach()
+        outputs = [value * layer.alpha.detach() for layer in layers for value in (layer.depth, layer.alpha)]
+        outputs += [layer.image for layer in layers]
     pulled(outputs, [c.to(device) for c in random_like(outputs)]).backward()
     statistics = [result.gradient_norms, *([result.weights] if settings.statistics else [])]
     return [t.detach().cpu() for t in (*outputs, *statistics, *gradients(splats).values())]
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth"])
+@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth", "all depths"])
 def test_images_and_gradients_are_those_of_the_cpu(settings):
     for actual, expected in zip(drawn("cuda", settings), drawn("cpu", settings), strict=True):
         assert relative_error(actual, expected) < 1e-5
@@ -50,6 +63,23 @@ def test_similarity_and_its_gradient_are_those_of_the_cpu():
         similarity.square().sum().backward()
         values.append([similarity.detach().cpu(), image.grad.cpu()])
     for expected, actual in zip(*values, strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_losses_and_their_gradients_are_those_of_the_cpu():
+    def pull(device):
+        depth, alpha, inverse_depth, alignment, region = (t.to(device) for t in random_inputs(70, 50, generator()))
+        image, target = torch.rand(2, 70, 50, 3, generator=generator()).to(device)
+        image.requires_grad_()
+        depth.requires_grad_()
+        values = [
+            l1_and_ssim(image, target, 0.2, region),
+            depth_error(depth, alpha, inverse_depth, alignment, region),
+        ]
+        sum(values).backward()
+        return [t.detach().cpu() for t in (*values, image.grad, depth.grad)]
+
+    for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
         assert relative_error(actual, expected) < 1e-5
 
 

@@ -166,20 +166,28 @@ def test_a_dynamic_image_without_its_background_has_a_loss():
 DEPTH = 1.0 + IMAGE[..., 0]
 TARGET = 1.0 + TRUTH[..., 0]
 OPAQUE = torch.full((HEIGHT, WIDTH), 0.9)
+ALIGNMENT = torch.tensor([0.5, 0.1])
+
+
+def compared_depth(depth, alpha, target, region):
+    """The depth loss against a target, as inverse depth that has yet to be aligned."""
+    scale, offset = ALIGNMENT.double()
+    inverse_depth = ((1.0 / target.double() - offset) / scale).float()
+    return depth_loss(depth, alpha, inverse_depth, ALIGNMENT, region)
 
 
 def test_the_depth_loss_is_that_of_equation_14():
     expected = ((DEPTH.double() - TARGET.double()) * MASK).abs().sum() / (HEIGHT * WIDTH)
-    assert error(depth_loss(DEPTH, OPAQUE, TARGET, MASK), expected) < 1e-6
+    assert error(compared_depth(DEPTH, OPAQUE, TARGET, MASK), expected) < 1e-6
 
 
 def test_depth_is_free_outside_the_region():
-    assert not gradient(depth_loss, DEPTH, OPAQUE, TARGET, MASK)[~MASK].any()
+    assert not gradient(compared_depth, DEPTH, OPAQUE, TARGET, MASK)[~MASK].any()
 
 
 def test_depth_is_pulled_to_its_target_with_equal_force():
     expected = (DEPTH.double() - TARGET.double()).sign() / (HEIGHT * WIDTH)
-    assert error(gradient(depth_loss, DEPTH, OPAQUE, TARGET, torch.ones_like(MASK)), expected) < 1e-9
+    assert error(gradient(compared_depth, DEPTH, OPAQUE, TARGET, torch.ones_like(MASK)), expected) < 1e-9
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
@@ -187,9 +195,9 @@ def test_pixels_of_unknown_depth_are_left_out(unknown):
     target, known = TARGET.clone(), MASK.clone()
     target[0] = unknown
     known[0] = False
-    expected = depth_loss(DEPTH, OPAQUE, TARGET, known)
-    assert error(depth_loss(DEPTH, OPAQUE, target, MASK), expected) < 1e-7
-    pull = gradient(depth_loss, DEPTH, OPAQUE, target, MASK)
+    expected = compared_depth(DEPTH, OPAQUE, TARGET, known)
+    assert error(compared_depth(DEPTH, OPAQUE, target, MASK), expected) < 1e-7
+    pull = gradient(compared_depth, DEPTH, OPAQUE, target, MASK)
     assert pull.isfinite().all()
     assert not pull[0].any()
 
@@ -198,13 +206,13 @@ def test_pixels_where_little_was_drawn_are_left_out():
     alpha, drawn = OPAQUE.clone(), MASK.clone()
     alpha[1] = 0.4
     drawn[1] = False
-    assert error(depth_loss(DEPTH, alpha, TARGET, MASK), depth_loss(DEPTH, OPAQUE, TARGET, drawn)) < 1e-7
+    assert error(compared_depth(DEPTH, alpha, TARGET, MASK), compared_depth(DEPTH, OPAQUE, TARGET, drawn)) < 1e-7
 
 
 def test_without_any_known_depth_there_is_no_loss():
     target = torch.full_like(TARGET, torch.nan)
-    assert depth_loss(DEPTH, OPAQUE, target, MASK) == 0
-    assert not gradient(depth_loss, DEPTH, OPAQUE, target, MASK).any()
+    assert compared_depth(DEPTH, OPAQUE, target, MASK) == 0
+    assert not gradient(compared_depth, DEPTH, OPAQUE, target, MASK).any()
 
 
 # Eq. 15: the terms of an iteration -----------------------------------------------------------------------------------
@@ -284,7 +292,7 @@ def view_depth():
     return 1.0 / (0.5 * INVERSE_DEPTH.double() + 0.1)
 
 
-def compared_depth(layer, region):
+def expected_depth(layer, region):
     known = region & (layer.alpha > 0.5)
     assert known.any()
     return ((layer.depth.double() - view_depth()) * known).abs().mean()
@@ -328,13 +336,13 @@ def test_each_stage_has_its_terms(stage, used):
 @pytest.mark.parametrize("stage", STAGES)
 def test_the_depth_term_is_that_of_the_static_branch_in_the_static_region(stage):
     terms, rendering = terms_of(stage)
-    expected = 2.0 * compared_depth(rendering.static, VIEW_MASK)
+    expected = 2.0 * expected_depth(rendering.static, VIEW_MASK)
     assert error(terms["depth"], expected) < 1e-5
 
 
 def test_the_dynamic_branch_has_its_share_of_the_depth_loss_in_the_dynamic_region():
     terms, rendering = terms_of("stage1")
-    expected = 0.4 * 2.0 * compared_depth(rendering.dynamic, ~VIEW_MASK)
+    expected = 0.4 * 2.0 * expected_depth(rendering.dynamic, ~VIEW_MASK)
     assert error(terms["depth_dynamic"], expected) < 1e-5
 
 

@@ -16,6 +16,7 @@ from tests.scenes import (
     chosen,
     error,
     float_tensors,
+    generator,
     gradients,
     make_camera,
     make_splats,
@@ -57,6 +58,25 @@ def test_images_statistics_and_gradients_are_those_of_the_reference(channels, an
         assert error(actual, wanted) < 2e-6
     assert relative_error(result.weights, weights.sum((1, 2))) < 2e-6
     assert torch.equal(result.contributed, weights.sum((1, 2)) > 0)
+    cotangents = random_like(expected)
+    pulled(outputs(result), cotangents).backward()
+    pulled(expected, cotangents).backward()
+    for name, gradient in gradients(splats).items():
+        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
+    assert relative_error(behind.grad, behind64.grad) < 1e-5
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_each_image_may_have_its_own_background(depth):
+    splats, behind = as_leaves(make_splats()), torch.rand(3, 3, generator=generator()).requires_grad_()
+    behind64 = behind.detach().double().requires_grad_()
+    result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, depth=depth))
+    doubles = as_doubles(splats)
+    masks = (None, ~splats.is_dynamic, splats.is_dynamic)
+    drawn = [reference(doubles, CAMERA, b, drawn=m) for b, m in zip(behind64, masks, strict=True)]
+    expected = [d[0] for d in drawn] + [d[1] for d in drawn]
+    for actual, wanted in zip(outputs(result), expected, strict=True):
+        assert error(actual, wanted) < 2e-6
     cotangents = random_like(expected)
     pulled(outputs(result), cotangents).backward()
     pulled(expected, cotangents).backward()

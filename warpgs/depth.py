@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from warpgs.kernels.constants import SMALLEST_INVERSE_DEPTH
+
 from .cameras import Camera
 
 REWEIGHTINGS = 50
@@ -68,4 +70,4 @@ def align_to_rendering(
 def metric_depth(inverse_depth: Float[Tensor, "H W"], alignment: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:
     """Depth in scene units of an aligned frame; NaN where unknown, and where the alignment says at or past infinity."""
     aligned = alignment[0] * inverse_depth + alignment[1]
-    return torch.where(aligned > 1e-3, 1.0 / aligned, torch.nan)
+    return torch.where(aligned > SMALLEST_INVERSE_DEPTH, 1.0 / aligned, torch.nan)

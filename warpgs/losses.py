@@ -4,21 +4,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .ops.ssim import ssim
+from .ops.depth_error import depth_error
+from .ops.ssim import l1_and_ssim
 
 
 def image_loss(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], ssim_weight: float) -> Float[Tensor, ""]:
     """L1 + λ (1 − SSIM) over all pixels."""
-    loss = (image - truth).abs().mean()
-    return loss + ssim_weight * (1.0 - ssim(image.contiguous(), truth)) if ssim_weight else loss
+    if ssim_weight:
+        return l1_and_ssim(image.contiguous(), truth, ssim_weight)
+    return (image - truth).abs().mean()
 
 
 def static_loss(
     image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], static: Bool[Tensor, "H W"], ssim_weight: float
 ) -> Float[Tensor, ""]:
     """Paper Eq. 9: the static image against the truth, both masked by M, so that what is hidden stays free."""
-    loss = ((image - truth) * static[..., None]).abs().mean()
-    return loss + ssim_weight * (1.0 - ssim(image.contiguous(), truth, static)) if ssim_weight else loss
+    if ssim_weight:
+        return l1_and_ssim(image.contiguous(), truth, ssim_weight, static)
+    return ((image - truth) * static[..., None]).abs().mean()
 
 
 def dynamic_loss(
@@ -36,16 +39,21 @@ def dynamic_loss(
 
 
 def depth_loss(
-    depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], target: Float[Tensor, "H W"], region: Bool[Tensor, "H W"]
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    inverse_depth: Float[Tensor, "H W"],
+    alignment: Float[Tensor, "2"],
+    region: Bool[Tensor, "H W"],
 ) -> Float[Tensor, ""]:
     """Paper Eq. 14: L1 of one branch's depth against monocular depth within its region [scene units].
+
+    The mean is over the whole image; pixels that have nothing to compare count as zero.
 
     Args:
         depth: Rendered, weighted by contribution and normalised.
         alpha: Opacity of the branch's image; pixels under half of it have no depth to speak of.
-        target: Aligned monocular depth; NaN where unknown.
+        inverse_depth: Monocular; NaN where unknown.
+        alignment: Scale and offset that make it 1 / depth; what is then next to infinity or past it is unknown.
         region: M for the static branch.
     """
-    known = region & target.isfinite() & (alpha > 0.5)
-    error = torch.where(known, depth - torch.where(known, target, 0.0), 0.0).abs()
-    return error.sum() / depth.numel()
+    return depth_error(depth, alpha, inverse_depth, alignment, region)

@@ -18,9 +18,6 @@ from .ops.tape import Run, differentiable
 from .ops.tiles import record_tiles
 from .scene.splats import Splats
 
-SMALLEST_ALPHA = 1e-6
-"""Opacity under which a pixel has no depth: keeps depth / alpha finite where nothing was drawn."""
-
 
 class Layer(NamedTuple):
     """One image.
@@ -63,7 +60,7 @@ class Rendering:
 def render(
     splats: Splats,
     camera: Camera,
-    background: Float[Tensor, " C"] | None = None,
+    background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
     settings: RenderSettings | None = None,
 ) -> Rendering:
     """Renders splats through a camera; differentiable in every splat parameter and in the background.
@@ -74,7 +71,8 @@ def render(
     Args:
         splats: N Gaussians, N may be 0.
         camera: On the device of the splats. No gradient flows to it.
-        background: [C] colour behind everything, black by default.
+        background: [C] colour behind everything, black by default; with branches also [3, C], behind the joint, the
+            static and the dynamic image.
         settings: What to compute besides the joint image.
 
     Returns:
@@ -87,7 +85,8 @@ def render(
     settings = settings or RenderSettings()
     C = splats.num_channels
     if background is not None:
-        check_tensor("background", background, (C,), {})
+        is_one_each = settings.branches and isinstance(background, Tensor) and background.ndim == 2
+        check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_one_each else (C,), {})
     check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
     branch = None
     if settings.branches:
@@ -123,12 +122,12 @@ def render(
         return (projection.radii, *composite.flat())
 
     appearance = splats.colors if splats.sh is None else splats.sh
-    behind = background
-    if background is not None and settings.depth:
-        behind = torch.cat([background, background.new_zeros(1)])
-    radii, *flat = differentiable(op, splats.means, splats.quats, splats.scales, splats.opacities, appearance, behind)
-    composite = Composite.from_flat(tuple(flat), NUM_BRANCH_IMAGES if settings.branches else 1)
-    layers = [_layer(*pair, settings.depth) for pair in zip(composite.images, composite.alphas, strict=True)]
+    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, appearance, background)
+    radii, *flat = differentiable(op, *tensors)
+    num_images = NUM_BRANCH_IMAGES if settings.branches else 1
+    composite = Composite.from_flat(tuple(flat), num_images, settings.depth)
+    depths = composite.depths or (None,) * num_images
+    layers = [Layer(*parts) for parts in zip(composite.images, composite.alphas, depths, strict=True)]
     return Rendering(
         joint=layers[0],
         static=layers[1] if settings.branches else None,
@@ -138,9 +137,3 @@ def render(
         contributed=composite.contributed,
         weights=composite.weights,
     )
-
-
-def _layer(image: Tensor, alpha: Tensor, depth: bool) -> Layer:
-    if not depth:
-        return Layer(image, alpha, None)
-    return Layer(image[..., :-1], alpha, image[..., -1] / alpha.clamp_min(SMALLEST_ALPHA))

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
-from . import depth, losses, optim
+from . import losses, optim
 from .config import RenderSettings, TrainConfig
 from .densify import GradientStatistics
 from .ops.graph import record
@@ -18,6 +19,9 @@ from .views import View, Views
 
 TERMS = ("static", "dynamic", "joint", "depth", "depth_dynamic")
 """Terms of the loss."""
+
+DECIBELS = -10.0
+"""PSNR of the base-10 logarithm of the mean squared error."""
 
 WARM_UPS = 3
 """Iterations of one kind before one is captured in a CUDA graph: all that is made once is then there."""
@@ -56,10 +60,13 @@ class Step:
         self.alignments = alignments
         self.sums = torch.zeros(len(TERMS) + 2, device=device)
         self._index = torch.zeros(1, dtype=torch.int64, device=device)
-        num_rates = len(optim.GROUPS)
-        self._numbers = torch.zeros(5 + num_rates, device=device)
-        self._noise, self._depth_weight = self._numbers[0:1], self._numbers[1]
-        self._background, self._rates = self._numbers[2:5], self._numbers[5:]
+        # What the host says anew in every iteration, in one copy: noise on time, colours behind the three images, what
+        # each of ``sums`` is scaled by (terms of the loss by their weights), learning rates.
+        lengths = (1, 9, len(self.sums), len(optim.GROUPS))
+        self._numbers = torch.zeros(sum(lengths), device=device)
+        self._noise, backgrounds, self._scales, self._rates = self._numbers.split(lengths)
+        self._backgrounds = backgrounds.view(3, 3)
+        self._nothing, self._one = torch.zeros((), device=device), torch.ones((), device=device)
         self.optimizer = optim.make_optimizer(scene, self._rates)
         self._replay: Callable[[], None] | None = None
         self._pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
@@ -77,7 +84,10 @@ class Step:
         """Runs the iteration of a moment of the schedule."""
         progress = (moment.progress, moment.network_progress, moment.network_warmth)
         rates = optim.learning_rates(self.config.optim, self.extent, *progress)
-        numbers = [draw.noise, moment.depth_weight, *draw.background.tolist(), *rates]
+        weights = self.config.loss
+        depth_weights = (moment.depth_weight, weights.depth_dynamic * moment.depth_weight)
+        scales = (weights.static, weights.dynamic, weights.joint, *depth_weights, DECIBELS, 1.0)
+        numbers = [draw.noise, *[0.0] * 6, *draw.background.tolist(), *scales, *rates]
         self._numbers.copy_(torch.tensor(numbers), non_blocking=True)
         self._index.fill_(draw.view)
         if not (self.config.graph and self.views.resident and self.views.device.type == "cuda"):
@@ -100,36 +110,39 @@ class Step:
         self._choose_trained(moment)
         splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, self._noise, late_sh=True)
         settings = RenderSettings(branches=True, depth=moment.depth_weight > 0, antialias=self.config.antialias)
-        rendering = render(splats, view.camera, settings=settings)
+        rendering = render(splats, view.camera, self._backgrounds, settings)
         terms = self._loss_terms(moment, view, rendering)
-        torch.stack(list(terms.values())).sum().backward()
+        # The gradient of a weighted sum, which is not wanted itself, starts from the weights.
+        torch.autograd.backward(list(terms.values()), [self._scales[TERMS.index(name)] for name in terms])
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.statistics.observe(rendering.gradient_norms, rendering.radii)
         self._note(terms, rendering, view)
 
     def _loss_terms(self, moment: Moment, view: View, rendering: Rendering) -> dict[str, Tensor]:
-        """Paper Eq. 15: static, dynamic and depth loss; in stage II also the joint image against the whole truth."""
+        """Paper Eq. 15: static, dynamic and depth loss; in stage II also the joint image against the whole truth.
+
+        Still without their weights, which are ``self._scales``.
+        """
         weights = self.config.loss
         static, dynamic = rendering.static, rendering.dynamic
         assert static is not None
         assert dynamic is not None
         truth, mask = view.image, view.static_mask
-        terms = {"static": weights.static * losses.static_loss(static.image, truth, mask, weights.ssim)}
-        branches = [("depth", static, mask, 1.0)]
+        terms = {"static": losses.static_loss(static.image, truth, mask, weights.ssim)}
+        branches = [("depth", static, mask)]
         if moment.stage.name != "pretrain":
-            image = dynamic.image + (1.0 - dynamic.alpha)[..., None] * self._background
-            terms["dynamic"] = weights.dynamic * losses.dynamic_loss(image, truth, mask, weights.ssim, self._background)
-            branches.append(("depth_dynamic", dynamic, ~mask, weights.depth_dynamic))
+            behind = self._backgrounds[2]
+            terms["dynamic"] = losses.dynamic_loss(dynamic.image, truth, mask, weights.ssim, behind)
+            if weights.depth_dynamic > 0:
+                branches.append(("depth_dynamic", dynamic, ~mask))
         if moment.joint:
-            terms["joint"] = weights.joint * losses.image_loss(rendering.joint.image, truth, weights.ssim)
+            terms["joint"] = losses.image_loss(rendering.joint.image, truth, weights.ssim)
         if moment.depth_weight > 0:
-            target = depth.metric_depth(view.inverse_depth, self.alignments.index_select(0, self._index)[0])
-            for name, layer, region, weight in branches:
-                if weight > 0:
-                    assert layer.depth is not None
-                    loss = losses.depth_loss(layer.depth, layer.alpha, target, region)
-                    terms[name] = weight * self._depth_weight * loss
+            alignment = self.alignments.index_select(0, self._index)[0]
+            for name, layer, region in branches:
+                assert layer.depth is not None
+                terms[name] = losses.depth_loss(layer.depth, layer.alpha, view.inverse_depth, alignment, region)
         return terms
 
     def _choose_trained(self, moment: Moment) -> None:
@@ -145,7 +158,6 @@ class Step:
     @torch.no_grad()
     def _note(self, terms: dict[str, Tensor], rendering: Rendering, view: View) -> None:
         """Adds to the sums since the last look, without waiting for the device."""
-        error = (rendering.joint.image.clamp(0, 1) - view.image).square().mean()
-        nothing = torch.zeros_like(error)
-        values = [terms.get(name, nothing) for name in TERMS]
-        self.sums += torch.stack([*values, -10.0 * error.log10(), nothing + 1.0])
+        error = mse_loss(rendering.joint.image.clamp(0, 1), view.image)
+        values = [terms.get(name, self._nothing) for name in TERMS]
+        self.sums.addcmul_(torch.stack([*values, error.log10(), self._one]), self._scales)

@@ -6,7 +6,7 @@ from skimage.metrics import structural_similarity
 
 from tests.reference.ssim import ssim_map as reference
 from tests.scenes import error, generator, random_like, relative_error
-from warpgs.ops.ssim import ssim, ssim_map
+from warpgs.ops.ssim import l1_and_ssim, ssim, ssim_map
 
 SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2)]
 """Also higher than one thread's strip, and narrower than the window."""
@@ -90,7 +90,39 @@ def test_the_mean_of_the_map_is_the_similarity():
     assert torch.equal(ssim(image, target), ssim_map(image, target).mean())
 
 
-def test_an_image_without_pixels_is_refused():
+def l1_and_ssim_reference(image, target, weight, mask):
+    similarity = reference(image, target, mask).mean()
+    difference = image - target if mask is None else (image - target) * mask[..., None]
+    return difference.abs().mean() + weight * (1.0 - similarity)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("weight", [0.0, 0.2, 3.0])
+@pytest.mark.parametrize("size", SIZES)
+def test_l1_and_similarity_in_one_pass_are_those_of_the_reference(size, weight, masked):
+    image, target, mask = images(size)
+    mask = mask if masked else None
+    double = image.double().requires_grad_()
+    image.requires_grad_()
+    value = l1_and_ssim(image, target, weight, mask)
+    expected = l1_and_ssim_reference(double, target.double(), weight, mask)
+    assert error(value, expected) < 1e-6
+    (3.7 * value).backward()
+    (3.7 * expected).backward()
+    assert relative_error(image.grad, double.grad) < 1e-5
+
+
+def test_equal_images_are_not_pulled_by_l1_and_similarity():
+    image, _, mask = images()
+    leaf = image.clone().requires_grad_()
+    value = l1_and_ssim(leaf, image, 0.2, mask)
+    value.backward()
+    assert value.item() == pytest.approx(0, abs=1e-7)
+    assert leaf.grad.abs().max() < 1e-7
+
+
+@pytest.mark.parametrize("compare", [ssim, lambda image, target: l1_and_ssim(image, target, 0.2)])
+def test_an_image_without_pixels_is_refused(compare):
     empty = torch.zeros(0, 5, 3)
     with pytest.raises(ValueError, match="image must have pixels"):
-        ssim(empty, empty)
+        compare(empty, empty)

@@ -14,6 +14,7 @@ from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
 
 from .contracts import check_image_size, check_same_device, check_tensor
+from .layers import Layers, gather_adjoints
 from .projection import Projection
 from .rows import Rows
 from .tape import PerShard, Run, differentiable
@@ -39,6 +40,8 @@ class Composite(NamedTuple):
     Attributes:
         images: [H, W, C] each.
         alphas: [H, W] each, the opacity that the splats leave, in [0, 1 - 1e-4).
+        depths: [H, W] each, mean depth of what was drawn, weighted by its contribution [scene units], 0 where nothing
+            was; none unless the rows have depth.
         norms: [N, 2] screen-space gradient norms, filled on the way back; see ``Rows``.
         contributed: [N] whether the Gaussian changed a pixel of the joint image.
         weights: [N] sum over pixels of the joint image of alpha times transmittance.
@@ -46,6 +49,7 @@ class Composite(NamedTuple):
 
     images: tuple[Float[Tensor, "H W C"], ...]
     alphas: tuple[Float[Tensor, "H W"], ...]
+    depths: tuple[Float[Tensor, "H W"], ...]
     norms: Float[Tensor, "N 2"]
     contributed: Bool[Tensor, " N"] | None
     weights: Float[Tensor, " N"] | None
@@ -53,14 +57,14 @@ class Composite(NamedTuple):
     def flat(self) -> tuple[Tensor, ...]:
         """As a tuple of tensors, the way ``differentiable`` wants it."""
         statistics = () if self.contributed is None or self.weights is None else (self.contributed, self.weights)
-        return (*self.images, *self.alphas, self.norms, *statistics)
+        return (*self.images, *self.alphas, *self.depths, self.norms, *statistics)
 
     @staticmethod
-    def from_flat(tensors: tuple[Tensor, ...], num_images: int) -> "Composite":
-        images, alphas = tensors[:num_images], tensors[num_images : 2 * num_images]
-        norms, *statistics = tensors[2 * num_images :]
+    def from_flat(tensors: tuple[Tensor, ...], num_images: int, with_depth: bool) -> "Composite":
+        n, m = num_images, num_images * int(with_depth)
+        norms, *statistics = tensors[2 * n + m :]
         contributed, weights = statistics or (None, None)
-        return Composite(images, alphas, norms, contributed, weights)
+        return Composite(tensors[:n], tensors[n : 2 * n], tensors[2 * n : 2 * n + m], norms, contributed, weights)
 
 
 def cuda_pixels(size: tuple[int, int]) -> tuple[int, int]:
@@ -112,15 +116,20 @@ def record_composite(
 ) -> Composite:
     """Composites packed rows. With ``is_dynamic`` [N] uint8 three images come out, otherwise one.
 
-    ``background`` has a value for each channel of the rows; none is black.
+    ``background`` is [features], or [images, features] with another one for each image; none is black. There is none
+    behind depth.
     """
     width, height = size
     C = rows.num_channels
     N = rows.packed.shape[0]
     images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
     ends = None if is_dynamic is None else record_tile_ends(run, tiles, is_dynamic)
-    image, alpha = run.empty(images, height, width, C), run.empty(images, height, width)
+    num_colors = C - int(rows.with_depth)
+    image, alpha = run.empty(images, height, width, num_colors), run.empty(images, height, width)
+    depth = run.empty(images, height, width) if rows.with_depth else None
+    layers = Layers(tuple(image), tuple(alpha), () if depth is None else tuple(depth))
     transmittance, last = run.empty(alpha.numel()), run.empty(alpha.numel(), dtype=torch.int32)
+    behind = None if background is None else background.view(-1, background.shape[-1])
     contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
     weights = run.zeros(run.num_shards, N) if statistics else None
     _launch(
@@ -135,38 +144,23 @@ def record_composite(
         tiles.gaussian_from_isect,
         rows.packed,
         is_dynamic,
-        background,
+        behind,
         width,
         height,
-        image.view(-1, C),
+        image.view(-1, num_colors),
+        None if depth is None else depth.view(-1),
         alpha.view(-1),
         transmittance,
         last,
         contributed,
         None if weights is None else PerShard(weights),
     )
-    result = Composite(
-        images=tuple(image),
-        alphas=tuple(alpha),
-        norms=rows.norms,
-        contributed=None if contributed is None else contributed.view(torch.bool),
-        weights=None if weights is None else weights.sum(0),
-    )
-
-    def gathered(run: Run, outputs: tuple[Tensor, ...]) -> Tensor | None:
-        """The cotangents of several outputs in one tensor, flat; None where nothing has arrived at any."""
-        values = [run.adjoint(t) for t in outputs]
-        if all(v is None for v in values):
-            return None
-        if len(values) == 1:
-            return values[0]
-        return torch.stack([torch.zeros_like(t) if v is None else v for t, v in zip(outputs, values, strict=True)])
 
     def backward(run: Run) -> None:
-        v_image, v_alpha = gathered(run, result.images), gathered(run, result.alphas)
+        v_image, v_alpha = gather_adjoints(run, layers, alpha, depth)
         if v_image is None and v_alpha is None:
             return
-        v_image = run.zeros(*image.shape) if v_image is None else v_image
+        v_image = run.zeros(images, height, width, C) if v_image is None else v_image
         gradients = run.zeros(run.num_shards, N, gradient_stride(C))
         _launch(
             run,
@@ -180,7 +174,7 @@ def record_composite(
             tiles.gaussian_from_isect,
             rows.packed,
             is_dynamic,
-            background,
+            behind,
             width,
             height,
             transmittance,
@@ -191,10 +185,18 @@ def record_composite(
         )
         run.add_adjoint(rows.packed, gradients)
         if background is not None and run.wants(background):
-            run.add_adjoint(background, transmittance @ v_image.view(-1, C))
+            pixels = height * width
+            v_behind = transmittance.view(images, 1, pixels) @ v_image.view(images, pixels, C)
+            v_behind = v_behind[:, 0, : background.shape[-1]]
+            run.add_adjoint(background, v_behind.sum(0) if background.ndim == 1 else v_behind)
 
     run.on_backward(backward)
-    return result
+    return Composite(
+        *layers,
+        norms=rows.norms,
+        contributed=None if contributed is None else contributed.view(torch.bool),
+        weights=None if weights is None else weights.sum(0),
+    )
 
 
 def composite(
@@ -259,4 +261,4 @@ def composite(
         return record_composite(run, rows, tiles, size, behind, branch, statistics, absgrad).flat()
 
     tensors = differentiable(op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background)
-    return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES)
+    return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES, with_depth=False)

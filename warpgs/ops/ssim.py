@@ -1,4 +1,4 @@
-"""Fused structural similarity (kernels/ssim.py)."""
+"""Fused structural similarity, alone or with the absolute difference beside it (kernels/ssim.py)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,56 +9,15 @@ from warpgs.kernels import ssim as kernels
 from .contracts import check_same_device, check_tensor
 from .tape import Run, differentiable
 
+SIMILARITY = (0.0, 0.0, 1.0)
+"""Weights of the kernels, base, L1 and similarity, for similarity alone."""
+
 
 def ssim_map(
     image: Float[Tensor, "H W C"], target: Float[Tensor, "H W C"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "H W C"]:
     """Structural similarity around each pixel and channel; see ``ssim``."""
-    sizes: dict[str, int] = {}
-    check_tensor("image", image, ("H", "W", "C"), sizes)
-    check_tensor("target", target, ("H", "W", "C"), sizes)
-    if mask is not None:
-        check_tensor("mask", mask, ("H", "W"), sizes, (torch.bool,))
-    check_same_device({"image": image, "target": target, "mask": mask})
-    kept = None if mask is None else mask.view(torch.uint8)
-    H, W, C = image.shape
-    strips = -(-H // kernels.STRIP)
-
-    def op(run: Run, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
-        similarity = run.empty(H, W, C)
-        partials = run.empty(3, H, W, C) if run.needs_grad else None
-        run.launch(
-            kernels.make_ssim_fwd(kept is not None),
-            strips * W * C,
-            image,
-            target,
-            kept,
-            similarity,
-            partials,
-            work=kernels.STRIP,
-        )
-
-        def backward(run: Run) -> None:
-            v_similarity = run.adjoint(similarity)
-            if v_similarity is not None:
-                v_image = run.empty(H, W, C)
-                run.launch(
-                    kernels.make_ssim_bwd(kept is not None),
-                    strips * W * C,
-                    image,
-                    target,
-                    kept,
-                    partials,
-                    v_similarity,
-                    v_image,
-                    work=kernels.STRIP,
-                )
-                run.add_adjoint(image, v_image)
-
-        run.on_backward(backward)
-        return (similarity,)
-
-    return differentiable(op, image, target.detach())[0]
+    return _compare(image, target, mask, SIMILARITY, mean=False)
 
 
 def ssim(
@@ -77,6 +36,61 @@ def ssim(
     Raises:
         ValueError: On a wrong shape, dtype or device, or an image without pixels.
     """
-    if isinstance(image, Tensor) and image.numel() == 0:
+    return _compare(image, target, mask, SIMILARITY, mean=True)
+
+
+def l1_and_ssim(
+    image: Float[Tensor, "H W C"],
+    target: Float[Tensor, "H W C"],
+    ssim_weight: float,
+    mask: Bool[Tensor, "H W"] | None = None,
+) -> Float[Tensor, ""]:
+    """Mean of |image − target| + λ (1 − SSIM) over pixels and channels, in one pass; otherwise as ``ssim``.
+
+    Args:
+        ssim_weight: λ.
+    """
+    return _compare(image, target, mask, (ssim_weight, 1.0, -ssim_weight), mean=True)
+
+
+def _compare(
+    image: Tensor, target: Tensor, mask: Tensor | None, weights: tuple[float, float, float], mean: bool
+) -> Tensor:
+    """base + l1 |image − target| + similarity SSIM: the mean, or [H, W, C] of each pixel and channel."""
+    sizes: dict[str, int] = {}
+    check_tensor("image", image, ("H", "W", "C"), sizes)
+    check_tensor("target", target, ("H", "W", "C"), sizes)
+    if mask is not None:
+        check_tensor("mask", mask, ("H", "W"), sizes, (torch.bool,))
+    check_same_device({"image": image, "target": target, "mask": mask})
+    if mean and image.numel() == 0:
         raise ValueError(f"image must have pixels to compare, got shape {list(image.shape)}")
-    return ssim_map(image, target, mask).mean()
+    kept = None if mask is None else mask.view(torch.uint8)
+    H, W, C = image.shape
+    threads = -(-H // kernels.STRIP) * W * C
+    _, l1, similarity = weights
+
+    def op(run: Run, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
+        values = run.empty(H, W, C)
+        partials = run.empty(3 if run.needs_grad else 0, H, W, C)
+        images = (image, target, kept)
+        kernel = kernels.make_ssim_fwd(kept is not None)
+        run.launch(kernel, threads, *images, *weights, values, partials, work=kernels.STRIP)
+        result = values.mean() if mean else values
+
+        def backward(run: Run) -> None:
+            v = run.adjoint(result)
+            if v is None:
+                return
+            v_image = run.empty(H, W, C)
+            scale, slopes = (1.0 / image.numel(), partials) if mean else (1.0, v * partials)
+            v_sum = v.view(1) if mean else v.new_ones(1)
+            kernel = kernels.make_ssim_bwd(kept is not None)
+            arguments = (scale * l1, scale * similarity, slopes, v_sum, v_image)
+            run.launch(kernel, threads, *images, *arguments, work=kernels.STRIP)
+            run.add_adjoint(image, v_image)
+
+        run.on_backward(backward)
+        return (result,)
+
+    return differentiable(op, image, target.detach())[0]

@@ -29,6 +29,9 @@ CHUNKS_PER_SHARD = 16
 SMALLEST_SHARD = 16384
 """Threads below which a CPU launch is not worth another core."""
 
+LITTLE_WORK = 1 / 16
+"""What a thread that only moves a few numbers does of a plain thread's work."""
+
 
 @dataclass(frozen=True)
 class PerShard:
@@ -199,7 +202,7 @@ class Run:
 
     # Launching --------------------------------------------------------------------------------------------------------
 
-    def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int = 1) -> None:
+    def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int | float = 1) -> None:
         """Runs ``dim`` threads of a kernel; ``arguments`` follow its first parameter, ``first``.
 
         ``work`` says how many times a plain thread's work one of these does, for sharing out CPU launches.
@@ -245,7 +248,7 @@ class Run:
             stream=self.stream,
         )
 
-    def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int | float) -> None:
         if self.is_cuda:
             _command(kernel, self.device, block_dim)(dim, 0, arguments, self.stream)
             return

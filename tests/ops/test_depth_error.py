@@ -1,0 +1,75 @@
+"""Depth against aligned monocular depth."""
+
+import pytest
+import torch
+
+from tests.reference.depth_error import depth_error as reference
+from tests.reference.depth_error import random_inputs
+from tests.scenes import error, generator, relative_error
+from warpgs.ops.depth_error import depth_error
+
+SIZES = [(1, 1), (37, 50)]
+
+
+def doubles(inputs):
+    return [t.double() if t.is_floating_point() else t for t in inputs]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_error_is_that_of_the_reference(size):
+    inputs = random_inputs(*size, generator())
+    expected = reference(*doubles(inputs))
+    assert expected > 0
+    assert error(depth_error(*inputs), expected) < 1e-6 * expected
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_gradient_is_that_of_the_reference(size):
+    inputs = random_inputs(*size, generator())
+    double = doubles(inputs)
+    inputs[0].requires_grad_()
+    double[0].requires_grad_()
+    (3.7 * depth_error(*inputs)).backward()
+    (3.7 * reference(*double)).backward()
+    assert relative_error(inputs[0].grad, double[0].grad) < 1e-6
+
+
+def test_a_depth_that_is_right_is_not_pulled():
+    depth, opaque, everywhere = torch.full((3, 4), 4.0), torch.ones(3, 4), torch.ones(3, 4, dtype=torch.bool)
+    depth.requires_grad_()
+    value = depth_error(depth, opaque, torch.full((3, 4), 0.25), torch.tensor([1.0, 0.0]), everywhere)
+    value.backward()
+    assert value == 0
+    assert not depth.grad.any()
+
+
+@pytest.mark.parametrize("alignment", [[torch.nan, torch.nan], [-1.0, 0.0], [0.0, 1e-3]])
+def test_without_an_alignment_that_leaves_targets_there_is_no_error(alignment):
+    depth, alpha, inverse_depth, _, region = random_inputs(5, 6, generator())
+    depth.requires_grad_()
+    value = depth_error(depth, alpha, inverse_depth, torch.tensor(alignment), region)
+    value.backward()
+    assert value == 0
+    assert not depth.grad.any()
+
+
+def test_depth_alone_gets_a_gradient():
+    inputs = [t.requires_grad_() if t.is_floating_point() else t for t in random_inputs(5, 6, generator())]
+    depth_error(*inputs).backward()
+    assert [t.grad is None for t in inputs] == [False, True, True, True, True]
+
+
+@pytest.mark.parametrize("name", ["depth", "alpha", "inverse_depth", "alignment", "region"])
+@pytest.mark.parametrize("spoil", [lambda t: t[:1], lambda t: t.double(), lambda t: t[..., None]])
+@pytest.mark.usefixtures("contracts_off")
+def test_what_does_not_fit_is_refused(name, spoil):
+    names = ["depth", "alpha", "inverse_depth", "alignment", "region"]
+    inputs = dict(zip(names, random_inputs(5, 6, generator()), strict=True))
+    with pytest.raises(ValueError, match=" must "):
+        depth_error(**{**inputs, name: spoil(inputs[name])})
+
+
+def test_an_image_without_pixels_is_refused():
+    empty = torch.zeros(0, 5)
+    with pytest.raises(ValueError, match="depth must have pixels"):
+        depth_error(empty, empty, empty, torch.ones(2), empty.bool())
