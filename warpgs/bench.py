@@ -183,6 +183,9 @@ def time_passes(workloads: dict[str, Workload], graphed: list[str], options: Ben
         steps[name, "forward_ms"] = workload.forward
     for name, workload in workloads.items():
         steps[name, "forward_backward_ms"] = workload.forward_backward
+    if options.device == "cuda":
+        for name, workload in workloads.items():
+            steps[name, "one_thread_forward_backward_ms"] = workload.forward_backward_on_one_thread
     for name in graphed:
         steps[name, "graph_forward_backward_ms"] = capture(workloads[name].forward_backward)
     for _ in range(WARM_UPS[options.device]):
@@ -237,7 +240,8 @@ def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings
 
 def ratios(figures: Measurements, base: Measurements) -> Measurements:
     """Times over those of ``base``; without a graph of its own, also over the base's graph."""
-    result = {f: figures[f"{f}_ms"] / base[f"{f}_ms"] for f in ("forward", "forward_backward")}
+    passes = ("forward", "forward_backward", "one_thread_forward_backward")
+    result = {f: figures[f"{f}_ms"] / base[f"{f}_ms"] for f in passes if f"{f}_ms" in base}
     graph = "graph_forward_backward_ms"
     if graph in base:
         result["graph_forward_backward"] = figures.get(graph, figures["forward_backward_ms"]) / base[graph]

@@ -36,6 +36,11 @@ class Workload:
     def forward_backward(self) -> tuple[Tensor, ...]:
         return torch.autograd.grad(self.draw(), self.parameters, self.cotangents)
 
+    def forward_backward_on_one_thread(self) -> tuple[Tensor, ...]:
+        """The same without autograd's thread for the device, which costs waking up and cold caches."""
+        with torch.autograd.set_multithreading_enabled(False):
+            return self.forward_backward()
+
 
 def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> Workload:
     """This package's render with random cotangents, the same for every render of these images."""
