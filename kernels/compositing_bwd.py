@@ -37,18 +37,18 @@ from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 
 @functools.cache
 def make_composite_bwd(
-    num_channels: int, images: int, outputs: int, pixels: tuple[int, int], absolute: bool
+    num_features: int, with_depth: bool, images: int, outputs: int, pixels: tuple[int, int], absolute: bool
 ) -> wp.Kernel:
     """Reverse walk, launched like the forward kernel.
 
     Args:
-        num_channels, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the forward
-            kernel's.
+        num_features, with_depth, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the
+            forward kernel's.
         absolute: Whether the absolute-value variant of the means' gradient is gathered too.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero.
     """
-    C = num_channels
+    C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, images * P)
@@ -62,7 +62,8 @@ def make_composite_bwd(
         gaussian_from_isect: wp.array[int],
         rows: wp.array2d[wp.vec4],
         is_dynamic: wp.array[wp.uint8],
-        background: wp.array2d[float],
+        background: wp.array[float],
+        background_stride: int,
         width: int,
         height: int,
         transmittance: wp.array[float],
@@ -95,7 +96,6 @@ def make_composite_bwd(
         n = integers()
         v_color = colors()
         n_last = wp.vec3i(0, 0, 0)
-        num_behind = wp.where(background.shape[0] > 0, background.shape[1], 0)
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
@@ -115,8 +115,8 @@ def make_composite_bwd(
                             for c in range(wp.static(C)):
                                 v = v_image[p, c]
                                 v_color[k * wp.static(C) + c] += v
-                                if c < num_behind:
-                                    behind += background[wp.min(m, background.shape[0] - 1), c] * v
+                                if background.shape[0] > 0 and c < wp.static(num_features):
+                                    behind += background[m * background_stride + c] * v
                             R[k] += T[k] * behind
         for m in range(wp.static(images)):
             n_last[m] = lane_max(n_last[m])  # from here on the lane group's

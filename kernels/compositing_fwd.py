@@ -6,7 +6,7 @@ Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
     image = Σ_i alpha_i T_i feature_i + T_end background.
 
-A channel that the image does not have is depth, which is normalised instead: divided by max(alpha, SMALLEST_ALPHA).
+Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, SMALLEST_ALPHA).
 
 Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one walk, each with its own
 transmittance. A tile whose Gaussians all belong to one branch needs no walk for it: that branch's image is the joint
@@ -42,20 +42,21 @@ from .rows import GEOMETRY_PARTS, row_load
 
 @functools.cache
 def make_composite_fwd(
-    num_channels: int, images: int, outputs: int, pixels: tuple[int, int], statistics: bool
+    num_features: int, with_depth: bool, images: int, outputs: int, pixels: tuple[int, int], statistics: bool
 ) -> wp.Kernel:
     """Forward kernel, ``lane_count()`` threads for each block of pixels.
 
     Args:
-        num_channels: Features of a Gaussian, at least 1.
+        num_features: Channels of an image, at least 1.
+        with_depth: Whether Gaussians have their depth as one more channel.
         images: How many it walks for, 1 or 3, see above.
         outputs: How many it writes, 1 or 3, at least ``images``; ``tile_ends`` is only read for 3.
         pixels: Columns and rows of pixels that a lane owns.
         statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
 
-    The kernel's ``background`` has a row for each image or one for all; there is none behind depth.
+    The kernel's ``background`` has ``num_features`` values, those of the next image ``background_stride`` further on.
     """
-    C = num_channels
+    C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, images * P)
@@ -68,7 +69,8 @@ def make_composite_fwd(
         gaussian_from_isect: wp.array[int],
         rows: wp.array2d[wp.vec4],
         is_dynamic: wp.array[wp.uint8],
-        background: wp.array2d[float],
+        background: wp.array[float],
+        background_stride: int,
         width: int,
         height: int,
         image: wp.array2d[float],
@@ -189,7 +191,6 @@ def make_composite_fwd(
             lane_sync()
             base += lane_count()
 
-        num_behind = wp.where(background.shape[0] > 0, background.shape[1], 0)
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
@@ -206,13 +207,13 @@ def make_composite_fwd(
                         alpha_image[p] = 1.0 - t
                         transmittance[p] = t
                         last[p] = n[k] * int(kept)
-                        for c in range(wp.static(C)):
+                        for c in range(wp.static(num_features)):
                             value = kept * color[k * wp.static(C) + c]
-                            if c < num_behind:
-                                value += t * background[wp.min(m, background.shape[0] - 1), c]
-                            if c < image.shape[1]:
-                                image[p, c] = value
-                            else:
-                                depth[p] = value / wp.max(1.0 - t, SMALLEST_ALPHA)
+                            if background.shape[0] > 0:
+                                value += t * background[m * background_stride + c]
+                            image[p, c] = value
+                        if wp.static(num_features < C):
+                            drawn = kept * color[k * wp.static(C) + wp.static(num_features)]
+                            depth[p] = drawn / wp.max(1.0 - t, SMALLEST_ALPHA)
 
     return composite_fwd

@@ -59,10 +59,10 @@ def test_ssim_compiles(make, with_mask, tmp_path):
 @pytest.mark.parametrize(("images", "outputs"), IMAGES)
 @pytest.mark.parametrize("pixels", [CUDA_PIXELS, CUDA_PIXELS_OF_SMALL])
 def test_compositing_compiles(make, flag, images, outputs, pixels, tmp_path):
-    assert_compiles(make(3, images, outputs, pixels, flag).module, tmp_path)
+    assert_compiles(make(3, flag, images, outputs, pixels, flag).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])
 @pytest.mark.parametrize("channels", [1, 9])
 def test_compositing_compiles_for_other_channels(make, channels, tmp_path):
-    assert_compiles(make(channels, 1, 1, CUDA_PIXELS, False).module, tmp_path)
+    assert_compiles(make(channels, False, 1, 1, CUDA_PIXELS, False).module, tmp_path)

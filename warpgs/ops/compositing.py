@@ -75,7 +75,7 @@ def cuda_pixels(size: tuple[int, int]) -> tuple[int, int]:
 def _launch(
     run: Run,
     make_kernel: Callable[..., Any],
-    channels: int,
+    rows: Rows,
     images: int,
     flag: bool,
     size: tuple[int, int],
@@ -83,13 +83,13 @@ def _launch(
     *arguments: Any,
 ) -> None:
     """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
-    lanes, columns, rows = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
+    lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
     pixels = cuda_pixels(size) if run.is_cuda else CPU_PIXELS
-    blocks = (TILE_SIZE // (columns * pixels[0])) * (TILE_SIZE // (rows * pixels[1]))
+    blocks = (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
 
     def walk(walked: int) -> None:
         run.launch(
-            make_kernel(channels, walked, images, pixels, flag),
+            make_kernel(rows.num_features, rows.with_depth, walked, images, pixels, flag),
             tiles.ranges.shape[0] * blocks * lanes,
             tiles.ranges,
             *arguments,
@@ -124,18 +124,19 @@ def record_composite(
     N = rows.packed.shape[0]
     images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
     ends = None if is_dynamic is None else record_tile_ends(run, tiles, is_dynamic)
-    num_colors = C - int(rows.with_depth)
-    image, alpha = run.empty(images, height, width, num_colors), run.empty(images, height, width)
+    num_features = rows.num_features
+    image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None
     layers = Layers(tuple(image), tuple(alpha), () if depth is None else tuple(depth))
     transmittance, last = run.empty(alpha.numel()), run.empty(alpha.numel(), dtype=torch.int32)
-    behind = None if background is None else background.view(-1, background.shape[-1])
+    behind = None if background is None else background.view(-1)
+    stride = 0 if background is None or background.ndim == 1 else num_features
     contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
     weights = run.zeros(run.num_shards, N) if statistics else None
     _launch(
         run,
         make_composite_fwd,
-        C,
+        rows,
         images,
         statistics,
         size,
@@ -145,9 +146,10 @@ def record_composite(
         rows.packed,
         is_dynamic,
         behind,
+        stride,
         width,
         height,
-        image.view(-1, num_colors),
+        image.view(-1, num_features),
         None if depth is None else depth.view(-1),
         alpha.view(-1),
         transmittance,
@@ -165,7 +167,7 @@ def record_composite(
         _launch(
             run,
             make_composite_bwd,
-            C,
+            rows,
             images,
             absgrad,
             size,
@@ -175,6 +177,7 @@ def record_composite(
             rows.packed,
             is_dynamic,
             behind,
+            stride,
             width,
             height,
             transmittance,
@@ -187,7 +190,7 @@ def record_composite(
         if background is not None and run.wants(background):
             pixels = height * width
             v_behind = transmittance.view(images, 1, pixels) @ v_image.view(images, pixels, C)
-            v_behind = v_behind[:, 0, : background.shape[-1]]
+            v_behind = v_behind[:, 0, :num_features]
             run.add_adjoint(background, v_behind.sum(0) if background.ndim == 1 else v_behind)
 
     run.on_backward(backward)

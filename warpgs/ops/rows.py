@@ -13,8 +13,8 @@ class Rows:
 
     Attributes:
         packed: [N, parts, 4] rows.
-        num_channels: Features, and depth where it is one of them.
-        with_depth: Whether it is.
+        num_features, with_depth: Features, and whether depth is one more channel after them.
+        num_channels: All of these.
         norms: [N, 2] length of the gradient of the screen-space mean and its absolute-value variant (the lengths'
             terms summed over pixels before squaring), in normalised device coordinates (pixels × size / 2) as the
             densification of 3DGS expects; zero until the way back has been gone.
@@ -23,8 +23,8 @@ class Rows:
 
     def __init__(self, run: Run, splats: Projection, num_features: int, with_depth: bool, size: tuple[int, int]):
         N = len(splats.depths)
-        self._splats, self._num_features, self._size = splats, num_features, size
-        self.num_channels, self.with_depth = num_features + int(with_depth), with_depth
+        self._splats, self._size = splats, size
+        self.num_features, self.with_depth, self.num_channels = num_features, with_depth, num_features + int(with_depth)
         self.packed = run.empty(N, kernels.row_parts(self.num_channels), 4)
         self.norms = run.empty(N, 2)
         self.depth_keys = run.empty(2 * N, dtype=int32)
@@ -45,7 +45,7 @@ class Rows:
 
     def add_features(self, run: Run, features: Tensor) -> None:
         """Writes [N, num_features] features beside the geometry, which binning does without."""
-        splats, num_features, with_depth, size = self._splats, self._num_features, self.with_depth, self._size
+        splats, num_features, with_depth, size = self._splats, self.num_features, self.with_depth, self._size
         N = len(features)
         depths = splats.depths if with_depth else None
         run.launch(kernels.make_pack_features(num_features, with_depth), N, features, depths, self.packed)
