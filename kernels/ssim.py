@@ -28,8 +28,11 @@ import warp as wp
 
 WINDOW = 11
 RADIUS = 5
-STRIP = wp.constant(16)
+STRIP = 16
 """Pixels of one column that a thread handles; the lines above and below it are filtered again."""
+
+STRIP_OF_SMALL = 4
+"""The same on CUDA in small images, which else have too few threads to keep a GPU busy."""
 
 C1 = wp.constant(0.01**2)
 C2 = wp.constant(0.03**2)
@@ -81,6 +84,7 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
         image: wp.array3d[float],
         target: wp.array3d[float],
         mask: wp.array2d[wp.uint8],
+        strip: int,
         base: float,
         l1: float,
         similarity: float,
@@ -95,8 +99,8 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
         lines = width * channels
         x = (thread % lines) / channels
         c = thread % channels
-        top = (thread / lines) * STRIP
-        bottom = wp.min(top + STRIP, height)
+        top = (thread / lines) * strip
+        bottom = wp.min(top + strip, height)
         pending_x = window_vector()
         pending_y = window_vector()
         pending_xx = window_vector()
@@ -159,6 +163,7 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
         image: wp.array3d[float],
         target: wp.array3d[float],
         mask: wp.array2d[wp.uint8],
+        strip: int,
         l1: float,
         similarity: float,
         partials: wp.array4d[float],
@@ -173,8 +178,8 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
         lines = width * channels
         x = (thread % lines) / channels
         c = thread % channels
-        top = (thread / lines) * STRIP
-        bottom = wp.min(top + STRIP, height)
+        top = (thread / lines) * strip
+        bottom = wp.min(top + strip, height)
         pending_mean = window_vector()
         pending_square = window_vector()
         pending_cross = window_vector()

@@ -27,9 +27,10 @@ CUDA_PIXELS = (1, 2)
 """Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""
 
 CUDA_PIXELS_OF_SMALL = (1, 1)
-"""The same in images of at most ``SMALL`` pixels, which else have too few lanes to keep a GPU busy."""
+"""The same in small images, which else have too few lanes to keep a GPU busy."""
 
 SMALL = 1 << 18
+"""Pixels that a small image has at most."""
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
@@ -67,9 +68,9 @@ class Composite(NamedTuple):
         return Composite(tensors[:n], tensors[n : 2 * n], tensors[2 * n : 2 * n + m], norms, contributed, weights)
 
 
-def cuda_pixels(size: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows of pixels that a lane composites on CUDA in an image of ``size``."""
-    return CUDA_PIXELS_OF_SMALL if size[0] * size[1] <= SMALL else CUDA_PIXELS
+def is_small(size: tuple[int, int]) -> bool:
+    """Whether an image of a size (width, height) is better cut into smaller pieces on a GPU."""
+    return size[0] * size[1] <= SMALL
 
 
 def _launch(
@@ -84,7 +85,9 @@ def _launch(
 ) -> None:
     """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
     lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    pixels = cuda_pixels(size) if run.is_cuda else CPU_PIXELS
+    pixels = CPU_PIXELS
+    if run.is_cuda:
+        pixels = CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
     blocks = (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
 
     def walk(walked: int) -> None:

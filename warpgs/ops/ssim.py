@@ -6,6 +6,7 @@ from torch import Tensor
 
 from warpgs.kernels import ssim as kernels
 
+from .compositing import is_small
 from .contracts import check_same_device, check_tensor
 from .tape import Run, differentiable
 
@@ -67,15 +68,16 @@ def _compare(
         raise ValueError(f"image must have pixels to compare, got shape {list(image.shape)}")
     kept = None if mask is None else mask.view(torch.uint8)
     H, W, C = image.shape
-    threads = -(-H // kernels.STRIP) * W * C
+    strip = kernels.STRIP_OF_SMALL if image.is_cuda and is_small((W, H)) else kernels.STRIP
+    threads = -(-H // strip) * W * C
     _, l1, similarity = weights
 
     def op(run: Run, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
         values = run.empty(H, W, C)
         partials = run.empty(3 if run.needs_grad else 0, H, W, C)
-        images = (image, target, kept)
+        images = (image, target, kept, strip)
         kernel = kernels.make_ssim_fwd(kept is not None)
-        run.launch(kernel, threads, *images, *weights, values, partials, work=kernels.STRIP)
+        run.launch(kernel, threads, *images, *weights, values, partials, work=strip)
         result = values.mean() if mean else values
 
         def backward(run: Run) -> None:
@@ -87,7 +89,7 @@ def _compare(
             v_sum = v.view(1) if mean else v.new_ones(1)
             kernel = kernels.make_ssim_bwd(kept is not None)
             arguments = (scale * l1, scale * similarity, slopes, v_sum, v_image)
-            run.launch(kernel, threads, *images, *arguments, work=kernels.STRIP)
+            run.launch(kernel, threads, *images, *arguments, work=strip)
             run.add_adjoint(image, v_image)
 
         run.on_backward(backward)
