@@ -8,6 +8,7 @@ import re
 import shutil
 import statistics
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs import evaluate, runs
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.nerfies import load_capture
 from warpgs.evaluate import Evaluation, ViewMetrics
 from warpgs.lpips import Lpips
 from warpgs.render import Layer, Rendering
@@ -341,3 +343,14 @@ def test_evaluating_a_capture_whose_pictures_were_changed_measures_the_new_ones(
         write_png(path, np.zeros((tiny.SCENE.height, tiny.SCENE.width, 3), np.uint8))
     runs.evaluate_run(copy, runs.open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
     assert json.loads((copy / "metrics.json").read_text())["psnr"] != pytest.approx(before)
+
+
+def test_figures_are_kept_where_no_video_can_be_written(finished_run, tmp_path, monkeypatch):
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    for name in ("metrics.json", "views.csv"):
+        (run / name).unlink(missing_ok=True)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(OSError, match="pip install av"):
+        runs.evaluate_run(run, load_capture(tiny.write(tmp_path)), quiet=True)
+    assert json.loads((run / "metrics.json").read_text())["psnr"] > 0
+    assert len((run / "views.csv").read_text().splitlines()) > 1

@@ -179,12 +179,12 @@ def evaluate_run(
             pictures.write_png(path, pictures.comparison(truth, rendering))
 
     evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, render_at.play, quiet)
-    _write_video(folder / "time.mp4", render_at, capture, target, quiet)
     counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
     run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
     totals = {"iterations": run.pop("iteration"), **run, **counts, "commit": _commit()}
     write_json(folder / "metrics.json", {**evaluation.summary(), **totals})
     write_views(folder / "views.csv", evaluation)
+    _write_video(folder / "time.mp4", render_at, capture, target, quiet)  # last: figures need no FFmpeg
     return _report(evaluation, counts)
 
 
