@@ -97,8 +97,7 @@ def pack(
     row_store(rows, i, 1, row1)
     depth_keys[i] = key
     gaussian_from_rank[i] = i
-    if norms.shape[0] > 0:
-        norms[i] = wp.vec2(0.0)
+    norms[i] = wp.vec2(0.0)
 
 
 @functools.cache

@@ -8,7 +8,10 @@ import torch
 from tests import tiny
 from tests.scenes import generator, relative_error
 from warpgs.fields.perceptron import num_values, perceptron, split
+from warpgs.ops.graph import capture
 from warpgs.playback import Player
+from warpgs.render import render
+from warpgs.step import WARM_UPS
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -58,6 +61,39 @@ def test_a_played_frame_is_the_rendered_one(data, tmp_path):
     cameras = [trainer.capture.cameras[name].to("cuda") for name in trainer.capture.train[:3]]
     for camera in cameras:
         assert relative_error(player.play(camera), player(camera, False).joint.image) < 1e-5
+
+
+@pytest.mark.parametrize("opacity", [False, True])
+@pytest.mark.parametrize("captured", [False, True])
+def test_colours_that_come_late_come_in_time(data, tmp_path, opacity, captured):
+    model = dataclasses.replace(tiny.MODEL, appearance_opacity=opacity)
+    trainer = trainer_on_cuda(data, tmp_path / "run", model=model)
+    tiny.train(trainer)
+    scene, camera = trainer.scene, trainer.capture.cameras[trainer.capture.train[0]].to("cuda")
+    scene.requires_grad_(True)
+    time = torch.tensor([camera.time], device="cuda")
+
+    def drawn(late):
+        image = render(scene.splats(time, late_sh=late), camera).joint.image
+        return (image.detach(), *torch.autograd.grad(image.square().sum(), list(scene.parameters())))
+
+    late = (capture(lambda: drawn(True)) if captured else lambda: drawn(True))()
+    for actual, expected in zip(late, drawn(False), strict=True):
+        assert relative_error(actual, expected) < 1e-4
+
+
+def test_graphs_that_are_taken_again_take_over_the_memory(data, tmp_path):
+    trainer = trainer_on_cuda(data, tmp_path / "run")
+    trainer._add_dynamic()
+    moment = trainer.protocol.at(trainer.protocol.stage2.start)
+    reserved = []
+    for _ in range(8):
+        trainer.step.resized()
+        for _ in range(WARM_UPS + 2):
+            trainer.step(moment, trainer._draw(moment))
+        torch.cuda.synchronize()
+        reserved.append(torch.cuda.memory_reserved())
+    assert reserved[-1] <= reserved[2]
 
 
 def rounded(x):

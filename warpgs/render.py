@@ -14,6 +14,7 @@ from .ops.contracts import check_same_device, check_tensor
 from .ops.projection import record_projection
 from .ops.rows import Rows
 from .ops.sh import record_sh
+from .ops.streams import join
 from .ops.tape import Run, differentiable
 from .ops.tiles import record_tiles
 from .scene.splats import Splats
@@ -110,8 +111,7 @@ def render(
         projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
         rows = Rows(run, projection, C, settings.depth, camera.size)
         tiles = record_tiles(run, rows, camera.size)
-        if splats.sh_stream is not None:
-            torch.cuda.current_stream(means.device).wait_stream(splats.sh_stream)
+        join(splats.sh_stream)
         features = appearance
         if degree is not None:
             features = record_sh(run, means, appearance, camera.viewmat, projection.radii, degree)

@@ -1,6 +1,7 @@
 """One training iteration: render the three images, compare each with its share of the truth, go downhill."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from . import losses, optim
 from .config import RenderSettings, TrainConfig
 from .densify import GradientStatistics
 from .ops.graph import record
+from .ops.streams import PRIORITY
 from .render import Rendering, render
 from .scene.split import SplitScene
 from .stages import Moment
@@ -69,7 +71,9 @@ class Step:
         self._nothing, self._one = torch.zeros((), device=device), torch.ones((), device=device)
         self.optimizer = optim.make_optimizer(scene, self._rates)
         self._replay: Callable[[], None] | None = None
-        self._pool = torch.cuda.graph_pool_handle() if device.type == "cuda" else None
+        on_cuda = device.type == "cuda"
+        self._pool = torch.cuda.graph_pool_handle() if on_cuda else None
+        self._stream = torch.cuda.Stream(device, priority=PRIORITY) if on_cuda else None
         self._kind: tuple[object, ...] | None = None
         self._warm = 0
         self.resized()
@@ -98,13 +102,17 @@ class Step:
             self._kind, self._warm, self._is_recorded = kind, 0, False
         if self._warm < WARM_UPS:
             self._warm += 1
-            self._run(moment, self.views.pick(self._index))
+            self._run_picked(moment)
             return
         if self._replay is None or not self._is_recorded:
             # An old graph lives until the new one has taken over its memory.
-            self._replay = record(lambda: self._run(moment, self.views.pick(self._index)), pool=self._pool)
+            self._replay = record(partial(self._run_picked, moment), self._stream, self._pool)
             self._is_recorded = True
         self._replay()
+
+    def _run_picked(self, moment: Moment) -> None:
+        """With the view that ``self._index`` says."""
+        self._run(moment, self.views.pick(self._index))
 
     def _run(self, moment: Moment, view: View) -> None:
         self._choose_trained(moment)

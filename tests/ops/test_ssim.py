@@ -6,6 +6,7 @@ from skimage.metrics import structural_similarity
 
 from tests.reference.ssim import ssim_map as reference
 from tests.scenes import error, generator, random_like, relative_error
+from warpgs.kernels import ssim as kernels
 from warpgs.ops.ssim import l1_and_ssim, ssim, ssim_map
 
 SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2)]
@@ -39,6 +40,17 @@ def test_gradient_is_that_of_the_reference(size, masked):
     value.backward(cotangent)
     reference(double, target.double(), mask).backward(cotangent.double())
     assert relative_error(image.grad, double.grad) < 1e-5
+
+
+def test_strips_of_small_images_make_no_difference(monkeypatch):
+    values = []
+    for strip in (kernels.STRIP, kernels.STRIP_OF_SMALL):
+        monkeypatch.setattr(kernels, "STRIP", strip)
+        image, target, mask = images((37, 21, 3))
+        value = ssim_map(image.requires_grad_(), target, mask)
+        value.square().sum().backward()
+        values.append((value.detach(), image.grad))
+    assert all(torch.equal(*pair) for pair in zip(*values, strict=True))
 
 
 def test_interior_is_that_of_scikit_image():

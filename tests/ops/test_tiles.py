@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.scenes import HEIGHT, WIDTH, make_camera, make_splats
+from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
+from warpgs.kernels.tiles import tile_ends
 from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
@@ -193,3 +194,22 @@ def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
     assert [[names[g] for g in listed] for listed in lists] == [
         [g for g in listed if few[g]] for listed in binned(splats)[0]
     ]
+
+
+@pytest.mark.parametrize("groups", [1, 3, 4])
+def test_lane_groups_find_where_the_branches_of_a_tile_end(groups):
+    random = generator()
+    lengths = torch.randint(0, 40, (60,), generator=random)
+    lengths[:3] = torch.tensor([0, 1, 300])
+    bounds = torch.cat([torch.zeros(1, dtype=torch.int64), lengths.cumsum(0)])
+    ranges = torch.stack([bounds[:-1], bounds[1:]], 1).int()
+    is_dynamic = torch.rand(500, generator=random) < torch.rand(500, generator=random) ** 4
+    gaussians = torch.randint(0, 500, (int(lengths.sum()),), dtype=torch.int32, generator=random)
+    ends = ranges[:, :1].repeat(1, 2)
+    run = Run(torch.device("cpu"), [])
+    arguments = (ranges, gaussians, is_dynamic.view(torch.uint8), groups, ends)
+    run.launch(tile_ends, len(ranges) * groups, *arguments)
+    for (begin, end), found in zip(ranges.tolist(), ends.tolist(), strict=True):
+        moves = is_dynamic[gaussians[begin:end].long()].tolist()
+        expected = [max([begin, *(begin + k + 1 for k, m in enumerate(moves) if m == branch)]) for branch in (0, 1)]
+        assert found == expected

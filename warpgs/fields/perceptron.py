@@ -8,12 +8,14 @@ All weights and biases are one tensor, and so are their gradients: what is done 
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from warpgs.ops.encoding import ALIGNMENT
 from warpgs.ops.relu import num_sums, relu_backward
 
 LARGEST_GRADIENT = 1024.0
@@ -62,13 +64,19 @@ def perceptron(
             precision.
         values: Weights and biases, as ``split`` finds them.
         shapes: Of the weights: [width, E], [width, width] …; the one at ``skip`` is [width, R + E], the last one has
-            ``num_outputs`` rows or more. In half precision all numbers are multiples of 8.
+            ``num_outputs`` rows or more. In half precision all numbers are multiples of 8, and hidden layers have
+            one width.
         skip: Index of the layer that reads the encoding again, after its features; 0 if none does.
         num_outputs: Rows of the last layer that count; what the others give is left out.
 
     Returns:
         [N, num_outputs].
+
+    Raises:
+        ValueError: In half precision, unless the numbers are such.
     """
+    if inputs.dtype == torch.float16 and any(number % ALIGNMENT for number in chain([inputs.shape[1]], *shapes)):
+        raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(shapes)}")
     return _Perceptron.apply(inputs, values, tuple(shapes), skip, num_outputs)
 
 

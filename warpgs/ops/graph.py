@@ -7,9 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-PRIORITY = -1
-"""Of the stream that is captured: before that of work beside it (``ops.streams.beside``), whose large matrix products
-would else let none of its many small kernels in."""
+from .streams import PRIORITY, join_captured, side_stream
 
 WARM_UPS = 3
 """Runs before the capture: they compile kernels, allocate scratch memory and learn how many intersections to expect."""
@@ -61,18 +59,29 @@ def record(
     Args:
         work: Works on the current CUDA device without reading anything back from it.
         stream: To capture on; a new one by default.
-        pool: From ``torch.cuda.graph_pool_handle()``. Graphs that share one share memory: only one of them may be in
-            use, and a new one takes over what the one before it had, which spares the driver's slow allocation.
+        pool: From ``torch.cuda.graph_pool_handle()``. Graphs that share one, and the stream, share memory: only one of
+            them may be in use, and a new one takes over what the one before it had, which spares the driver's slow
+            allocation.
     """
     stream = stream or torch.cuda.Stream(priority=PRIORITY)
     warp_stream = wp.stream_from_torch(stream)
+    with torch.cuda.stream(stream):
+        side_stream(stream.device)  # to be there before the capture: nothing is made in one
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
-    # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
-    with (
-        torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
-        wp.ScopedStream(warp_stream, sync_enter=False),
-        wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
-    ):
-        work()
+    current = torch.cuda.current_stream()
+    try:
+        # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
+        with (
+            torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
+            wp.ScopedStream(warp_stream, sync_enter=False),
+            wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
+        ):
+            try:
+                work()
+            except BaseException:
+                join_captured(stream.device)
+                raise
+    finally:
+        torch.cuda.set_stream(current)  # torch leaves its own behind where the end of a capture fails
     return graph.replay

@@ -11,6 +11,8 @@ from .tape import Run
 class Rows:
     """Packed splats, and what the way back leaves of them.
 
+    Their features come later, by ``add_features``: binning does without, compositing and the way back do not.
+
     Attributes:
         packed: [N, parts, 4] rows.
         num_features, with_depth: Features, and whether depth is one more channel after them.
@@ -44,7 +46,7 @@ class Rows:
         )
 
     def add_features(self, run: Run, features: Tensor) -> None:
-        """Writes [N, num_features] features beside the geometry, which binning does without."""
+        """Writes [N, num_features] features beside the geometry."""
         splats, num_features, with_depth, size = self._splats, self.num_features, self.with_depth, self._size
         N = len(features)
         depths = splats.depths if with_depth else None

@@ -57,7 +57,8 @@ def l1_and_ssim(
 def _compare(
     image: Tensor, target: Tensor, mask: Tensor | None, weights: tuple[float, float, float], mean: bool
 ) -> Tensor:
-    """base + l1 |image − target| + similarity SSIM: the mean, or [H, W, C] of each pixel and channel."""
+    """base + l1 |image − target| + similarity SSIM: the mean, or [H, W, C] of each pixel and channel, without L1."""
+    assert mean or weights == SIMILARITY
     sizes: dict[str, int] = {}
     check_tensor("image", image, ("H", "W", "C"), sizes)
     check_tensor("target", target, ("H", "W", "C"), sizes)

@@ -19,6 +19,7 @@ import warp as wp
 from torch import Tensor
 
 from . import profiling
+from .streams import PRIORITY
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -300,7 +301,7 @@ def _side_stream(device: wp.Device) -> wp.Stream:
     """A second stream of this thread; threads share none, because one may be capturing a graph."""
     streams = _side_streams.__dict__
     if device.alias not in streams:
-        streams[device.alias] = wp.Stream(device)
+        streams[device.alias] = wp.Stream(device, priority=PRIORITY)
     return streams[device.alias]
 
 

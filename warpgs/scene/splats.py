@@ -9,6 +9,7 @@ from torch import Tensor
 
 from warpgs.ops.contracts import check_same_device, check_tensor
 from warpgs.ops.sh import check_coefficients
+from warpgs.ops.streams import join
 
 
 @dataclass(frozen=True)
@@ -69,5 +70,6 @@ class Splats:
         return 3 if self.colors is None else self.colors.shape[1]
 
     def to(self, device: torch.device | str) -> "Splats":
+        join(self.sh_stream)
         moved = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
-        return dataclasses.replace(self, **moved)
+        return dataclasses.replace(self, **moved, sh_stream=None)

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from warpgs.config import ModelConfig
 from warpgs.fields.mlp import AppearanceField, DeformationField
 from warpgs.ops.activation import Changes, activate, join_sh
-from warpgs.ops.streams import beside
+from warpgs.ops.streams import join, on_side_stream
 
 from .gaussians import Gaussians
 from .splats import Splats
@@ -65,16 +65,16 @@ class SplitScene(nn.Module):
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = None
-        with beside(device) as stream:
+        with on_side_stream(device) as stream:
             if relit and len(static):
                 residuals, logit_residuals = self.appearance(static.means, time)
             sh = join_sh(static.raw(), dynamic.raw(), residuals)
-        if stream is not None and not (late_sh and logit_residuals is None):
-            torch.cuda.current_stream(device).wait_stream(stream)
-            stream = None
         offsets = None
         if moving and len(dynamic):
             offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
+        if not late_sh or logit_residuals is not None:
+            join(stream)
+            stream = None
         relit_by, moved_by = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
