@@ -75,7 +75,11 @@ def main(config: TrainConfig) -> int:
             f"depth can be aligned with the sparse points in {aligned} of {views} views" + ("" if aligned else NO_DEPTH)
         )
     steps = trainer.protocol.num_iterations
-    with Interrupt() as interrupt, Logbook(folder / "events", steps, trainer.iteration) as logbook:
+    with (
+        runs.held(folder),
+        Interrupt() as interrupt,
+        Logbook(folder / "events", steps, trainer.iteration) as logbook,
+    ):
         finished = trainer.train(logbook, interrupt)
     if not finished:
         print(f"stopped after iteration {trainer.iteration} of {steps}; go on with --resume {folder}", file=sys.stderr)

@@ -14,7 +14,7 @@ import pytest
 
 import train as script
 from tests.prepare import filmed
-from warpgs import checkpoint
+from warpgs import checkpoint, runs
 from warpgs.config import TrainConfig
 from warpgs.data.nerfies import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
@@ -44,6 +44,15 @@ def test_a_run_ends_with_its_figures_for_people(finished):
     assert run.returncode == 0, run.stderr
     assert "PSNR" in run.stdout
     assert "LPIPS not measured" in run.stdout
+
+
+def test_a_run_that_is_being_trained_is_not_resumed_beside(finished):
+    with runs.held(finished[1]):
+        second = train("--resume", finished[1], "--device", "cpu")
+    assert second.returncode == 2
+    assert f"error: {finished[1]} is being trained by another process" in second.stderr
+    with runs.held(finished[1]):
+        pass  # free again
 
 
 def test_a_run_leaves_its_metrics(finished):

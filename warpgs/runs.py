@@ -1,11 +1,14 @@
 """Run folders: config.json, checkpoints/, metrics.json, views.csv, events/, pictures/."""
 
 import dataclasses
+import fcntl
 import json
 import reprlib
 import subprocess
 import sys
 import typing
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +32,9 @@ PICTURES = 6
 
 LARGEST_CONFIG = 1 << 20
 """Of config.json [bytes]."""
+
+LOCK = ".lock"
+"""File in a run folder that whoever trains there holds."""
 
 VIDEO_FRAMES = 120
 """Frames of the video over time, at most."""
@@ -77,6 +83,22 @@ def create(folder: Path, config: TrainConfig) -> None:
     data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
     plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
     write_text(folder / "config.json", json.dumps(plain, indent=2, default=str) + "\n")
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Holds a run folder while it is trained in, so that no other process does; ends with the process at the latest.
+
+    Raises:
+        ValueError: If another process holds it.
+        OSError: If it can't be written in.
+    """
+    with open(folder / LOCK, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"{folder} is being trained by another process") from error
+        yield
 
 
 def load_config(folder: Path) -> TrainConfig:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
+pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 sync_api = pytest.importorskip(
     "playwright.sync_api", reason="browser tests need playwright: pip install 'warpgs[browser]'"
 )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
+pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
 from tests.test_paths import capture
 from warpgs.viewer.looks import look_through

@@ -2,7 +2,7 @@
 
 import pytest
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
+pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
 import viser
 from websockets.exceptions import ConnectionClosed

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
+pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
 from tests.viewer import watched
 from warpgs.cli import main
@@ -120,9 +120,14 @@ def test_a_host_that_is_not_ours_is_one_line(run, capsys, host):
             check_address(host, 70000)
 
 
+@pytest.mark.parametrize("port", [-1, 65536, 99999])
+def test_a_port_that_there_is_not_is_one_line(run, capsys, port):
+    assert f"can't listen on port {port}: choose a --port from 0 to 65535" in refusal(capsys, run, "--port", port)
+
+
 def test_a_missing_package_is_one_line_that_says_how_to_get_it(run, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert "pip install 'warpgs[viewer]'" in refusal(capsys, run)
+    assert "pip install -e '.[viewer]'" in refusal(capsys, run)
 
 
 def test_what_is_no_run_is_one_line(tmp_path, capsys):

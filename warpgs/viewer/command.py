@@ -44,7 +44,7 @@ class View:
             OSError: If the address can't be listened on.
         """
         if importlib.util.find_spec("viser") is None:
-            raise ImportError("the viewer needs viser: pip install 'warpgs[viewer]'")
+            raise ImportError("the viewer needs viser: pip install -e '.[viewer]'")
         from .server import Viewer, check_address
 
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser left: so what

@@ -23,17 +23,22 @@ class _Server(viser.ViserServer):
         return None
 
 
+LARGEST_PORT = 65535
+
+
 def check_address(host: str, port: int) -> None:
     """Refuses an address that can't be listened on: viser would look for another port, or never return.
 
     Raises:
         OSError: If the port is in use or the host is not of this machine; the message names both.
     """
+    if not 0 <= port <= LARGEST_PORT:  # else only its last 16 bits would be tried here, and viser would hang
+        raise OSError(f"can't listen on port {port}: choose a --port from 0 to {LARGEST_PORT}")
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.create_server(address[:2], family=family):
             pass
-    except (OSError, OverflowError, UnicodeError) as error:
+    except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise OSError(f"can't listen on {host}, port {port}: {reason}; choose another --port or --host") from error
 
