@@ -14,14 +14,11 @@ from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
 
 from .contracts import check_image_size, check_same_device, check_tensor
-from .layers import Layers, gather_adjoints
+from .layers import NUM_BRANCH_IMAGES, Layers, gather_adjoints
 from .projection import Projection
 from .rows import Rows
 from .tape import PerShard, Run, differentiable
 from .tiles import Tiles, record_tile_ends, record_tiles
-
-NUM_BRANCH_IMAGES = 3
-"""Joint, static only, dynamic only."""
 
 CUDA_PIXELS = (1, 2)
 """Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""

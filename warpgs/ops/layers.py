@@ -9,7 +9,8 @@ from warpgs.kernels import layers as kernels
 
 from .tape import LITTLE_WORK, Run
 
-MOST_LAYERS = 3
+NUM_BRANCH_IMAGES = 3
+"""Joint, static only, dynamic only."""
 
 
 class Layers(NamedTuple):
@@ -47,14 +48,14 @@ def gather_adjoints(
         return v_image, v_alpha
     C = layers.images[0].shape[-1]
     v_composite, v_alpha = run.empty(num, H, W, C + int(depth is not None)), run.empty(num, H, W)
-    missing: list[Tensor | None] = [None] * MOST_LAYERS
+    missing: list[Tensor | None] = [None] * NUM_BRANCH_IMAGES
     run.launch(
         kernels.make_layers_bwd(C, depth is not None),
         alpha.numel(),
         H * W,
         alpha.view(-1),
         None if depth is None else depth.view(-1),
-        *(None if v is None else v.view(-1) for values in arrived for v in (values + missing)[:MOST_LAYERS]),
+        *(None if v is None else v.view(-1) for values in arrived for v in (values + missing)[:NUM_BRANCH_IMAGES]),
         v_composite.view(-1),
         v_alpha.view(-1),
         work=LITTLE_WORK,
