@@ -10,9 +10,9 @@ import tyro
 from warpgs import runs
 from warpgs.config import PRESETS, TrainConfig, scaled
 from warpgs.data.capture import Capture
+from warpgs.errors import is_out_of_memory, one_line, out_of_memory
 from warpgs.interrupt import Interrupt
 from warpgs.logbook import Logbook
-from warpgs.memory import is_out_of_memory
 from warpgs.prepare.check import quick_findings
 from warpgs.trainer import Trainer
 
@@ -98,10 +98,10 @@ if __name__ == "__main__":
         advice = (
             "the run's last checkpoint is whole; start a new run with a smaller --densify.max-gaussians or a larger"
         )
-        print(f"error: out of memory ({' '.join(str(error).split())[:200]}); {advice} --factor", file=sys.stderr)
+        print(f"error: {out_of_memory(error)}; {advice} --factor", file=sys.stderr)
         sys.exit(2)
     except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)

@@ -10,6 +10,7 @@ was drawn, and where the target is unknown (NaN fails the comparison) or next to
 
 import warp as wp
 
+from .absolute import slope_of_abs
 from .constants import SMALLEST_INVERSE_DEPTH
 
 OPAQUE = wp.constant(0.5)
@@ -63,5 +64,4 @@ def depth_error_bwd(
     """``v_sum`` [1]: cotangent of the sum of all errors, times ``scale``."""
     p = first + wp.tid()
     difference = depth_difference(depth, alpha, inverse_depth, alignment, region, p)
-    sign = wp.where(difference > 0.0, 1.0, 0.0) - wp.where(difference < 0.0, 1.0, 0.0)
-    v_depth[p] = scale * v_sum[0] * sign
+    v_depth[p] = scale * v_sum[0] * slope_of_abs(difference)

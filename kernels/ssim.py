@@ -26,6 +26,8 @@ import math
 
 import warp as wp
 
+from .absolute import slope_of_abs
+
 WINDOW = 11
 RADIUS = 5
 STRIP = 16
@@ -201,9 +203,8 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
             if y >= top:
                 p = pixel(image, mask, y, x, c)
                 q = pixel(target, mask, y, x, c)
-                sign = wp.where(p > q, 1.0, 0.0) - wp.where(p < q, 1.0, 0.0)
                 steepness = pending_mean[0] + 2.0 * p * pending_square[0] + q * pending_cross[0]
-                value = v_sum[0] * (l1 * sign + similarity * steepness)
+                value = v_sum[0] * (l1 * slope_of_abs(p - q) + similarity * steepness)
                 if wp.static(with_mask):
                     if mask[y, x] == wp.uint8(0):
                         value = 0.0

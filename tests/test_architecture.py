@@ -11,7 +11,7 @@ from warpgs.ops.covariance import covariance
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    {"config", "files", "memory", "progress"},
+    {"config", "errors", "files", "progress"},
     {"kernels"},
     {"ops"},
     {"cameras", "scene", "fields"},

@@ -9,7 +9,8 @@ from tests.reference.ssim import ssim_map
 from tests.scenes import error, generator, make_camera, make_splats, relative_error
 from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.losses import depth_loss, dynamic_loss, image_loss, static_loss
+from warpgs.losses import dynamic_loss, image_loss, static_loss
+from warpgs.ops.depth_error import depth_error
 from warpgs.render import render
 from warpgs.scene.gaussians import Gaussians
 from warpgs.scene.split import SplitScene
@@ -173,7 +174,7 @@ def compared_depth(depth, alpha, target, region):
     """The depth loss against a target, as inverse depth that has yet to be aligned."""
     scale, offset = ALIGNMENT.double()
     inverse_depth = ((1.0 / target.double() - offset) / scale).float()
-    return depth_loss(depth, alpha, inverse_depth, ALIGNMENT, region)
+    return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region)
 
 
 def test_the_depth_loss_is_that_of_equation_14():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from warpgs import pictures
+from warpgs.data.writing import write_png
 from warpgs.render import Layer, Rendering
 
 H, W = 20, 32
@@ -79,7 +80,7 @@ def test_every_picture_of_a_comparison_has_a_caption(rendering):
 
 def test_a_png_holds_the_picture_exactly_in_rgb(tmp_path):
     picture = colorful()
-    pictures.write_png(tmp_path / "new folder" / "a.png", picture)
+    write_png(tmp_path / "new folder" / "a.png", picture)
     stored = cv2.imread(str(tmp_path / "new folder" / "a.png"))
     assert (stored[..., ::-1] == picture).all()
 
@@ -93,7 +94,7 @@ def test_a_png_that_can_not_be_written_leaves_the_old_one_and_is_named(tmp_path,
     path.write_bytes(b"old")
     monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match=rf"{path} could not be written: No space left on device$"):
-        pictures.write_png(path, colorful())
+        write_png(path, colorful())
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -74,8 +74,8 @@ def print_result(result: dict[str, Any]) -> None:
         f"{result['name']}: {result['width']}x{result['height']}, {result['num_gaussians']:,} Gaussians, "
         f"{result['intersections']:,} intersections"
     )
-    console.print(f"\n{title}", highlight=False, soft_wrap=True)
-    table = Table("", box=box.SIMPLE if console.is_terminal else None)
+    table = _titled(console, title)
+    table.add_column("")
     for name in names:
         table.add_column(name, justify="right")
     for figure in dict.fromkeys(figure for column in columns for figure in column):
@@ -86,8 +86,7 @@ def print_result(result: dict[str, Any]) -> None:
 def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
     """Prints a table with one line for each row; all rows have the same figures."""
     console = _console()
-    console.print(f"\n{title}", highlight=False, soft_wrap=True)
-    table = Table(box=box.SIMPLE if console.is_terminal else None)
+    table = _titled(console, title)
     for name in rows[0]:
         table.add_column(name, justify="right")
     for row in rows:
@@ -108,6 +107,12 @@ def trace_events(scene: str, kernels: Iterable[KernelTime], process: int) -> lis
 def _console() -> Console:
     console = Console()
     return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _titled(console: Console, title: str) -> Table:
+    """Prints a title on a line of its own, however wide the table that is to follow."""
+    console.print(f"\n{title}", highlight=False, soft_wrap=True)
+    return Table(box=box.SIMPLE if console.is_terminal else None)
 
 
 def _flat(figures: dict[str, Any], prefix: str = "") -> dict[str, Any]:

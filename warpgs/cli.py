@@ -10,9 +10,9 @@ import tyro
 
 from . import runs
 from .bench import Bench
+from .errors import is_out_of_memory, one_line, out_of_memory
 from .export.command import Export
 from .film import Render
-from .memory import is_out_of_memory
 from .prepare.commands import Check, Prepare
 from .report.command import Report
 from .viewer.command import View
@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         command.run()
     except (ValueError, ImportError, OSError) as error:
-        print(f"warpgs: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"warpgs: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("warpgs: stopped", file=sys.stderr)
@@ -70,6 +70,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not is_out_of_memory(error):
             raise
-        print(f"warpgs: out of memory ({' '.join(str(error).split())[:200]}); {ADVICE}", file=sys.stderr)
+        print(f"warpgs: {out_of_memory(error)}; {ADVICE}", file=sys.stderr)
         return 2
     return 0

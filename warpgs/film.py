@@ -17,6 +17,7 @@ from torch import Tensor
 from . import paths, paths_file, pictures, runs
 from .cameras import Camera
 from .data.capture import Capture
+from .data.writing import write_png
 from .evaluate import RenderAt
 from .files import remove_numbered
 from .playback import Player
@@ -225,7 +226,7 @@ def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.
             if writer is not None:
                 _add(writer, image)
             if options.write != "mp4":
-                pictures.write_png(folder / f"{name}.png", image)
+                write_png(folder / f"{name}.png", image)
     height, width = image.shape[:2]
     return f"{len(names)} pictures of {width} × {height} in {folder}"
 

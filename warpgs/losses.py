@@ -1,10 +1,9 @@
-"""The terms of the training loss (paper Eq. 9, 12, 14 and 15)."""
+"""The image terms of the training loss (paper Eq. 9, 12 and 15); that of depth (Eq. 14) is ``ops.depth_error``."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .ops.depth_error import depth_error
 from .ops.ssim import l1_and_ssim
 
 
@@ -36,24 +35,3 @@ def dynamic_loss(
     Only the truth is masked: where M = 1 the dynamic image has to show its background.
     """
     return image_loss(image, torch.where(static[..., None], background, truth), ssim_weight)
-
-
-def depth_loss(
-    depth: Float[Tensor, "H W"],
-    alpha: Float[Tensor, "H W"],
-    inverse_depth: Float[Tensor, "H W"],
-    alignment: Float[Tensor, "2"],
-    region: Bool[Tensor, "H W"],
-) -> Float[Tensor, ""]:
-    """Paper Eq. 14: L1 of one branch's depth against monocular depth within its region [scene units].
-
-    The mean is over the whole image; pixels that have nothing to compare count as zero.
-
-    Args:
-        depth: Rendered, weighted by contribution and normalised.
-        alpha: Opacity of the branch's image; pixels under half of it have no depth to speak of.
-        inverse_depth: Monocular; NaN where unknown.
-        alignment: Scale and offset that make it 1 / depth; what is then next to infinity or past it is unknown.
-        region: M for the static branch.
-    """
-    return depth_error(depth, alpha, inverse_depth, alignment, region)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .files import beside, partial_of, write_whole
+from .files import beside, partial_of
 from .render import Rendering
 
 ERROR_RANGE = 0.25
@@ -59,18 +59,6 @@ def _captioned(name: str, picture: np.ndarray) -> np.ndarray:
     bar = np.zeros((CAPTION_HEIGHT, picture.shape[1], 3), np.uint8)
     cv2.putText(bar, name, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (235, 235, 235), 1, cv2.LINE_AA)
     return np.concatenate([bar, picture])
-
-
-def write_png(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Writes an RGB picture.
-
-    Raises:
-        OSError: If it can't be written; the message names the file.
-    """
-    whole, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    if not whole:
-        raise OSError(f"{path} could not be encoded")
-    write_whole(path, [data.tobytes()])
 
 
 class Video:

@@ -19,6 +19,7 @@ from .config import TrainConfig, validate
 from .data.capture import Capture, Frame
 from .data.nerfies import load_capture
 from .data.synthetic import builtin_capture
+from .data.writing import write_png
 from .evaluate import Evaluation, RenderAt, evaluate, write_json, write_views
 from .files import read_bounded, write_text
 from .lpips import find, locate
@@ -198,7 +199,7 @@ def evaluate_run(
     def draw(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
         if index in chosen:
             path = folder / "pictures" / f"{frame.name}.png"
-            pictures.write_png(path, pictures.comparison(truth, rendering))
+            write_png(path, pictures.comparison(truth, rendering))
 
     evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, render_at.play, quiet)
     counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}

@@ -12,6 +12,7 @@ from torch.nn.functional import mse_loss
 from . import losses, optim
 from .config import RenderSettings, TrainConfig
 from .densify import GradientStatistics
+from .ops.depth_error import depth_error
 from .ops.graph import record
 from .ops.streams import PRIORITY
 from .render import Rendering, render
@@ -150,7 +151,7 @@ class Step:
             alignment = self.alignments.index_select(0, self._index)[0]
             for name, layer, region in branches:
                 assert layer.depth is not None
-                terms[name] = losses.depth_loss(layer.depth, layer.alpha, view.inverse_depth, alignment, region)
+                terms[name] = depth_error(layer.depth, layer.alpha, view.inverse_depth, alignment, region)
         return terms
 
     def _choose_trained(self, moment: Moment) -> None:

@@ -1,4 +1,4 @@
-"""Files of a capture; errors name the file, which those of a full disk don't do by themselves."""
+"""Files of captures, and pictures of runs; errors name the file, which those of a full disk don't do by themselves."""
 
 import io
 import json
@@ -15,9 +15,11 @@ def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W
     """Writes grey levels or RGB, and makes the folders above.
 
     Raises:
-        OSError: If it can't be written.
+        OSError: If it can't be written; the message names the file.
     """
-    _, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    whole, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not whole:
+        raise OSError(f"{path} could not be encoded")
     write_whole(path, [data.tobytes()])
 
 

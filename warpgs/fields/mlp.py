@@ -4,7 +4,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
-from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
+from warpgs.ops.encoding import ALIGNMENT, aligned, encode, encoded_size
 
 from .perceptron import Layer, num_values, perceptron, split
 
@@ -36,9 +36,9 @@ class Trunk(nn.Module):
         encoded = encoded_size(*self.bands)
         columns = [encoded] + [config.width + (encoded if k == self.skip else 0) for k in range(1, config.depth)]
         self.sizes = [*((config.width, c) for c in columns), (outputs, config.width)]
-        padding = -encoded % ALIGNMENT
+        padding = aligned(encoded) - encoded
         self.shapes = [(rows, c + (padding if k in (0, self.skip) else 0)) for k, (rows, c) in enumerate(self.sizes)]
-        self.shapes[-1] = (outputs + -outputs % ALIGNMENT, config.width)
+        self.shapes[-1] = (aligned(outputs), config.width)
         self.values = nn.Parameter(center.new_zeros(num_values(self.shapes)))
         for layer, (rows, c) in zip(self.layers(self.values.data)[:-1], self.sizes, strict=False):
             start = nn.Linear(c, rows)

@@ -82,12 +82,12 @@ def activate(static: Raw, dynamic: Raw, relit: Changes = NO_CHANGES, moved: Chan
     Raises:
         ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
     """
-    geometries = [raw[:NUM_GEOMETRY] for raw in (static, dynamic)]
+    static_geometry, dynamic_geometry = static[:NUM_GEOMETRY], dynamic[:NUM_GEOMETRY]
     everything: dict[str, Tensor | None] = {}
-    for name, raw, changes in (("static", static, relit), ("dynamic", dynamic, moved)):
+    for name, geometry, changes in (("static", static_geometry, relit), ("dynamic", dynamic_geometry, moved)):
         sizes: dict[str, int] = {}
         shapes = [("N", 3), ("N", 4), ("N", 3), ("N",)]
-        for field, tensor, shape in zip(Raw._fields, raw[:NUM_GEOMETRY], shapes, strict=False):
+        for field, tensor, shape in zip(Raw._fields, geometry, shapes, strict=False):
             check_tensor(f"{name}.{field}", tensor, shape, sizes)
             everything[f"{name}.{field}"] = tensor
         for (field, change), shape in zip(changes._asdict().items(), [("N", 10), ("N",)], strict=True):
@@ -105,7 +105,7 @@ def activate(static: Raw, dynamic: Raw, relit: Changes = NO_CHANGES, moved: Chan
         _record_branch(run, rest[:NUM_GEOMETRY], Changes(*rest[NUM_GEOMETRY:]), out, len(tensors[0]))
         return tuple(out)
 
-    return Activated(*differentiable(op, *geometries[0], *relit, *geometries[1], *moved))
+    return Activated(*differentiable(op, *static_geometry, *relit, *dynamic_geometry, *moved))
 
 
 def _record_branch(run: Run, raw: Sequence[Tensor], changes: Changes, out: Activated, first_row: int) -> None:

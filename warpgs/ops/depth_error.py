@@ -17,17 +17,17 @@ def depth_error(
     alignment: Float[Tensor, "2"],
     region: Bool[Tensor, "H W"],
 ) -> Float[Tensor, ""]:
-    """Mean over the image of |depth − target| [scene units], target = 1 / (scale · inverse_depth + offset).
+    """Mean over the image of |depth − target| [scene units], target = 1 / (scale · inverse_depth + offset); Eq. 14.
 
     Pixels that have nothing to compare count as zero. Differentiable in ``depth`` only.
 
     Args:
-        depth: [H, W] rendered, normalised by opacity.
+        depth: [H, W] of one branch, rendered, normalised by opacity.
         alpha: [H, W] opacity of what was drawn; pixels of at most a half are left out.
         inverse_depth: [H, W] monocular, NaN where unknown; there, and where the target is past 1000, pixels are left
             out.
         alignment: [2] scale and offset, on the device.
-        region: [H, W] where to compare.
+        region: [H, W] where to compare: M for the static branch.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or an image without pixels.

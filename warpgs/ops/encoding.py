@@ -46,13 +46,17 @@ def encode(
     check_same_device({"means": means, "time": time, "center": center, "half_size": half_size})
     with torch.no_grad():
         run = Run(means.device, [])
-        columns = encoded_size(*bands)
-        columns += -columns % ALIGNMENT
+        columns = aligned(encoded_size(*bands))
         encoding = run.empty(len(means), room + columns, dtype=torch.float16 if half else torch.float32)
         lanes_log2 = kernels.CUDA_LANES_LOG2 if run.is_cuda else 0
         arguments = (means, time, center, half_size, *bands, room, lanes_log2, encoding)
         run.launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
+
+
+def aligned(number: int) -> int:
+    """The next multiple of ``ALIGNMENT``."""
+    return number + -number % ALIGNMENT
 
 
 def encoded_size(position_bands: int, time_bands: int) -> int:

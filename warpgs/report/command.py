@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import one_line
 from warpgs.files import write_text
 
 from .page import Gallery, page
@@ -62,7 +63,7 @@ class Report:
             try:
                 strips.append(rendered(record, [*worst, *best], self.device, self.quiet))
             except (ValueError, OSError) as error:
-                reasons[k] = " ".join(str(error).split())
+                reasons[k] = one_line(error)
                 strips.append(Strips({}, ""))
         if len(reasons) == len(chosen):  # then only views of which there are pictures
             worst, best = extremes(chosen, self.views, set.intersection(*map(available, chosen)))

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs import runs
+from warpgs.errors import one_line
 
 from .source import Source, open_source
 from .training_cameras import TrainingCameras
@@ -63,7 +64,7 @@ def training_cameras(source: Source) -> TrainingCameras | None:
     try:
         return TrainingCameras(runs.open_capture(source.config))
     except (ValueError, OSError) as error:
-        print(f"without training cameras: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"without training cameras: {one_line(error)}", file=sys.stderr)
         return None
 
 

@@ -10,6 +10,7 @@ import torch
 
 from warpgs import checkpoint, runs
 from warpgs.config import TrainConfig
+from warpgs.errors import one_line
 from warpgs.playback import Player
 
 LOOK_EVERY = 2.0
@@ -62,7 +63,7 @@ class Source:
         except FileNotFoundError:
             return  # the trainer deleted it for a newer one: next time
         except (ValueError, OSError) as error:
-            self.note = " ".join(str(error).split())
+            self.note = one_line(error)
 
     def _load(self) -> Player:
         scene, facts = runs.newest_scene(self.folder, self.config)
