@@ -14,15 +14,18 @@ from .ellipse import ellipse_meets_box
 from .lanes import lane_ballot, lane_rank, lane_sync, stage_put
 from .rows import GEOMETRY_PARTS, row_load
 
+Counter = wp.types.vector(length=1, dtype=int)
+"""A number that an inner loop counts with: Warp carries a plain one from iteration to iteration by copies."""
+
 
 @functools.cache
-def state_types(num_channels: int, num_states: int) -> tuple[type, type, type, type]:
-    """Vector types of what a lane holds: a float, an int and a colour for each of its pixels in each image (so many
-    states), and one Gaussian's features."""
+def state_types(num_channels: int, num_pixels: int) -> tuple[type, type, type, type]:
+    """Vector types of what a lane holds: a float, an int and a colour for each of its pixels, and one Gaussian's
+    features."""
     return (
-        wp.types.vector(length=num_states, dtype=float),
-        wp.types.vector(length=num_states, dtype=int),
-        wp.types.vector(length=num_states * num_channels, dtype=float),
+        wp.types.vector(length=num_pixels, dtype=float),
+        wp.types.vector(length=num_pixels, dtype=int),
+        wp.types.vector(length=num_pixels * num_channels, dtype=float),
         wp.types.vector(length=num_channels, dtype=float),
     )
 
@@ -34,20 +37,33 @@ def module_options(pixels_per_lane: int) -> dict[str, object]:
 
 
 @wp.func
-def block_corner(group: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
-    """Tile index and left, top [px] of a lane group's block. Blocks of a tile follow each other."""
+def block_corner(group: int, images: int, width: int, block_width: int, block_height: int) -> wp.vec4i:
+    """Tile index, left, top [px] and image of a lane group's block.
+
+    The blocks of a tile in one image follow each other, then come those of its next image.
+    """
     blocks_x = TILE_SIZE / block_width
     blocks = blocks_x * (TILE_SIZE / block_height)
-    tile = group / blocks
+    tile = group / blocks / images
     block = group % blocks
     tiles_x = (width + TILE_SIZE - 1) / TILE_SIZE
     left = (tile % tiles_x) * TILE_SIZE + (block % blocks_x) * block_width
     top = (tile / tiles_x) * TILE_SIZE + (block / blocks_x) * block_height
-    return wp.vec3i(tile, left, top)
+    return wp.vec4i(tile, left, top, group / blocks % images)
 
 
 @wp.func
-def block_box(corner: wp.vec3i, block_width: int, block_height: int, width: int, height: int) -> wp.vec4:
+def tile_list(image: int, tile_range: wp.vec2i, lengths: wp.vec2i, half: int) -> wp.vec3i:
+    """A tile's list of Gaussians in one image: where it begins, which way it runs, and its length (``split_tiles``)."""
+    if image == 1:
+        return wp.vec3i(half + tile_range[0], 1, lengths[0])
+    if image == 2:
+        return wp.vec3i(half + tile_range[1] - 1, -1, lengths[1])
+    return wp.vec3i(tile_range[0], 1, tile_range[1] - tile_range[0])
+
+
+@wp.func
+def block_box(corner: wp.vec4i, block_width: int, block_height: int, width: int, height: int) -> wp.vec4:
     """Left, top, right, bottom of the outermost pixel centres of a block inside the image."""
     return wp.vec4(
         float(corner[1]) + 0.5,

@@ -14,7 +14,7 @@ import functools
 
 import warp as wp
 
-from .blocks import block_box, block_corner, module_options, stage_survivors, state_types
+from .blocks import block_box, block_corner, module_options, stage_survivors, state_types, tile_list
 from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
@@ -37,31 +37,32 @@ from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 
 @functools.cache
 def make_composite_bwd(
-    num_features: int, with_depth: bool, images: int, outputs: int, pixels: tuple[int, int], absolute: bool
+    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absolute: bool
 ) -> wp.Kernel:
     """Reverse walk, launched like the forward kernel.
 
     Args:
-        num_features, with_depth, images, outputs, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the
+        num_features, with_depth, images, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the
             forward kernel's.
         absolute: Whether the absolute-value variant of the means' gradient is gathered too.
 
-    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero.
+    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero. Bit m of ``arrived`` says whether image
+    m has cotangents; where it has none, they are zero.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
-    scalars, integers, colors, features_vector = state_types(C, images * P)
+    scalars, integers, colors, features_vector = state_types(C, P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],
-        tile_ends: wp.array[wp.vec2i],
+        branch_lengths: wp.array[wp.vec2i],
         gaussian_from_isect: wp.array[int],
+        half: int,
         rows: wp.array2d[wp.vec4],
-        is_dynamic: wp.array[wp.uint8],
         background: wp.array[float],
         background_stride: int,
         width: int,
@@ -70,21 +71,26 @@ def make_composite_bwd(
         last: wp.array[int],
         v_image: wp.array2d[float],
         v_alpha_image: wp.array[float],
+        arrived: int,
         gradients: wp.array2d[float],
     ):
         thread = first + wp.tid()
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        corner = block_corner(thread / lane_count(), width, block_width, block_height)
+        corner = block_corner(thread / lane_count(), wp.static(images), width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        begin = tile_ranges[corner[0]][0]
-        ends = wp.vec2i(begin, begin)
-        if wp.static(outputs == 3):
-            ends = tile_ends[corner[0]]
-            if (ends[0] > begin and ends[1] > begin) != wp.static(images == 3):
-                return  # the other kernel's tile
+        tile_range = tile_ranges[corner[0]]
+        lengths = wp.vec2i(0, 0)
+        walked = int(0)  # the image
+        if wp.static(images == 3):
+            lengths = branch_lengths[corner[0]]
+            walked = corner[3]
+        is_mixed = lengths[0] > 0 and lengths[1] > 0
+        if (walked > 0 and not is_mixed) or (is_mixed and (arrived >> walked) % 2 == 0):
+            return  # the joint image's lane group goes this one's way, or nothing has arrived at this image
+        isects = tile_list(walked, tile_range, lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -95,20 +101,20 @@ def make_composite_bwd(
         R = scalars()
         n = integers()
         v_color = colors()
-        n_last = wp.vec3i(0, 0, 0)
+        n_max = int(0)
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
                 y = pixel_y + j * lane_rows()
                 if x < width and y < height:
-                    for m in range(wp.static(outputs)):
-                        # In a tile of one branch its image is the joint one, and so their cotangents add up.
-                        if wp.static(outputs == images) or m == 0 or ends[wp.max(m - 1, 0)] > begin:
-                            k = wp.static(P * (images // 3)) * m + j * wp.static(columns) + i
+                    k = j * wp.static(columns) + i
+                    # In a tile of one branch its image is the joint one, and so their cotangents add up.
+                    for m in range(walked, wp.where(is_mixed, walked + 1, wp.static(images))):
+                        if m == 0 or lengths[wp.max(m - 1, 0)] > 0:
                             p = (m * height + y) * width + x
                             T[k] = transmittance[p]
                             n[k] = last[p]
-                            n_last[wp.static(images // 3) * m] = wp.max(n_last[wp.static(images // 3) * m], n[k])
+                            n_max = wp.max(n_max, n[k])
                             behind = float(0.0)
                             if v_alpha_image.shape[0] > 0:
                                 behind = -v_alpha_image[p]
@@ -118,24 +124,16 @@ def make_composite_bwd(
                                 if background.shape[0] > 0 and c < wp.static(num_features):
                                     behind += background[m * background_stride + c] * v
                             R[k] += T[k] * behind
-        for m in range(wp.static(images)):
-            n_last[m] = lane_max(n_last[m])  # from here on the lane group's
-        n_max = wp.max(n_last[0], wp.max(n_last[1], n_last[2]))
+        n_max = lane_max(n_max)  # from here on the lane group's
 
         stage = stage_address()
         base = (n_max - 1) / lane_count() * lane_count()
         while base >= 0 and n_max > 0:
             index = base + lane
             own_g = int(-1)
-            tag = index + 1
             if index < n_max:
-                own_g = gaussian_from_isect[begin + index]
-                if wp.static(images == 3):
-                    branch = int(is_dynamic[own_g])
-                    tag = 2 * tag + branch
-                    if index >= wp.max(n_last[0], wp.where(branch == 0, n_last[1], n_last[2])):
-                        own_g = -1
-            ballot, own0, own1, own2 = stage_survivors(own_g, tag, box, rows, lane, stage)
+                own_g = gaussian_from_isect[isects[0] + isects[1] * index]
+            ballot, own0, own1, own2 = stage_survivors(own_g, index + 1, box, rows, lane, stage)
             count = lane_bit_count(ballot)
             for back in range(count):
                 slot = count - 1 - back
@@ -144,10 +142,6 @@ def make_composite_bwd(
                 quad = stage_get(stage, slot, 2, own2)
                 g = wp.cast(row1[2], wp.int32)
                 position = wp.cast(row1[3], wp.int32)
-                branch_image = int(-1)
-                if wp.static(images == 3):
-                    branch_image = 1 + (position & 1)
-                    position = position >> 1
                 features = features_vector()
                 for c in range(wp.static(min(C, 4))):
                     features[c] = quad[c]
@@ -174,21 +168,19 @@ def make_composite_bwd(
                             alpha = wp.min(ALPHA_MAX, unclamped)
                             scale = 1.0 / (1.0 - alpha)
                             v_alpha = float(0.0)
-                            for m in range(wp.static(images)):
-                                if m == 0 or m == branch_image:
-                                    k = m * wp.static(P) + j * wp.static(columns) + i
-                                    if position <= n[k]:
-                                        touched = 1
-                                        t = T[k] * scale
-                                        w = alpha * t
-                                        seen = float(0.0)
-                                        for c in range(wp.static(C)):
-                                            v = v_color[k * wp.static(C) + c]
-                                            seen += features[c] * v
-                                            sums[c] += w * v
-                                        v_alpha += t * seen - R[k] * scale
-                                        R[k] = R[k] + w * seen
-                                        T[k] = t
+                            k = j * wp.static(columns) + i
+                            if position <= n[k]:
+                                touched = 1
+                                t = T[k] * scale
+                                w = alpha * t
+                                seen = float(0.0)
+                                for c in range(wp.static(C)):
+                                    v = v_color[k * wp.static(C) + c]
+                                    seen += features[c] * v
+                                    sums[c] += w * v
+                                v_alpha = t * seen - R[k] * scale
+                                R[k] = R[k] + w * seen
+                                T[k] = t
                             if unclamped <= ALPHA_MAX:
                                 s = alpha * v_alpha
                                 sums[wp.static(C)] += s

@@ -14,7 +14,7 @@ import warp as wp
 
 from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
-from .lanes import lane_ballot, lane_broadcast, lane_count, lane_lowest, lane_max, lane_sum_before
+from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
 from .rows import row_load
 
 SLACK = wp.constant(0.01)
@@ -26,7 +26,7 @@ MANY_TILES = wp.constant(24)
 
 
 LOOKS = wp.constant(4)
-"""Intersections that a lane looks at in one go when it looks for a tile's last ones: they are on their way together."""
+"""Intersections that a lane looks at in one go when tiles are split: they are on their way together."""
 
 
 @wp.func
@@ -203,40 +203,47 @@ def tile_ranges(
 
 
 @wp.kernel(enable_backward=False)
-def tile_ends(
+def split_tiles(
     first: int,
     ranges: wp.array2d[int],
-    gaussian_from_isect: wp.array[int],
     is_dynamic: wp.array[wp.uint8],
-    groups: int,
-    ends: wp.array2d[int],
+    half: int,
+    gaussian_from_isect: wp.array[int],
+    lengths: wp.array2d[int],
 ):
-    """One past the last static and the last dynamic intersection of each tile: where each branch's walk may end.
+    """Splits each tile's list by branch, ``lane_count()`` threads for each tile.
 
-    ``groups`` lane groups for each tile look from the end of its list, in turn, each until it has found both.
-    ``ends`` holds where the tile begins before.
+    In the second half of ``gaussian_from_isect``, which begins at ``half`` and where a tile has as much room as in the
+    first, its static Gaussians follow each other from the begin of that room on, its dynamic ones from its end back,
+    both front to back. ``lengths`` says how many there are of each.
     """
     thread = first + wp.tid()
     lane = thread % lane_count()
-    group = (thread / lane_count()) % groups
-    tile = thread / lane_count() / groups
+    tile = thread / lane_count()
     begin = ranges[tile, 0]
-    end_static = begin
-    end_dynamic = begin
-    base = ranges[tile, 1] - group * LOOKS * lane_count()
-    while base > begin and (end_static == begin or end_dynamic == begin):
-        is_last_static = begin
-        is_last_dynamic = begin
+    end = ranges[tile, 1]
+    num_static = int(0)
+    num_dynamic = int(0)
+    base = begin + lane
+    while base - lane < end:
+        gaussians = wp.vec4i(-1)
+        branches = wp.vec4i(-1)
         for k in range(LOOKS):
-            isect = base - 1 - lane - k * lane_count()
-            if isect >= begin:
-                if is_dynamic[gaussian_from_isect[isect]] != wp.uint8(0):
-                    is_last_dynamic = wp.max(is_last_dynamic, isect + 1)
-                else:
-                    is_last_static = wp.max(is_last_static, isect + 1)
-        end_static = wp.max(end_static, lane_max(is_last_static))
-        end_dynamic = wp.max(end_dynamic, lane_max(is_last_dynamic))
-        base -= groups * LOOKS * lane_count()
+            if base + k * lane_count() < end:
+                gaussians[k] = gaussian_from_isect[base + k * lane_count()]
+        for k in range(LOOKS):
+            if gaussians[k] >= 0:
+                branches[k] = int(is_dynamic[gaussians[k]])
+        for k in range(LOOKS):
+            static_ballot = lane_ballot(int(branches[k] == 0))
+            dynamic_ballot = lane_ballot(int(branches[k] == 1))
+            if branches[k] == 0:
+                gaussian_from_isect[half + begin + num_static + lane_rank(static_ballot, lane)] = gaussians[k]
+            if branches[k] == 1:
+                gaussian_from_isect[half + end - 1 - num_dynamic - lane_rank(dynamic_ballot, lane)] = gaussians[k]
+            num_static += lane_bit_count(static_ballot)
+            num_dynamic += lane_bit_count(dynamic_ballot)
+        base += LOOKS * lane_count()
     if lane == 0:
-        wp.atomic_max(ends, tile, 0, end_static)
-        wp.atomic_max(ends, tile, 1, end_dynamic)
+        lengths[tile, 0] = num_static
+        lengths[tile, 1] = num_dynamic

@@ -30,6 +30,8 @@ def parameters_after_steps(data, run, **changes):
     """After iterations of stage II with one set of Gaussians, which is where most of a run's time goes."""
     trainer = trainer_on_cuda(data, run, **changes)
     trainer._add_dynamic()
+    with torch.no_grad():  # a sphere's rotation would be trained by rounding errors alone
+        trainer.scene.dynamic.log_scales += torch.linspace(-0.5, 0.5, 3, device="cuda")
     moment = trainer.protocol.at(trainer.protocol.stage2.start)
     for iteration in range(STEPS):
         trainer.iteration = iteration

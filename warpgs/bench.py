@@ -37,7 +37,7 @@ VISIBLE_DIFFERENCE = 1e-3
 
 STAGES = {
     "project": ("project_fwd", "sh_fwd", "pack", "pack_features"),
-    "bin": ("count_tiles", "emit_isects", "tile_ranges", "tile_ends"),
+    "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
     "composite_bwd": ("layers_bwd", "composite_bwd"),

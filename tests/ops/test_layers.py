@@ -22,7 +22,10 @@ def taken_apart(composite, alpha, with_depth):
         depth = torch.stack(layers.depths) if with_depth else None
 
         def backward(run):
-            for tensor, gradient in zip((composite, alpha), gather_adjoints(run, layers, alpha, depth), strict=True):
+            *gradients, arrived = gather_adjoints(run, layers, alpha, depth)
+            for k, tensors in enumerate(zip(*(kind for kind in layers if kind), strict=True)):
+                assert arrived >> k & 1 == any(run.adjoint(t) is not None for t in tensors)
+            for tensor, gradient in zip((composite, alpha), gradients, strict=True):
                 if gradient is not None:
                     run.add_adjoint(tensor, gradient.view(tensor.shape))
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
-from warpgs.kernels.tiles import tile_ends
 from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
@@ -196,8 +195,7 @@ def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
     ]
 
 
-@pytest.mark.parametrize("groups", [1, 3, 4])
-def test_lane_groups_find_where_the_branches_of_a_tile_end(groups):
+def test_the_lists_of_tiles_are_split_by_branch_in_order():
     random = generator()
     lengths = torch.randint(0, 40, (60,), generator=random)
     lengths[:3] = torch.tensor([0, 1, 300])
@@ -205,11 +203,12 @@ def test_lane_groups_find_where_the_branches_of_a_tile_end(groups):
     ranges = torch.stack([bounds[:-1], bounds[1:]], 1).int()
     is_dynamic = torch.rand(500, generator=random) < torch.rand(500, generator=random) ** 4
     gaussians = torch.randint(0, 500, (int(lengths.sum()),), dtype=torch.int32, generator=random)
-    ends = ranges[:, :1].repeat(1, 2)
-    run = Run(torch.device("cpu"), [])
-    arguments = (ranges, gaussians, is_dynamic.view(torch.uint8), groups, ends)
-    run.launch(tile_ends, len(ranges) * groups, *arguments)
-    for (begin, end), found in zip(ranges.tolist(), ends.tolist(), strict=True):
-        moves = is_dynamic[gaussians[begin:end].long()].tolist()
-        expected = [max([begin, *(begin + k + 1 for k, m in enumerate(moves) if m == branch)]) for branch in (0, 1)]
-        assert found == expected
+    joint = tiles.Tiles(ranges, torch.cat([gaussians, gaussians.new_full(gaussians.shape, -1)]), torch.zeros(1))
+    split = tiles.record_split_tiles(Run(torch.device("cpu"), []), joint, is_dynamic.view(torch.uint8))
+    assert torch.equal(joint.gaussian_from_isect[: joint.half], gaussians)
+    for (begin, end), (num_static, num_dynamic) in zip(ranges.tolist(), split.tolist(), strict=True):
+        listed = gaussians[begin:end]
+        moves = is_dynamic[listed.long()]
+        room = joint.gaussian_from_isect[joint.half + begin : joint.half + end]
+        assert torch.equal(room[:num_static], listed[~moves])
+        assert torch.equal(room.flip(0)[:num_dynamic], listed[moves])

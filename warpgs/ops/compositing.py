@@ -18,7 +18,7 @@ from .layers import NUM_BRANCH_IMAGES, Layers, gather_adjoints
 from .projection import Projection
 from .rows import Rows
 from .tape import PerShard, Run, differentiable
-from .tiles import Tiles, record_tile_ends, record_tiles
+from .tiles import Tiles, record_split_tiles, record_tiles
 
 CUDA_PIXELS = (1, 2)
 """Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""
@@ -80,28 +80,21 @@ def _launch(
     tiles: Tiles,
     *arguments: Any,
 ) -> None:
-    """Launches a compositing kernel over all blocks of pixels; with three images also the one for mixed tiles."""
+    """Launches a compositing kernel over all blocks of pixels."""
     lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
     pixels = CPU_PIXELS
     if run.is_cuda:
         pixels = CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
     blocks = (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
 
-    def walk(walked: int) -> None:
-        run.launch(
-            make_kernel(rows.num_features, rows.with_depth, walked, images, pixels, flag),
-            tiles.ranges.shape[0] * blocks * lanes,
-            tiles.ranges,
-            *arguments,
-            block_dim=BLOCK_DIM,
-            work=TILE_SIZE * TILE_SIZE,
-        )
-
-    if images == 1:
-        walk(1)
-    else:
-        # Each kernel does its own tiles. The long lists of mixed tiles go first: the others fill in beside them.
-        run.side_by_side(lambda: walk(images), lambda: walk(1))
+    run.launch(
+        make_kernel(rows.num_features, rows.with_depth, images, pixels, flag),
+        tiles.ranges.shape[0] * images * blocks * lanes,
+        tiles.ranges,
+        *arguments,
+        block_dim=BLOCK_DIM,
+        work=TILE_SIZE * TILE_SIZE,
+    )
 
 
 def record_composite(
@@ -123,7 +116,7 @@ def record_composite(
     C = rows.num_channels
     N = rows.packed.shape[0]
     images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
-    ends = None if is_dynamic is None else record_tile_ends(run, tiles, is_dynamic)
+    lengths = None if is_dynamic is None else record_split_tiles(run, tiles, is_dynamic)
     num_features = rows.num_features
     image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None
@@ -141,10 +134,10 @@ def record_composite(
         statistics,
         size,
         tiles,
-        ends,
+        lengths,
         tiles.gaussian_from_isect,
+        tiles.half,
         rows.packed,
-        is_dynamic,
         behind,
         stride,
         width,
@@ -159,8 +152,8 @@ def record_composite(
     )
 
     def backward(run: Run) -> None:
-        v_image, v_alpha = gather_adjoints(run, layers, alpha, depth)
-        if v_image is None and v_alpha is None:
+        v_image, v_alpha, arrived = gather_adjoints(run, layers, alpha, depth)
+        if arrived == 0:
             return
         v_image = run.zeros(images, height, width, C) if v_image is None else v_image
         gradients = run.zeros(run.num_shards, N, gradient_stride(C))
@@ -172,10 +165,10 @@ def record_composite(
             absgrad,
             size,
             tiles,
-            ends,
+            lengths,
             tiles.gaussian_from_isect,
+            tiles.half,
             rows.packed,
-            is_dynamic,
             behind,
             stride,
             width,
@@ -184,6 +177,7 @@ def record_composite(
             last,
             v_image.view(-1, C),
             None if v_alpha is None else v_alpha.view(-1),
+            arrived,
             PerShard(gradients),
         )
         run.add_adjoint(rows.packed, gradients)

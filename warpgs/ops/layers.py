@@ -29,7 +29,7 @@ class Layers(NamedTuple):
 
 def gather_adjoints(
     run: Run, layers: Layers, alpha: Tensor, depth: Tensor | None
-) -> tuple[Tensor | None, Tensor | None]:
+) -> tuple[Tensor | None, Tensor | None, int]:
     """What has arrived at layers, in one launch for all: gradients of the composites, depth as drawn being their last
     channel, and of alpha; None where nothing has arrived.
 
@@ -37,15 +37,16 @@ def gather_adjoints(
         alpha, depth: [layers, H, W], what ``layers`` has by the piece.
 
     Returns:
-        [layers, H, W, channels] and [layers, H, W].
+        [layers, H, W, channels], [layers, H, W] and a number whose bit k says whether anything has arrived at layer k.
     """
     arrived = [[run.adjoint(t) for t in tensors] for tensors in layers]
-    if all(v is None for values in arrived for v in values):
-        return None, None
+    bits = sum({1 << k for values in arrived for k, v in enumerate(values) if v is not None})
+    if bits == 0:
+        return None, None, 0
     num, H, W = alpha.shape
     if num == 1 and depth is None:
         (v_image,), (v_alpha,), _ = arrived
-        return v_image, v_alpha
+        return v_image, v_alpha, bits
     C = layers.images[0].shape[-1]
     v_composite, v_alpha = run.empty(num, H, W, C + int(depth is not None)), run.empty(num, H, W)
     missing: list[Tensor | None] = [None] * NUM_BRANCH_IMAGES
@@ -60,4 +61,4 @@ def gather_adjoints(
         v_alpha.view(-1),
         work=LITTLE_WORK,
     )
-    return v_composite, v_alpha
+    return v_composite, v_alpha, bits

@@ -19,7 +19,6 @@ import warp as wp
 from torch import Tensor
 
 from . import profiling
-from .streams import PRIORITY
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -213,20 +212,6 @@ class Run:
         with profiling.span(kernel.func.__name__, self.device):
             self._launch(kernel, dim, arguments, block_dim, work)
 
-    def side_by_side(self, first: Callable[[], None], second: Callable[[], None]) -> None:
-        """Runs two functions that launch kernels, on CUDA at the same time: neither may need what the other writes."""
-        main = self.stream
-        if main is None or profiling.is_on():
-            first()
-            second()
-            return
-        self.stream = _side_stream(self._warp_device)
-        self.stream.wait_stream(main)
-        first()
-        side, self.stream = self.stream, main
-        second()
-        main.wait_stream(side)
-
     def launch_adjoint(
         self, kernel: wp.Kernel, dim: int, tensors: Sequence[Tensor], adjoints: Sequence[Tensor]
     ) -> None:
@@ -294,15 +279,6 @@ class Run:
 
 
 _streams: dict[tuple[int, int], wp.Stream] = {}
-_side_streams = threading.local()
-
-
-def _side_stream(device: wp.Device) -> wp.Stream:
-    """A second stream of this thread; threads share none, because one may be capturing a graph."""
-    streams = _side_streams.__dict__
-    if device.alias not in streams:
-        streams[device.alias] = wp.Stream(device, priority=PRIORITY)
-    return streams[device.alias]
 
 
 @functools.lru_cache(maxsize=256)

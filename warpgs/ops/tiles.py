@@ -22,23 +22,25 @@ DECAY = 0.999
 
 DEPTH_BITS = 31
 
-GROUPS_PER_TILE = 4
-"""Lane groups on CUDA that look for a tile's last intersections: one of one branch is looked through to its begin."""
-
 
 class Tiles(NamedTuple):
     """Which Gaussians each tile of 16×16 pixels looks at, in row-major order of tiles.
 
     Attributes:
         ranges: [num_tiles, 2] int32 begin and end of each tile's run in ``gaussian_from_isect``.
-        gaussian_from_isect: int32 Gaussian of each (Gaussian, tile) intersection, by tile, then front to back; longer
-            than the last range's end.
+        gaussian_from_isect: int32, in its first half the Gaussian of each (Gaussian, tile) intersection, by tile, then
+            front to back; longer than the last range's end.
         demand: [1] int64 number of intersections, in host memory; valid once the device has come this far.
     """
 
     ranges: Tensor
     gaussian_from_isect: Tensor
     demand: Tensor
+
+    @property
+    def half(self) -> int:
+        """Where the second half of ``gaussian_from_isect`` begins."""
+        return len(self.gaussian_from_isect) // 2
 
 
 @dataclass
@@ -133,18 +135,21 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
     return Tiles(ranges, gaussian_from_isect, budget.demand)
 
 
-def record_tile_ends(run: Run, tiles: Tiles, is_dynamic: Tensor) -> Tensor:
-    """[num_tiles, 2] int32: one past each tile's last static and last dynamic intersection."""
-    ends = tiles.ranges[:, :1].repeat(1, 2)
-    lanes, groups = (WARP_SIZE, GROUPS_PER_TILE) if run.is_cuda else (1, 1)
+def record_split_tiles(run: Run, tiles: Tiles, is_dynamic: Tensor) -> Tensor:
+    """Splits each tile's list by branch, into the second half of ``gaussian_from_isect``.
+
+    Returns:
+        [num_tiles, 2] int32: how many static and how many dynamic Gaussians each tile has.
+    """
+    lengths = torch.empty_like(tiles.ranges)
     run.launch(
-        kernels.tile_ends,
-        tiles.ranges.shape[0] * lanes * groups,
+        kernels.split_tiles,
+        len(lengths) * (WARP_SIZE if run.is_cuda else 1),
         tiles.ranges,
-        tiles.gaussian_from_isect,
         is_dynamic,
-        groups,
-        ends,
+        tiles.half,
+        tiles.gaussian_from_isect,
+        lengths,
         block_dim=BLOCK_DIM,
     )
-    return ends
+    return lengths
