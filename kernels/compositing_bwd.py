@@ -87,7 +87,8 @@ def make_composite_bwd(
         if wp.static(images == 3):
             lengths = branch_lengths[corner[0]]
             walked = corner[3]
-        is_mixed = lengths[0] > 0 and lengths[1] > 0
+        # Absolute values are those of each image's pixels, so that there each image is gone back alone.
+        is_mixed = wp.static(absolute) or (lengths[0] > 0 and lengths[1] > 0)
         if (walked > 0 and not is_mixed) or (is_mixed and (arrived >> walked) % 2 == 0):
             return  # the joint image's lane group goes this one's way, or nothing has arrived at this image
         isects = tile_list(walked, tile_range, lengths, half)

@@ -15,7 +15,8 @@ class RenderSettings:
         branches: Also the images of the static and of the dynamic Gaussians alone, from the same pass.
         depth: Also depth, as one more channel.
         statistics: Also whether and how much each Gaussian contributed to the joint image.
-        absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms.
+        absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms, whose terms are the
+            pixels of all images.
         antialias: Opacity compensation for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
     """

@@ -131,14 +131,16 @@ def test_statistics_are_the_sums_of_the_blend_weights():
     assert torch.equal(result.contributed, weights > 0)
 
 
-def test_absolute_norms_sum_the_lengths_pixel_by_pixel():
+@pytest.mark.parametrize("dynamic", [None, torch.arange(8) < 0, torch.arange(8) < 3, torch.arange(8) < 8])
+def test_absolute_norms_sum_the_lengths_pixel_by_pixel(dynamic):
     size = (20, 17)
     inputs = make_inputs(8, size=size)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
-    result, (image, _, _) = ours(single, size, absgrad=True), theirs(double, size)
-    (cotangent,) = random_like([image])
-    pulled(result.images, [cotangent]).backward()
-    per_pixel = (image * cotangent).sum(-1).flatten()
+    result = ours(single, size, absgrad=True, is_dynamic=dynamic)
+    images = [theirs(double, size, drawn)[0] for drawn in ([None] if dynamic is None else [None, ~dynamic, dynamic])]
+    cotangents = random_like(images)
+    pulled(result.images, cotangents).backward()
+    per_pixel = torch.cat([(i * c).sum(-1).flatten() for i, c in zip(images, cotangents, strict=True)])
     gradients = torch.stack([torch.autograd.grad(p, double[0], retain_graph=True)[0] for p in per_pixel])
     half_size = torch.tensor([size[0] / 2, size[1] / 2])
     assert relative_error(result.norms[:, 0], (gradients.sum(0) * half_size).norm(dim=-1)) < 1e-5
