@@ -1,5 +1,9 @@
 """The GPU draws what the CPU draws."""
 
+import dataclasses
+import gc
+import weakref
+
 import pytest
 import torch
 
@@ -15,7 +19,9 @@ from tests.scenes import (
     relative_error,
 )
 from warpgs.config import RenderSettings
+from warpgs.ops import replay
 from warpgs.ops.depth_error import depth_error
+from warpgs.ops.graph import WARM_UPS
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.render import render
 
@@ -104,3 +110,23 @@ def test_a_render_can_be_captured_and_replayed():
     graph.replay()
     torch.cuda.synchronize()
     assert relative_error(image, render(splats, camera).joint.image) < 1e-6
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth", "all depths"])
+def test_renders_that_repeat_are_replayed(settings):
+    plain = drawn("cuda", dataclasses.replace(settings, replay=False))
+    for _ in range(2 * WARM_UPS):
+        for actual, expected in zip(drawn("cuda", settings), plain, strict=True):
+            assert relative_error(actual, expected) < 1e-5
+    assert sum(kind.recordings for kind in replay._kinds.known.values()) > 0
+
+
+def test_a_recording_keeps_nothing_of_its_caller():
+    kept = []
+    for seed in range(2 * WARM_UPS):
+        splats = as_leaves(make_splats(200, seed=seed).to("cuda"))
+        render(splats, make_camera(64, 48).to("cuda")).joint.image.sum().backward()
+        kept += [weakref.ref(t) for t in (splats.means, splats.means.grad)]
+    del splats
+    gc.collect()
+    assert not any(reference() is not None for reference in kept)

@@ -15,10 +15,12 @@ class RenderSettings:
         branches: Also the images of the static and of the dynamic Gaussians alone, from the same pass.
         depth: Also depth, as one more channel.
         statistics: Also whether and how much each Gaussian contributed to the joint image.
-        absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms, whose terms are the
+        absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms, summed over the
             pixels of all images.
         antialias: Opacity compensation for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
+        replay: On CUDA, renders that are alike and small are replayed from CUDA graphs (``ops/replay.py``): the same
+            results in half the time, for the memory of a render or two more.
     """
 
     branches: bool = False
@@ -27,6 +29,7 @@ class RenderSettings:
     absgrad: bool = False
     antialias: bool = False
     near: float = 0.01
+    replay: bool = True
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from .ops.compositing import Composite, record_composite
 from .ops.contracts import check_same_device, check_tensor
 from .ops.layers import NUM_BRANCH_IMAGES
 from .ops.projection import record_projection
+from .ops.replay import repeated
 from .ops.rows import Rows
 from .ops.sh import record_sh
 from .ops.streams import join
@@ -107,15 +108,18 @@ def render(
         opacities: Tensor,
         appearance: Tensor,
         behind: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        branch: Tensor | None,
     ) -> tuple[Tensor, ...]:
-        geometry = (means, quats, scales, opacities, camera.viewmat, camera.K)
+        geometry = (means, quats, scales, opacities, viewmat, K)
         projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
         rows = Rows(run, projection, C, settings.depth, camera.size)
         tiles = record_tiles(run, rows, camera.size)
         join(splats.sh_stream)
         features = appearance
         if degree is not None:
-            features = record_sh(run, means, appearance, camera.viewmat, projection.radii, degree)
+            features = record_sh(run, means, appearance, viewmat, projection.radii, degree)
         rows.add_features(run, features)
         composite = record_composite(
             run, rows, tiles, camera.size, behind, branch, settings.statistics, settings.absgrad
@@ -123,8 +127,12 @@ def render(
         return (projection.radii, *composite.flat())
 
     appearance = splats.colors if splats.sh is None else splats.sh
-    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, appearance, background)
-    radii, *flat = differentiable(op, *tensors)
+    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
+    tensors = (*geometry, appearance, background, camera.viewmat, camera.K, branch)
+    if settings.replay and splats.sh_stream is None and len(splats.means) > 0:
+        radii, *flat = repeated((camera.size, C, settings, degree), op, *tensors)
+    else:
+        radii, *flat = differentiable(op, *tensors)
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
     composite = Composite.from_flat(tuple(flat), num_images, settings.depth)
     depths = composite.depths or (None,) * num_images

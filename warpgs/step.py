@@ -118,7 +118,8 @@ class Step:
     def _run(self, moment: Moment, view: View) -> None:
         self._choose_trained(moment)
         splats = self.scene.splats(view.time, moment.moving, moment.relit, moment.sh_degree, self._noise, late_sh=True)
-        settings = RenderSettings(branches=True, depth=moment.depth_weight > 0, antialias=self.config.antialias)
+        with_depth, antialias = moment.depth_weight > 0, self.config.antialias
+        settings = RenderSettings(branches=True, depth=with_depth, antialias=antialias, replay=False)
         rendering = render(splats, view.camera, self._backgrounds, settings)
         terms = self._loss_terms(moment, view, rendering)
         # The gradient of a weighted sum, which is not wanted itself, starts from the weights.

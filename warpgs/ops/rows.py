@@ -53,6 +53,7 @@ class Rows:
         run.launch(kernels.make_pack_features(num_features, with_depth), N, features, depths, self.packed)
 
         packed, norms = self.packed, self.norms
+        run.filled.append(norms)
 
         def backward(run: Run) -> None:
             gradients = run.adjoint(packed)

@@ -143,6 +143,8 @@ class Run:
         device: Where the tensors live.
         needs_grad: Whether anything will ask for gradients; if not, ops keep nothing for the way back.
         num_shards: Cores that a CPU launch is spread over (``torch.get_num_threads()``); 1 on CUDA.
+        filled: Outputs of the op that the way back writes to.
+        conditions: What has to hold for the launches to do the same job again, for other values of the tensors.
     """
 
     def __init__(self, device: torch.device, wanted: Sequence[Tensor]):
@@ -153,6 +155,8 @@ class Run:
         self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), _CORES))
         self._warp_device = wp.device_from_torch(device)
         self.stream = self._current_stream()
+        self.filled: list[Tensor] = []
+        self.conditions: list[Callable[[], bool]] = []
         self._tape = wp.Tape()
         self._adjoints: dict[int, Tensor | None] = {}
         self._kept: list[Tensor] = []

@@ -103,6 +103,7 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
     if budget.most == 0.0 or not run.is_cuda:
         budget.demand.copy_(end_of_rank[-1:])
     capacity = budget.capacity(N) if run.is_cuda else max(int(budget.demand.item()), N)
+    run.conditions.append(lambda: int(budget.demand.item()) <= capacity)
     tile_from_isect, gaussian_from_isect = run.empty(2 * capacity, dtype=int32), run.empty(2 * capacity, dtype=int32)
     run.launch(
         kernels.emit_isects,

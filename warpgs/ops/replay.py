@@ -1,0 +1,278 @@
+"""Work that repeats, replayed from CUDA graphs.
+
+The kernels of a small render take a GPU less time than the host needs to launch them one by one. What has been called a
+few times with inputs of the same shapes is therefore recorded, the way forth and the way back, and from then on takes
+one launch each way. Nobody notices but by the time: inputs are copied to where the recording reads them, outputs and
+gradients are copied out of it, and a recording whose way back may still be gone is not used for another call.
+"""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import profiling
+from .graph import WARM_UPS, record
+from .streams import PRIORITY
+from .tape import Run, differentiable
+
+LARGEST = 1 << 25
+"""Bytes of inputs and outputs above which nothing is replayed: launching is not what takes time there, copying is."""
+
+MOST_KINDS = 16
+"""Kinds of calls that a thread remembers."""
+
+MOST_RECORDINGS = 4
+"""Of one kind of call: so many renders may wait for their ways back at a time."""
+
+Op = Callable[..., tuple[Tensor, ...]]
+
+
+class _Buffers:
+    """Tensors that stay where they are, for a graph to read or write, with None for those that there are not.
+
+    Those of elements of four bytes are copied in one launch, bit by bit.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor | None]) -> None:
+        self.tensors: list[Any] = list(tensors)
+        given = [(k, t.detach()) for k, t in enumerate(tensors) if t is not None]
+        self._words = [(k, t.dtype) for k, t in given if t.element_size() == 4]
+        self._words_at = [t.view(torch.float32) for _, t in given if t.element_size() == 4]
+        self._others = [(k, t) for k, t in given if t.element_size() != 4]
+
+    def fill(self, sources: Sequence[Any]) -> None:
+        """Copies tensors of the same shapes into these."""
+        torch._foreach_copy_(self._words_at, [sources[k].view(torch.float32) for k, _ in self._words])
+        for k, target in self._others:
+            target.copy_(sources[k])
+
+    def copies(self) -> list[Any]:
+        """New tensors with what these hold."""
+        words = [torch.empty_like(t) for t in self._words_at]
+        torch._foreach_copy_(words, self._words_at)
+        result: list[Any] = [None] * len(self.tensors)
+        for (k, dtype), copy in zip(self._words, words, strict=True):
+            result[k] = copy.view(dtype)
+        for k, tensor in self._others:
+            result[k] = tensor.clone()
+        return result
+
+
+class _WayBack:
+    """A recorded way back, with the cotangents that it starts from and the gradients that it leaves."""
+
+    def __init__(self, recording: "Recording", cotangents: Sequence[Tensor | None]) -> None:
+        own = [None if c is None else torch.empty_like(c, memory_format=torch.contiguous_format) for c in cotangents]
+        self._cotangents = _Buffers(own)
+
+        def work() -> None:
+            self._gradients = _Buffers(recording.go_back(own))
+
+        self._replay = recording.record(work)
+
+    def __call__(self, cotangents: Sequence[Tensor | None]) -> list[Tensor | None]:
+        self._cotangents.fill(cotangents)
+        self._replay()
+        return self._gradients.copies()
+
+
+class Recording:
+    """An op, recorded with tensors of its own.
+
+    Args:
+        op: As for ``differentiable``; what it reads besides its tensors must never change.
+        tensors: Inputs like those that are to come.
+
+    Attributes:
+        filled: Indices of the outputs that the way back writes to.
+    """
+
+    def __init__(self, op: Op, tensors: Sequence[Tensor | None]) -> None:
+        self._inputs = _Buffers(
+            [None if t is None else t.detach().clone().requires_grad_(t.requires_grad) for t in tensors]
+        )
+        self._device = next(t.device for t in tensors if t is not None)
+        self._stream_and_pool = _stream_and_pool(self._device)
+        self._ways_back: dict[tuple[bool, ...], _WayBack | None] = {}
+        self._replay = self.record(lambda: self._go(op))
+
+    def is_valid(self) -> bool:
+        """Whether what was assumed when it was recorded still holds."""
+        return all(condition() for condition in self._run.conditions)
+
+    def forward(self, tensors: Sequence[Tensor | None]) -> list[Tensor]:
+        """Outputs for other inputs."""
+        self._inputs.fill(tensors)
+        self._replay()
+        return self._outputs.copies()
+
+    def backward(self, cotangents: Sequence[Tensor | None], filled: Sequence[Tensor]) -> list[Tensor | None]:
+        """Gradients of the inputs of the last ``forward``; writes to those of its outputs that ``self.filled`` says."""
+        arrived = tuple(c is not None for c in cotangents)
+        if arrived not in self._ways_back:
+            # The first time plainly: it loads kernels, which a capture could not.
+            self._ways_back[arrived] = None
+            gradients = self.go_back(cotangents)
+        else:
+            way = self._ways_back[arrived]
+            if way is None:
+                way = self._ways_back[arrived] = _WayBack(self, cotangents)
+            gradients = way(cotangents)
+        for output, k in zip(filled, self.filled, strict=True):
+            output.copy_(self._outputs.tensors[k])
+        return gradients
+
+    def record(self, work: Callable[[], None]) -> Callable[[], None]:
+        return record(work, *self._stream_and_pool)
+
+    def _go(self, op: Op) -> None:
+        inputs = self._inputs.tensors
+        self._run = Run(self._device, [t for t in inputs if t is not None and t.requires_grad])
+        with torch.no_grad():
+            outputs = op(self._run, *inputs)
+        self._outputs = _Buffers(outputs)
+        self.filled = [k for k, o in enumerate(outputs) if any(o is t for t in self._run.filled)]
+
+    def go_back(self, cotangents: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """The way back itself."""
+        self._run.backward(self._outputs.tensors, cotangents)
+        inputs = self._inputs.tensors
+        gradients = [self._run.adjoint(t) if t is not None and t.requires_grad else None for t in inputs]
+        self._run.forget_adjoints()
+        return gradients
+
+
+def _stream_and_pool(device: torch.device) -> tuple[torch.cuda.Stream, Any]:
+    """What all graphs of a recording share, for ``record``."""
+    return torch.cuda.Stream(device, priority=PRIORITY), torch.cuda.graph_pool_handle()
+
+
+def _copy(targets: Sequence[Tensor | None], sources: Sequence[Tensor | None]) -> None:
+    """Copies tensors into others, those of floats in one launch."""
+    pairs = [(t, s) for t, s in zip(targets, sources, strict=True) if t is not None and s is not None]
+    floats = [(t, s) for t, s in pairs if t.dtype == torch.float32]
+    with torch.no_grad():
+        if floats:
+            torch._foreach_copy_([t for t, _ in floats], [s for _, s in floats])
+        for target, source in pairs:
+            if target.dtype != torch.float32:
+                target.copy_(source)
+
+
+def _copies(tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
+    copies = [None if t is None else torch.empty_like(t) for t in tensors]
+    _copy(copies, tensors)
+    return copies
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which recording a call takes
+
+
+class _Lease:
+    """A recording in use, until nobody can go its way back any more."""
+
+    def __init__(self, kind: "_Kind", recording: Recording) -> None:
+        self._kind, self.recording = kind, recording
+
+    def __del__(self) -> None:
+        self._kind.idle.append(self.recording)
+
+
+class _Kind:
+    """Calls that are alike.
+
+    Attributes:
+        calls: How many there have been without a recording.
+        bytes: Of inputs and outputs.
+        idle: Recordings that are not in use.
+        recordings: How many there are.
+    """
+
+    def __init__(self) -> None:
+        self.calls = self.bytes = self.recordings = 0
+        self.idle: list[Recording] = []
+
+    def lease(self, op: Op, tensors: Sequence[Tensor | None]) -> _Lease | None:
+        """A recording for this call, if there is one or it is time to make one."""
+        if self.calls < WARM_UPS or self.bytes > LARGEST:
+            return None
+        if self.idle:
+            recording = self.idle.pop()
+            if recording.is_valid():
+                return _Lease(self, recording)
+            self.recordings -= 1
+            self.calls = 0
+            return None
+        if self.recordings == MOST_RECORDINGS:
+            return None
+        lease = _Lease(self, Recording(op, tensors))
+        self.recordings += 1
+        return lease
+
+
+_kinds = threading.local()
+
+
+def _kind(key: Hashable) -> _Kind:
+    """This thread's memory of a kind of call; threads share none, because a recording serves one call at a time."""
+    kinds: OrderedDict[Hashable, _Kind] = _kinds.__dict__.setdefault("known", OrderedDict())
+    if key not in kinds:
+        kinds[key] = _Kind()
+        if len(kinds) > MOST_KINDS:
+            kinds.popitem(last=False)
+    kinds.move_to_end(key)
+    return kinds[key]
+
+
+class _Replayed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, lease: _Lease, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.lease = lease
+        outputs = lease.recording.forward(tensors)
+        ctx.filled = [outputs[k].detach() for k in lease.recording.filled]  # without their graph, which holds this
+        ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
+        return tuple(outputs)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        with torch.no_grad():
+            return None, *ctx.lease.recording.backward(cotangents, ctx.filled)
+
+
+def _stream(device: torch.device) -> int:
+    return torch.cuda.current_stream(device).cuda_stream
+
+
+def _can_replay(device: torch.device) -> bool:
+    return device.type == "cuda" and not profiling.is_on() and not torch.cuda.is_current_stream_capturing()
+
+
+def repeated(key: Hashable, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    """As ``differentiable``; on CUDA calls that are alike and not large are replayed from the fourth on.
+
+    Args:
+        key: What ``op`` reads besides its tensors: calls with equal keys do the same with the same inputs.
+        op: As for ``differentiable``. Float outputs may be filled on the way back if the run knows (``Run.filled``).
+        tensors: Its inputs, all of them: it must not read others.
+    """
+    device = next(t.device for t in tensors if t is not None)
+    if not _can_replay(device):
+        return differentiable(op, *tensors)
+    wants = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    shapes = tuple(None if t is None else (t.shape, t.dtype, wants and t.requires_grad) for t in tensors)
+    kind = _kind((key, device, _stream(device), shapes))
+    lease = kind.lease(op, tensors if wants else [None if t is None else t.detach() for t in tensors])
+    if lease is None:
+        outputs = differentiable(op, *tensors)
+        kind.calls += 1
+        kind.bytes = sum(t.numel() * t.element_size() for t in (*tensors, *outputs) if t is not None)
+        return outputs
+    if wants:
+        return _Replayed.apply(lease, *tensors)
+    return tuple(lease.recording.forward(tensors))
