@@ -244,7 +244,7 @@ def test_runs_of_one_name_are_told_apart(tmp_path, run):
     [
         ("psnr", 25.126, "25.13"),
         ("train_seconds", 59.6, "0:01:00"),
-        ("peak_bytes", 3 << 30, "3.00 GiB"),
+        ("peak_bytes", 3 * 10**9, "3.00 GB"),
         ("num_static", 12345, "12,345"),
         ("lpips", None, "not measured"),
         ("commit", "abc", "abc"),

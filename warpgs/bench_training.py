@@ -104,7 +104,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
         moment = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, moment, device, repeats))
     if device == "cuda":
-        result["peak_memory_mib"] = torch.cuda.max_memory_allocated() >> 20
+        result["peak_memory_mb"] = torch.cuda.max_memory_allocated() // 10**6
     return result
 
 

@@ -1,5 +1,6 @@
 """The ``warpgs`` command."""
 
+import importlib.metadata
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -58,6 +59,9 @@ ADVICE = "free some, or ask for less: smaller pictures, fewer Gaussians; --devic
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+        print(f"warpgs {importlib.metadata.version('warpgs')}")
+        return 0
     command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="warpgs", description=__doc__, args=arguments)
     try:
         command.run()

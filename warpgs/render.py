@@ -17,7 +17,7 @@ from .ops.replay import repeated
 from .ops.rows import Rows
 from .ops.sh import record_sh
 from .ops.streams import join
-from .ops.tape import Run, differentiable
+from .ops.tape import Op, Run, differentiable
 from .ops.tiles import record_tiles
 from .scene.splats import Splats
 
@@ -100,37 +100,13 @@ def render(
     if degree is None and splats.sh is not None:
         degree = round(splats.sh.shape[1] ** 0.5) - 1
 
-    def op(
-        run: Run,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        appearance: Tensor,
-        behind: Tensor | None,
-        viewmat: Tensor,
-        K: Tensor,
-        branch: Tensor | None,
-    ) -> tuple[Tensor, ...]:
-        geometry = (means, quats, scales, opacities, viewmat, K)
-        projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
-        rows = Rows(run, projection, C, settings.depth, camera.size)
-        tiles = record_tiles(run, rows, camera.size)
-        join(splats.sh_stream)
-        features = appearance
-        if degree is not None:
-            features = record_sh(run, means, appearance, viewmat, projection.radii, degree)
-        rows.add_features(run, features)
-        composite = record_composite(
-            run, rows, tiles, camera.size, behind, branch, settings.statistics, settings.absgrad
-        )
-        return (projection.radii, *composite.flat())
-
     appearance = splats.colors if splats.sh is None else splats.sh
     geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
     tensors = (*geometry, appearance, background, camera.viewmat, camera.K, branch)
+    kind = (camera.size, C, settings, degree)
+    op = _make_op(*kind, splats.sh_stream)
     if settings.replay and splats.sh_stream is None and len(splats.means) > 0:
-        radii, *flat = repeated((camera.size, C, settings, degree), op, *tensors)
+        radii, *flat = repeated(kind, op, *tensors)
     else:
         radii, *flat = differentiable(op, *tensors)
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
@@ -146,3 +122,39 @@ def render(
         contributed=composite.contributed,
         weights=composite.weights,
     )
+
+
+def _make_op(
+    size: tuple[int, int],
+    num_channels: int,
+    settings: RenderSettings,
+    sh_degree: int | None,
+    sh_stream: torch.cuda.Stream | None,
+) -> Op:
+    """What is done with the tensors of a render; it depends on nothing else than what is given here."""
+
+    def op(
+        run: Run,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        appearance: Tensor,
+        background: Tensor | None,
+        viewmat: Tensor,
+        K: Tensor,
+        branch: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        geometry = (means, quats, scales, opacities, viewmat, K)
+        projection = record_projection(run, *geometry, size, settings.near, settings.antialias)
+        rows = Rows(run, projection, num_channels, settings.depth, size)
+        tiles = record_tiles(run, rows, size)
+        join(sh_stream)
+        features = appearance
+        if sh_degree is not None:
+            features = record_sh(run, means, appearance, viewmat, projection.radii, sh_degree)
+        rows.add_features(run, features)
+        composite = record_composite(run, rows, tiles, size, background, branch, settings.statistics, settings.absgrad)
+        return (projection.radii, *composite.flat())
+
+    return op

@@ -17,7 +17,7 @@ from torch import Tensor
 from . import profiling
 from .graph import WARM_UPS, record
 from .streams import PRIORITY
-from .tape import Run, differentiable
+from .tape import Op, Run, differentiable
 
 LARGEST = 1 << 25
 """Bytes of inputs and outputs above which nothing is replayed: launching is not what takes time there, copying is."""
@@ -27,8 +27,6 @@ MOST_KINDS = 16
 
 MOST_RECORDINGS = 4
 """Of one kind of call: so many renders may wait for their ways back at a time."""
-
-Op = Callable[..., tuple[Tensor, ...]]
 
 
 class _Buffers:

@@ -33,6 +33,10 @@ LITTLE_WORK = 1 / 16
 """What a thread that only moves a few numbers does of a plain thread's work."""
 
 
+Op = Callable[..., tuple[Tensor, ...]]
+"""``op(run, *tensors) -> tensors``."""
+
+
 @dataclass(frozen=True)
 class PerShard:
     """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
@@ -293,7 +297,7 @@ def _int_array(pointer: int, size: int, device: str) -> wp.array:
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         device = next(t.device for t in tensors if t is not None)
         ctx.run = Run(device, [t for t in tensors if t is not None and t.requires_grad])
         ctx.set_materialize_grads(False)
@@ -316,7 +320,7 @@ class _Differentiable(torch.autograd.Function):
             return None, *(a if n else None for a, n in zip(adjoints, ctx.needs_input_grad[1:], strict=True))
 
 
-def differentiable(op: Callable[..., tuple[Tensor, ...]], *tensors: Tensor | None) -> tuple[Tensor, ...]:
+def differentiable(op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
     """Runs ``op(run, *tensors)`` and, where a tensor wants gradients, lets autograd go back through it.
 
     Args:

@@ -51,7 +51,7 @@ class Report:
         made = f"made {moment} by warpgs {importlib.metadata.version('warpgs')}"
         out = self.out or (self.run_folders[0] if len(records) == 1 else Path()) / "report.html"
         write_text(out, page(records, [gallery for gallery in galleries if gallery.worst], made))
-        print(f"{out}: {out.stat().st_size / 2**20:.1f} MiB")
+        print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
     def _gallery(self, records: Sequence[Record], group: Sequence[int]) -> Gallery:
         """Worst and best views of runs that share a capture."""

@@ -78,7 +78,7 @@ def in_words(name: str, value: Any) -> str:
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
     if name == "peak_bytes":
-        return f"{value / 2**30:.2f} GiB"
+        return f"{value / 1e9:.2f} GB"
     if isinstance(value, int):
         return f"{value:,}"
     digits = 2 if "psnr" in name else 1 if name == "fps" else 5 if name == "flicker" else 4
