@@ -88,9 +88,14 @@ def make_composite_bwd(
             lengths = branch_lengths[corner[0]]
             walked = corner[3]
         # Absolute values are those of each image's pixels, so that there each image is gone back alone.
-        is_mixed = wp.static(absolute) or (lengths[0] > 0 and lengths[1] > 0)
-        if (walked > 0 and not is_mixed) or (is_mixed and (arrived >> walked) % 2 == 0):
-            return  # the joint image's lane group goes this one's way, or nothing has arrived at this image
+        is_alone = wp.static(absolute) or (lengths[0] > 0 and lengths[1] > 0)
+        if walked > 0 and not is_alone:
+            return  # the joint image's lane group goes this one's way
+        gone_back = 1 << walked
+        if not is_alone:
+            gone_back = 1 + 2 * int(lengths[0] > 0) + 4 * int(lengths[1] > 0)
+        if (arrived & gone_back) == 0:
+            return
         isects = tile_list(walked, tile_range, lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
@@ -110,7 +115,7 @@ def make_composite_bwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     # In a tile of one branch its image is the joint one, and so their cotangents add up.
-                    for m in range(walked, wp.where(is_mixed, walked + 1, wp.static(images))):
+                    for m in range(walked, wp.where(is_alone, walked + 1, wp.static(images))):
                         if m == 0 or lengths[wp.max(m - 1, 0)] > 0:
                             p = (m * height + y) * width + x
                             T[k] = transmittance[p]

@@ -164,9 +164,9 @@ def make_composite_fwd(
                                     T[k] = t_next
                                     n[k] = position
                                     weight += w
-                if wp.static(statistics):
+                if wp.static(statistics) and walked == 0:
                     weight = lane_sum(weight)
-                    if lane == 0 and weight > 0.0 and walked == 0:
+                    if lane == 0 and weight > 0.0:
                         contributed[g] = wp.uint8(1)
                         wp.atomic_add(weights, g, weight)
             lane_sync()

@@ -8,6 +8,8 @@ The buffers hold ``capacity`` intersections. The true number M is only known on 
 intersections that do not exist have the tile index ``num_tiles`` and sort to the end, and when M > capacity every
 tile looks at all Gaussians in depth order instead, which is slow but draws the same image. M is written to ``demand``
 in host memory, from where the next call sizes its buffers.
+
+For images of one branch alone, ``split_tiles`` makes two lists of each tile's.
 """
 
 import warp as wp
@@ -233,7 +235,7 @@ def split_tiles(
                 gaussians[k] = gaussian_from_isect[base + k * lane_count()]
         for k in range(LOOKS):
             if gaussians[k] >= 0:
-                branches[k] = int(is_dynamic[gaussians[k]])
+                branches[k] = int(is_dynamic[gaussians[k]] != wp.uint8(0))
         for k in range(LOOKS):
             static_ballot = lane_ballot(int(branches[k] == 0))
             dynamic_ballot = lane_ballot(int(branches[k] == 1))

@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import weakref
+from collections import OrderedDict
 
 import pytest
 import torch
@@ -21,8 +22,9 @@ from tests.scenes import (
 from warpgs.config import RenderSettings
 from warpgs.ops import replay
 from warpgs.ops.depth_error import depth_error
-from warpgs.ops.graph import WARM_UPS
+from warpgs.ops.replay import PLAIN_CALLS
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
+from warpgs.ops.tiles import forget_budgets
 from warpgs.render import render
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -34,8 +36,8 @@ SETTINGS = [
 ]
 
 
-def drawn(device, settings, channels=None):
-    splats = as_leaves(make_splats(200, channels=channels).to(device))
+def drawn(device, settings, channels=None, seed=3):
+    splats = as_leaves(make_splats(200, seed, channels).to(device))
     camera = make_camera().to(device)
     behind = torch.linspace(0.1, 0.8, splats.num_channels, device=device)
     result = render(splats, camera, behind, settings)
@@ -113,17 +115,32 @@ def test_a_render_can_be_captured_and_replayed():
 
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth", "all depths"])
-def test_renders_that_repeat_are_replayed(settings):
-    plain = drawn("cuda", dataclasses.replace(settings, replay=False))
-    for _ in range(2 * WARM_UPS):
-        for actual, expected in zip(drawn("cuda", settings), plain, strict=True):
+def test_renders_that_repeat_are_replayed(settings, monkeypatch):
+    monkeypatch.setattr(replay, "_kinds", OrderedDict())
+    for seed in range(2 * PLAIN_CALLS):
+        plain = drawn("cuda", dataclasses.replace(settings, replay=False), seed=seed)
+        for actual, expected in zip(drawn("cuda", settings, seed=seed), plain, strict=True):
             assert relative_error(actual, expected) < 1e-5
-    assert sum(kind.recordings for kind in replay._kinds.known.values()) > 0
+    (kind,) = replay._kinds.values()
+    assert kind.recordings == 1
+
+
+def test_where_nothing_is_in_sight_renders_are_replayed_too():
+    forget_budgets()
+    camera = make_camera(72, 40).to("cuda")
+    for _ in range(2 * PLAIN_CALLS):
+        splats = as_leaves(make_splats(50).to("cuda"))
+        with torch.no_grad():
+            splats.opacities.zero_()
+        image = render(splats, camera, torch.full((3,), 0.5, device="cuda")).joint.image
+        assert (image == 0.5).all()
+        image.sum().backward()
+        assert not splats.means.grad.any()
 
 
 def test_a_recording_keeps_nothing_of_its_caller():
     kept = []
-    for seed in range(2 * WARM_UPS):
+    for seed in range(2 * PLAIN_CALLS):
         splats = as_leaves(make_splats(200, seed=seed).to("cuda"))
         render(splats, make_camera(64, 48).to("cuda")).joint.image.sum().backward()
         kept += [weakref.ref(t) for t in (splats.means, splats.means.grad)]

@@ -6,7 +6,6 @@ import json
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,13 +22,14 @@ from .config import RenderSettings
 from .ops.graph import capture
 from .ops.profiling import KernelTime, profile
 from .ops.projection import record_projection
+from .ops.replay import PLAIN_CALLS
 from .ops.rows import Rows
 from .ops.ssim import ssim
 from .ops.tape import Run
-from .ops.tiles import record_tiles
+from .ops.tiles import forget_budgets, record_tiles
 from .scene.splats import Splats
 
-WARM_UPS = {"cuda": 5, "cpu": 1}
+WARM_UPS = {"cuda": 2 * PLAIN_CALLS, "cpu": 1}
 """Runs before the first that counts; on CPU only compilation is to be kept out, and runs are long."""
 
 VISIBLE_DIFFERENCE = 1e-3
@@ -127,9 +127,8 @@ def bench(options: Bench, scenes: Iterable[Scene]) -> None:
     print_machine(head)
     results, trace = [], []
     for scene in scenes:
-        # How many intersections to expect is learned by each thread for itself: a scene must not inherit another's.
-        with ThreadPoolExecutor(max_workers=1) as thread:
-            result, kernels = thread.submit(measure, options, scene).result()
+        forget_budgets()  # of the scene before
+        result, kernels = measure(options, scene)
         print_result(result)
         results.append(result)
         trace += trace_events(scene.name, kernels, len(results))

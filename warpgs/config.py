@@ -12,15 +12,16 @@ class RenderSettings:
     """What a render computes besides the joint image.
 
     Attributes:
-        branches: Also the images of the static and of the dynamic Gaussians alone, from the same pass.
+        branches: Also the images of the static and of the dynamic Gaussians alone, from the same sorted lists.
         depth: Also depth, as one more channel.
         statistics: Also whether and how much each Gaussian contributed to the joint image.
         absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms, summed over the
             pixels of all images.
         antialias: Opacity compensation for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
-        replay: On CUDA, renders that are alike and small are replayed from CUDA graphs (``ops/replay.py``): the same
-            results in half the time, for the memory of a render or two more.
+        replay: On CUDA, the main thread's renders that are alike and small are replayed from CUDA graphs: the same
+            results with less waiting for Python, for the memory of a few renders. Recording one waits for the GPU, and
+            no other thread may wait for the whole GPU meanwhile (``ops/replay.py``).
     """
 
     branches: bool = False

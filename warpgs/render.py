@@ -102,10 +102,11 @@ def render(
 
     appearance = splats.colors if splats.sh is None else splats.sh
     geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
-    tensors = (*geometry, appearance, background, camera.viewmat, camera.K, branch)
+    tensors = (*geometry, appearance, background, camera.viewmat.detach(), camera.K.detach(), branch)
     kind = (camera.size, C, settings, degree)
     op = _make_op(*kind, splats.sh_stream)
-    if settings.replay and splats.sh_stream is None and len(splats.means) > 0:
+    is_empty = 0 in (len(splats.means), *camera.size)
+    if settings.replay and splats.sh_stream is None and not is_empty:
         radii, *flat = repeated(kind, op, *tensors)
     else:
         radii, *flat = differentiable(op, *tensors)

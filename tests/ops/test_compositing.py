@@ -131,6 +131,23 @@ def test_statistics_are_the_sums_of_the_blend_weights():
     assert torch.equal(result.contributed, weights > 0)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_each_image_alone_can_be_gone_back_from(share, k):
+    inputs = make_inputs()
+    dynamic = inputs[0][:, 0] < share * SIZE[0]  # so that there are tiles of one branch, too
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    image = ours(single, is_dynamic=dynamic).images[k]
+    expected = theirs(double, drawn=(torch.ones(40, dtype=torch.bool), ~dynamic, dynamic)[k])[0]
+    assert error(image, expected) < 2e-6
+    (cotangent,) = random_like([image])
+    pulled([image], [cotangent]).backward()
+    pulled([expected], [cotangent]).backward()
+    for name, a, e in zip(INPUTS, single, double, strict=False):
+        wanted = torch.zeros_like(e) if e.grad is None else e.grad
+        assert error(a.grad, wanted) < 1e-5 * (1 + wanted.abs().max()), name
+
+
 @pytest.mark.parametrize("dynamic", [None, torch.arange(8) < 0, torch.arange(8) < 3, torch.arange(8) < 8])
 def test_absolute_norms_sum_the_lengths_pixel_by_pixel(dynamic):
     size = (20, 17)

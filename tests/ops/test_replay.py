@@ -2,14 +2,16 @@
 
 import dataclasses
 import gc
+from collections import OrderedDict
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+import torch.utils.checkpoint
 
 from tests.scenes import as_leaves, gradients, make_camera, make_splats, pulled, random_like
 from warpgs.config import RenderSettings
-from warpgs.ops import replay, tiles
-from warpgs.ops.graph import WARM_UPS
+from warpgs.ops import replay
 from warpgs.render import render
 
 SETTINGS = [RenderSettings(), RenderSettings(branches=True, depth=True, statistics=True, absgrad=True)]
@@ -29,9 +31,8 @@ def recordings(monkeypatch):
     monkeypatch.setattr(replay, "_stream_and_pool", lambda device: (None, None))
     monkeypatch.setattr(replay, "_stream", lambda device: 0)
     monkeypatch.setattr(replay, "_can_replay", lambda device: True)
-    replay._kinds.__dict__.clear()
-    yield made
-    replay._kinds.__dict__.clear()
+    monkeypatch.setattr(replay, "_kinds", OrderedDict())
+    return made
 
 
 def draw(seed=0, settings=SETTINGS[0]):
@@ -43,7 +44,7 @@ def draw(seed=0, settings=SETTINGS[0]):
 
 
 def warm_up(**options):
-    for _ in range(WARM_UPS):
+    for _ in range(replay.PLAIN_CALLS):
         _, _, images = draw(**options)
         pulled(images, random_like(images)).backward()
 
@@ -63,8 +64,7 @@ def assert_same(actual, expected):
 
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_replayed_renders_are_the_plain_ones(settings, recordings):
-    plain = [everything(draw(seed, settings)) for seed in range(4)]
-    assert WARM_UPS == 3
+    plain = [everything(draw(seed, settings)) for seed in range(replay.PLAIN_CALLS)]
     for _ in range(2):
         for seed, expected in enumerate(plain):
             assert_same(everything(draw(seed, settings)), expected)
@@ -73,7 +73,7 @@ def test_replayed_renders_are_the_plain_ones(settings, recordings):
 
 @pytest.mark.parametrize(("num", "size"), [(0, (40, 30)), (5, (0, 8))])
 def test_empty_renders_too(num, size, recordings):
-    for _ in range(2 * WARM_UPS):
+    for _ in range(2 * replay.PLAIN_CALLS):
         splats = as_leaves(make_splats(num))
         image = render(splats, make_camera(*size), torch.full((3,), 0.5)).joint.image
         assert (image == 0.5).all()
@@ -83,7 +83,7 @@ def test_empty_renders_too(num, size, recordings):
 
 def test_without_gradients_too(recordings):
     with torch.no_grad():
-        plain = [draw(seed)[2] for seed in range(WARM_UPS)]
+        plain = [draw(seed)[2] for seed in range(replay.PLAIN_CALLS)]
         for seed, expected in enumerate(plain):
             assert_same(draw(seed)[2], expected)
     assert len(recordings) == 1
@@ -97,7 +97,7 @@ def test_what_is_in_use_is_not_replayed(recordings):
     values = [everything(d) for d in drawn]
     for images, (_, _, still) in zip(kept, drawn, strict=True):
         assert_same(still, images)
-    replay._kinds.__dict__.clear()
+    replay._kinds.clear()
     for seed, value in enumerate(values):
         assert_same(value, everything(draw(seed)))
 
@@ -138,35 +138,93 @@ def test_every_image_alone_can_be_gone_back_from(recordings):
                 assert torch.equal(gradients(splats)[name], gradient)
 
 
-def test_inputs_may_change_before_the_way_back(recordings):
-    warm_up()
-    expected = everything(draw())
-    drawn = draw()
+@pytest.mark.parametrize("num_before", [0, replay.PLAIN_CALLS])
+def test_mistakes_are_noticed_as_ever(num_before, recordings):
+    for _ in range(num_before):
+        everything(draw())
+    changed = draw()
     with torch.no_grad():
-        drawn[0].means.add_(1.0)
-    assert_same(everything(drawn), expected)
+        changed[0].means.add_(1.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        everything(changed)
+    twice = draw()
+    everything(twice)
+    with pytest.raises(RuntimeError, match="second time"):
+        everything(twice)
 
 
-def test_more_intersections_than_there_is_room_for_are_learned_anew(recordings, monkeypatch):
+def test_what_is_computed_again_for_the_way_back_may_be_replayed(recordings):
+    for _ in range(2 * replay.PLAIN_CALLS):
+        values = []
+        for again in (False, True):
+            splats = as_leaves(make_splats())
+
+            def image(means, splats=splats):
+                return render(dataclasses.replace(splats, means=means), make_camera()).joint.image
+
+            if again:
+                drawn = torch.utils.checkpoint.checkpoint(image, splats.means, use_reentrant=False)
+            else:
+                drawn = image(splats.means)
+            drawn.square().sum().backward()
+            values.append(splats.means.grad)
+        assert torch.equal(*values)
+
+
+def test_the_camera_has_no_gradient(recordings):
+    for _ in range(2 * replay.PLAIN_CALLS):
+        camera = make_camera()
+        camera.viewmat.requires_grad_()
+        assert not render(make_splats(), camera).joint.image.requires_grad
+        splats = as_leaves(make_splats())
+        render(splats, camera).joint.image.sum().backward()
+        assert camera.viewmat.grad is None
+
+
+def test_a_recording_that_does_not_fit_any_more_is_dropped(recordings, monkeypatch):
     warm_up()
     everything(draw())
-    assert len(recordings) == 1
-    budget = tiles._budget(torch.device("cpu"), *make_camera().size)
-    budget.demand.fill_(10**6)
-    warm_up()
-    assert len(recordings) == 1
+    monkeypatch.setattr(replay.Recording, "is_valid", lambda self: False)
     everything(draw())
+    (kind,) = replay._kinds.values()
+    assert (kind.recordings, kind.calls) == (0, 1)
+    warm_up()
     assert len(recordings) == 2
 
 
-def test_other_shapes_settings_and_threads_have_recordings_of_their_own(recordings):
+def test_other_shapes_and_settings_have_recordings_of_their_own(recordings):
     warm_up()
     everything(draw())
     everything(draw(settings=RenderSettings(antialias=True)))
+    render(as_leaves(make_splats(59)), make_camera(), torch.linspace(0.1, 0.8, 3))
+    render(as_leaves(make_splats(60)), make_camera(32, 24), torch.linspace(0.1, 0.8, 3))
+    render(as_leaves(make_splats(60)), make_camera())
     with torch.no_grad():
         draw()
     assert len(recordings) == 1
-    assert len(replay._kinds.known) == 3
+    assert len(replay._kinds) == 6
+
+
+def test_so_many_recordings_are_kept_and_no_more(recordings):
+    for num in range(20, 20 + 2 * replay.MOST_RECORDINGS):
+        for _ in range(replay.PLAIN_CALLS + 2):
+            splats = as_leaves(make_splats(num))
+            render(splats, make_camera()).joint.image.sum().backward()
+        kept = [len(kind.idle) for kind in replay._kinds.values()]
+        assert sum(kept) == sum(kind.recordings for kind in replay._kinds.values()) <= replay.MOST_RECORDINGS
+        assert kept[-1] == 1
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU to ask")
+def test_only_the_main_thread_outside_of_inference_mode_replays(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: False)
+    cuda = torch.device("cuda")
+    assert replay._can_replay(cuda)
+    assert not replay._can_replay(torch.device("cpu"))
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        assert not thread.submit(replay._can_replay, cuda).result()
+    with torch.inference_mode():
+        assert not replay._can_replay(cuda)
 
 
 def test_large_work_is_not_replayed(recordings, monkeypatch):
@@ -179,11 +237,11 @@ def test_large_work_is_not_replayed(recordings, monkeypatch):
 def test_only_so_many_kinds_of_calls_are_remembered(recordings):
     for width in range(1, replay.MOST_KINDS + 10):
         render(make_splats(3), make_camera(width, 8))
-    assert len(replay._kinds.known) == replay.MOST_KINDS
+    assert len(replay._kinds) == replay.MOST_KINDS
 
 
 def test_replaying_can_be_switched_off(recordings):
     for _ in range(2):
         warm_up(settings=RenderSettings(replay=False))
     assert not recordings
-    assert not replay._kinds.__dict__
+    assert not replay._kinds

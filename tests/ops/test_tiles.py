@@ -9,6 +9,7 @@ from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
 from warpgs.ops.rows import Rows
 from warpgs.ops.tape import Run
+from warpgs.render import render
 
 NUM = 120
 ALPHA_MIN = 1 / 255
@@ -148,21 +149,22 @@ def too_small(monkeypatch):
     monkeypatch.setattr(tiles, "_budget", budget)
 
 
-def drawn_with_gradients():
+def drawn_with_gradients(is_dynamic):
     splats = projected()
     leaves = [t.clone().requires_grad_() for t in splats[:4]]
     colors = torch.rand(NUM, 3, generator=torch.Generator().manual_seed(5)).requires_grad_()
-    image = composite(Projection(*leaves, splats.radii), colors, (WIDTH, HEIGHT)).images[0]
-    image.square().sum().backward()
-    return [image.detach(), *(t.grad for t in (leaves[0], leaves[1], leaves[3], colors))]
+    images = composite(Projection(*leaves, splats.radii), colors, (WIDTH, HEIGHT), is_dynamic=is_dynamic).images
+    sum(image.square().sum() for image in images).backward()
+    return [*(image.detach() for image in images), *(t.grad for t in (leaves[0], leaves[1], leaves[3], colors))]
 
 
-def test_the_slow_way_of_full_buffers_draws_the_same(request):
+@pytest.mark.parametrize("is_dynamic", [None, torch.arange(NUM) % 3 == 0])
+def test_the_slow_way_of_full_buffers_draws_the_same(is_dynamic, request):
     _, demand = binned(projected())
     assert demand > NUM
-    expected = drawn_with_gradients()
+    expected = drawn_with_gradients(is_dynamic)
     request.getfixturevalue("too_small")
-    actual = drawn_with_gradients()
+    actual = drawn_with_gradients(is_dynamic)
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)
 
@@ -183,6 +185,27 @@ def test_the_next_budget_covers_what_was_needed_and_little_more():
         wanted = max(demand * tiles.HEADROOM, 3_000)
         assert capacity >= wanted
         assert demand == 40 or capacity <= 1.13 * wanted
+
+
+def test_a_budget_knows_whether_buffers_fit():
+    budget = tiles._Budget(torch.device("cpu"))
+    assert budget.most is None
+    assert budget.capacity(3_000) < 4_000
+    assert budget.most == 0.0  # nothing was in sight, but a frame has been
+    budget.demand.fill_(100_000)
+    capacity = budget.capacity(3_000)
+    assert budget.fits(capacity, 3_000)
+    assert budget.fits(100_000, 3_000)
+    assert not budget.fits(99_999, 3_000)
+    assert not budget.fits(3 * capacity, 3_000)
+
+
+def test_what_is_learned_in_inference_mode_serves_outside_of_it():
+    tiles.forget_budgets()
+    splats = make_splats()
+    with torch.inference_mode():
+        inside = render(splats, make_camera()).joint.image
+    assert torch.equal(render(splats, make_camera()).joint.image, inside)
 
 
 def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():

@@ -13,11 +13,12 @@ from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
 
+from .commands import PerShard
 from .contracts import check_image_size, check_same_device, check_tensor
 from .layers import NUM_BRANCH_IMAGES, Layers, gather_adjoints
 from .projection import Projection
 from .rows import Rows
-from .tape import PerShard, Run, differentiable
+from .tape import Run, differentiable
 from .tiles import Tiles, record_split_tiles, record_tiles
 
 CUDA_PIXELS = (1, 2)
@@ -80,7 +81,7 @@ def _launch(
     tiles: Tiles,
     *arguments: Any,
 ) -> None:
-    """Launches a compositing kernel over all blocks of pixels."""
+    """Launches a compositing kernel over all blocks of pixels in all images."""
     lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
     pixels = CPU_PIXELS
     if run.is_cuda:

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from .streams import PRIORITY, join_captured, side_stream
+from .streams import PRIORITY, WARP_STREAM, join_captured, side_stream
 
 WARM_UPS = 3
 """Runs before the capture: they compile kernels, allocate scratch memory and learn how many intersections to expect."""
@@ -64,11 +64,17 @@ def record(
             allocation.
     """
     stream = stream or torch.cuda.Stream(priority=PRIORITY)
+    graph = torch.cuda.CUDAGraph()
+    with WARP_STREAM:  # one capture at a time: nobody may wait for the whole GPU while there is one
+        torch.cuda.synchronize()
+        _record(work, graph, stream, pool)
+    return graph.replay
+
+
+def _record(work: Callable[[], None], graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) -> None:
     warp_stream = wp.stream_from_torch(stream)
     with torch.cuda.stream(stream):
         side_stream(stream.device)  # to be there before the capture: nothing is made in one
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
     current = torch.cuda.current_stream()
     try:
         # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
@@ -84,4 +90,3 @@ def record(
                 raise
     finally:
         torch.cuda.set_stream(current)  # torch leaves its own behind where the end of a capture fails
-    return graph.replay

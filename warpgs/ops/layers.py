@@ -31,7 +31,7 @@ def gather_adjoints(
     run: Run, layers: Layers, alpha: Tensor, depth: Tensor | None
 ) -> tuple[Tensor | None, Tensor | None, int]:
     """What has arrived at layers, in one launch for all: gradients of the composites, depth as drawn being their last
-    channel, and of alpha; None where nothing has arrived.
+    channel, and of alpha, None where nothing has arrived; and where something has.
 
     Args:
         alpha, depth: [layers, H, W], what ``layers`` has by the piece.

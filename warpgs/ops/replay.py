@@ -2,8 +2,11 @@
 
 The kernels of a small render take a GPU less time than the host needs to launch them one by one. What has been called a
 few times with inputs of the same shapes is therefore recorded, the way forth and the way back, and from then on takes
-one launch each way. Nobody notices but by the time: inputs are copied to where the recording reads them, outputs and
-gradients are copied out of it, and a recording whose way back may still be gone is not used for another call.
+one launch each way. Results are the same: inputs are copied to where the recording reads them, outputs and gradients
+are copied out of it, and a recording whose way back may still be gone is not used for another call.
+
+To record is to wait for the GPU, and CUDA forbids every thread to wait for the whole of it meanwhile. So only the main
+thread records and replays; other threads call plainly.
 """
 
 import threading
@@ -15,18 +18,25 @@ import torch
 from torch import Tensor
 
 from . import profiling
-from .graph import WARM_UPS, record
+from .graph import record
 from .streams import PRIORITY
 from .tape import Op, Run, differentiable
+
+PLAIN_CALLS = 8
+"""Calls of one kind before one is recorded. They load kernels, find out how many intersections to expect, and show that
+the calls do repeat: recording takes as long as some of them."""
 
 LARGEST = 1 << 25
 """Bytes of inputs and outputs above which nothing is replayed: launching is not what takes time there, copying is."""
 
 MOST_KINDS = 16
-"""Kinds of calls that a thread remembers."""
+"""Kinds of calls that are remembered."""
 
 MOST_RECORDINGS = 4
-"""Of one kind of call: so many renders may wait for their ways back at a time."""
+"""Of all kinds together: so many renders may wait for their ways back at a time."""
+
+MOST_WAYS_BACK = 4
+"""Sets of outputs that cotangents arrive at, of one recording; the way back from others is gone plainly."""
 
 
 class _Buffers:
@@ -44,14 +54,16 @@ class _Buffers:
 
     def fill(self, sources: Sequence[Any]) -> None:
         """Copies tensors of the same shapes into these."""
-        torch._foreach_copy_(self._words_at, [sources[k].view(torch.float32) for k, _ in self._words])
+        if self._words:
+            torch._foreach_copy_(self._words_at, [sources[k].view(torch.float32) for k, _ in self._words])
         for k, target in self._others:
             target.copy_(sources[k])
 
     def copies(self) -> list[Any]:
         """New tensors with what these hold."""
         words = [torch.empty_like(t) for t in self._words_at]
-        torch._foreach_copy_(words, self._words_at)
+        if words:
+            torch._foreach_copy_(words, self._words_at)
         result: list[Any] = [None] * len(self.tensors)
         for (k, dtype), copy in zip(self._words, words, strict=True):
             result[k] = copy.view(dtype)
@@ -111,15 +123,16 @@ class Recording:
     def backward(self, cotangents: Sequence[Tensor | None], filled: Sequence[Tensor]) -> list[Tensor | None]:
         """Gradients of the inputs of the last ``forward``; writes to those of its outputs that ``self.filled`` says."""
         arrived = tuple(c is not None for c in cotangents)
-        if arrived not in self._ways_back:
-            # The first time plainly: it loads kernels, which a capture could not.
-            self._ways_back[arrived] = None
-            gradients = self.go_back(cotangents)
-        else:
-            way = self._ways_back[arrived]
-            if way is None:
-                way = self._ways_back[arrived] = _WayBack(self, cotangents)
+        way = self._ways_back.get(arrived)
+        if way is None and arrived in self._ways_back:
+            way = self._ways_back[arrived] = _WayBack(self, cotangents)
+        if way is not None:
             gradients = way(cotangents)
+        else:
+            # The first time plainly: it loads kernels, which a capture could not.
+            gradients = self.go_back(cotangents)
+            if len(self._ways_back) < MOST_WAYS_BACK:
+                self._ways_back[arrived] = None
         for output, k in zip(filled, self.filled, strict=True):
             output.copy_(self._outputs.tensors[k])
         return gradients
@@ -147,24 +160,6 @@ class Recording:
 def _stream_and_pool(device: torch.device) -> tuple[torch.cuda.Stream, Any]:
     """What all graphs of a recording share, for ``record``."""
     return torch.cuda.Stream(device, priority=PRIORITY), torch.cuda.graph_pool_handle()
-
-
-def _copy(targets: Sequence[Tensor | None], sources: Sequence[Tensor | None]) -> None:
-    """Copies tensors into others, those of floats in one launch."""
-    pairs = [(t, s) for t, s in zip(targets, sources, strict=True) if t is not None and s is not None]
-    floats = [(t, s) for t, s in pairs if t.dtype == torch.float32]
-    with torch.no_grad():
-        if floats:
-            torch._foreach_copy_([t for t, _ in floats], [s for _, s in floats])
-        for target, source in pairs:
-            if target.dtype != torch.float32:
-                target.copy_(source)
-
-
-def _copies(tensors: Sequence[Tensor | None]) -> list[Tensor | None]:
-    copies = [None if t is None else torch.empty_like(t) for t in tensors]
-    _copy(copies, tensors)
-    return copies
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -197,7 +192,7 @@ class _Kind:
 
     def lease(self, op: Op, tensors: Sequence[Tensor | None]) -> _Lease | None:
         """A recording for this call, if there is one or it is time to make one."""
-        if self.calls < WARM_UPS or self.bytes > LARGEST:
+        if self.calls < PLAIN_CALLS or self.bytes > LARGEST:
             return None
         if self.idle:
             recording = self.idle.pop()
@@ -206,25 +201,36 @@ class _Kind:
             self.recordings -= 1
             self.calls = 0
             return None
-        if self.recordings == MOST_RECORDINGS:
+        if not _make_room():
             return None
         lease = _Lease(self, Recording(op, tensors))
         self.recordings += 1
         return lease
 
 
-_kinds = threading.local()
+_kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
+"""By key, the least recently called first."""
 
 
 def _kind(key: Hashable) -> _Kind:
-    """This thread's memory of a kind of call; threads share none, because a recording serves one call at a time."""
-    kinds: OrderedDict[Hashable, _Kind] = _kinds.__dict__.setdefault("known", OrderedDict())
-    if key not in kinds:
-        kinds[key] = _Kind()
-        if len(kinds) > MOST_KINDS:
-            kinds.popitem(last=False)
-    kinds.move_to_end(key)
-    return kinds[key]
+    if key not in _kinds:
+        _kinds[key] = _Kind()
+        if len(_kinds) > MOST_KINDS:
+            _kinds.popitem(last=False)
+    _kinds.move_to_end(key)
+    return _kinds[key]
+
+
+def _make_room() -> bool:
+    """Whether another recording may be made; drops one of the least recent kind that has one to spare."""
+    if sum(kind.recordings for kind in _kinds.values()) < MOST_RECORDINGS:
+        return True
+    for kind in _kinds.values():
+        if kind.idle:
+            kind.idle.pop()
+            kind.recordings -= 1
+            return True
+    return False
 
 
 class _Replayed(torch.autograd.Function):
@@ -232,6 +238,8 @@ class _Replayed(torch.autograd.Function):
     def forward(ctx: Any, lease: _Lease, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.lease = lease
+        # The recording has copies; but where a plain call could not be gone back from, this one cannot either.
+        ctx.save_for_backward(*tensors)
         outputs = lease.recording.forward(tensors)
         ctx.filled = [outputs[k].detach() for k in lease.recording.filled]  # without their graph, which holds this
         ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
@@ -239,6 +247,7 @@ class _Replayed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        _ = ctx.saved_tensors
         with torch.no_grad():
             return None, *ctx.lease.recording.backward(cotangents, ctx.filled)
 
@@ -248,11 +257,17 @@ def _stream(device: torch.device) -> int:
 
 
 def _can_replay(device: torch.device) -> bool:
-    return device.type == "cuda" and not profiling.is_on() and not torch.cuda.is_current_stream_capturing()
+    return (
+        device.type == "cuda"
+        and threading.current_thread() is threading.main_thread()
+        and not profiling.is_on()
+        and not torch.is_inference_mode_enabled()
+        and not torch.cuda.is_current_stream_capturing()
+    )
 
 
 def repeated(key: Hashable, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """As ``differentiable``; on CUDA calls that are alike and not large are replayed from the fourth on.
+    """As ``differentiable``; on CUDA calls that are alike and not large are replayed after a few.
 
     Args:
         key: What ``op`` reads besides its tensors: calls with equal keys do the same with the same inputs.

@@ -12,6 +12,9 @@ PRIORITY = -1
 """Of work that others wait for; 0, the lowest, is that of what runs beside it. Else large matrix products would let
 none of many small kernels in."""
 
+WARP_STREAM = threading.RLock()
+"""Held by who changes Warp's current stream, which is one for all threads, unlike torch's."""
+
 _streams = threading.local()
 
 

@@ -1,17 +1,17 @@
-"""The only bridge between torch and Warp: memory, streams, launches and adjoints.
+"""The only bridge between torch and Warp: memory, streams, launches (``commands``) and adjoints.
 
 An op is a function ``op(run, *tensors, ...) -> tensors``. Through its ``Run`` it allocates (from torch), launches
 kernels on torch's current stream, and records how to go back; ``differentiable`` wraps it into autograd. All ops of one
 ``differentiable`` call share one ``wp.Tape``, so a whole render crosses between torch and Warp once each way.
 """
 
+import contextlib
 import functools
 import os
 import threading
 import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,6 +19,8 @@ import warp as wp
 from torch import Tensor
 
 from . import profiling
+from .commands import command_for
+from .streams import WARP_STREAM
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -32,100 +34,12 @@ SMALLEST_SHARD = 16384
 LITTLE_WORK = 1 / 16
 """What a thread that only moves a few numbers does of a plain thread's work."""
 
-
 Op = Callable[..., tuple[Tensor, ...]]
 """``op(run, *tensors) -> tensors``."""
 
-
-@dataclass(frozen=True)
-class PerShard:
-    """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
-
-    tensor: Tensor
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Launches
-
-
-class _Command:
-    """A recorded launch of one kernel whose arguments are rewritten in place.
-
-    ``wp.launch`` packs and checks every argument anew (22 µs on the host for a typical kernel, more than many kernels
-    take); here an argument that has the shape of last time costs one pointer.
-    """
-
-    def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
-        blank = [None if hasattr(a.type, "ndim") else 0 for a in kernel.adj.args]
-        self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
-        self.dim = 1
-        _bounds, self.first, *self.slots = self.launch.params
-        self.arguments = kernel.adj.args[1:]
-        self.shapes: list[Any] = [None] * len(self.slots)
-
-    def __call__(
-        self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None, shard: int = 0
-    ) -> None:
-        if dim != self.dim:
-            self.launch.set_dim(dim)
-            self.dim = dim
-        self.first.value = first
-        shapes = self.shapes
-        for index, (slot, value) in enumerate(zip(self.slots, arguments, strict=True)):
-            if type(value) is PerShard:
-                value = value.tensor[shard]
-            if isinstance(value, Tensor):
-                slot.data = value.data_ptr()
-                shape = value.shape
-                if shape != shapes[index]:
-                    _describe(self.arguments[index], slot, value)
-                    shapes[index] = shape
-            elif value is not None:
-                slot.value = value
-            elif shapes[index] is not None:
-                slot.data = 0
-                slot.shape[0] = 0
-                shapes[index] = None
-        self.launch.launch(stream)
-
-
-def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
-    """Writes a tensor's shape and strides into a kernel argument, after checking that the kernel may read it so."""
-    dtype, ndim = argument.type.dtype, argument.type.ndim
-    inner = getattr(dtype, "_shape_", ())
-    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    if wp.dtype_to_torch(scalar) != tensor.dtype or tuple(tensor.shape[ndim:]) != tuple(inner):
-        raise TypeError(
-            f"kernel argument {argument.label} is a {ndim}-d array of {dtype.__name__}, "
-            f"got {tuple(tensor.shape)} {tensor.dtype}"
-        )
-    if not tensor.is_contiguous():
-        raise TypeError(f"kernel argument {argument.label} must be contiguous")
-    slot.ndim = ndim
-    strides = tensor.stride()
-    for axis in range(ndim):
-        slot.shape[axis] = tensor.shape[axis]
-        slot.strides[axis] = strides[axis] * tensor.element_size()
-
-
 _CORES = os.cpu_count() or 1
-_commands = threading.local()
 _pool: ThreadPoolExecutor | None = None
 _pool_lock = threading.Lock()
-_load_lock = threading.Lock()
-
-
-def _command(kernel: wp.Kernel, device: torch.device, block_dim: int) -> _Command:
-    """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
-    try:
-        return _commands.cache[kernel, device, block_dim]
-    except AttributeError:
-        _commands.cache = {}
-    except KeyError:
-        pass
-    with _load_lock:  # two threads that compile and load one module at once unload each other's code
-        command = _commands.cache[kernel, device, block_dim] = _Command(kernel, wp.device_from_torch(device), block_dim)
-    return command
 
 
 def _workers() -> ThreadPoolExecutor:
@@ -244,13 +158,13 @@ class Run:
 
     def _launch(self, kernel: wp.Kernel, dim: int, arguments: Sequence[Any], block_dim: int, work: int | float) -> None:
         if self.is_cuda:
-            _command(kernel, self.device, block_dim)(dim, 0, arguments, self.stream)
+            command_for(kernel, self.device, block_dim)(dim, 0, arguments, self.stream)
             return
         shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
         chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
         def run_shard(shard: int) -> None:
-            command = _command(kernel, self.device, 1)
+            command = command_for(kernel, self.device, 1)
             for first in range(shard * chunk, dim, shards * chunk):
                 command(min(chunk, dim - first), first, arguments, None, shard)
 
@@ -278,12 +192,14 @@ class Run:
                 wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
                 return
             # Warp sorts on its own stream. No event is waited for, which a CUDA graph capture would not allow.
-            previous = device.stream
-            device.set_stream(self.stream, sync=False)
-            try:
-                wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
-            finally:
-                device.set_stream(previous, sync=False)
+            # In a capture the lock is held already, by a thread that may be waiting for this one.
+            with contextlib.nullcontext() if torch.cuda.is_current_stream_capturing() else WARP_STREAM:
+                previous = device.stream
+                device.set_stream(self.stream, sync=False)
+                try:
+                    wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
+                finally:
+                    device.set_stream(previous, sync=False)
 
 
 _streams: dict[tuple[int, int], wp.Stream] = {}

@@ -29,7 +29,7 @@ class Tiles(NamedTuple):
     Attributes:
         ranges: [num_tiles, 2] int32 begin and end of each tile's run in ``gaussian_from_isect``.
         gaussian_from_isect: int32, in its first half the Gaussian of each (Gaussian, tile) intersection, by tile, then
-            front to back; longer than the last range's end.
+            front to back; longer than the last range's end. The second half is ``record_split_tiles``'s.
         demand: [1] int64 number of intersections, in host memory; valid once the device has come this far.
     """
 
@@ -52,18 +52,23 @@ class _Budget:
     """
 
     device: torch.device
-    most: float = 0.0
+    most: float | None = None
     demand: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        self.demand = pinned_counter(self.device)
+        with torch.inference_mode(False):  # else nothing outside of that mode could write to it
+            self.demand = pinned_counter(self.device)
 
     def capacity(self, num_gaussians: int) -> int:
         """Buffer size for the next frame, in steps of an eighth so that the allocator sees few sizes."""
-        self.most = max(float(self.demand.item()), self.most * DECAY)
+        self.most = max(float(self.demand.item()), (self.most or 0.0) * DECAY)
         wanted = max(int(self.most * HEADROOM), num_gaussians, 1024)
         step = 1 << max(wanted.bit_length() - 4, 0)
         return -(-wanted // step) * step
+
+    def fits(self, capacity: int, num_gaussians: int) -> bool:
+        """Whether buffers of a size hold what was needed last, and not much more than will be."""
+        return self.demand.item() <= capacity <= 2 * self.capacity(num_gaussians)
 
 
 _budgets = threading.local()
@@ -75,6 +80,11 @@ def _budget(device: torch.device, width: int, height: int) -> _Budget:
     if key not in cache:
         cache[key] = _Budget(device)
     return cache[key]
+
+
+def forget_budgets() -> None:
+    """Forgets what this thread has learned of intersections, for who goes on with another scene of the same size."""
+    _budgets.__dict__.clear()
 
 
 def num_tiles(width: int, height: int) -> tuple[int, int]:
@@ -93,17 +103,17 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
     total = tiles_x * tiles_y
     int32 = torch.int32
     if N == 0 or total == 0:
-        return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), pinned_counter(run.device))
+        return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), torch.zeros(1, dtype=torch.int64))
     run.sort_pairs(splat_rows.depth_keys, gaussian_from_rank, N, DEPTH_BITS)
     end_of_rank = run.empty(N, dtype=torch.int64)
     run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, end_of_rank)
     torch.cumsum(end_of_rank, 0, out=end_of_rank)
 
     budget = _budget(run.device, *size)
-    if budget.most == 0.0 or not run.is_cuda:
+    if budget.most is None or not run.is_cuda:
         budget.demand.copy_(end_of_rank[-1:])
     capacity = budget.capacity(N) if run.is_cuda else max(int(budget.demand.item()), N)
-    run.conditions.append(lambda: int(budget.demand.item()) <= capacity)
+    run.conditions.append(lambda: budget.fits(capacity, N))
     tile_from_isect, gaussian_from_isect = run.empty(2 * capacity, dtype=int32), run.empty(2 * capacity, dtype=int32)
     run.launch(
         kernels.emit_isects,

@@ -1,0 +1,94 @@
+"""Recorded launches: kernels whose arguments are tensors, started at little cost to the host."""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class PerShard:
+    """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
+
+    tensor: Tensor
+
+
+class Command:
+    """A recorded launch of one kernel whose arguments are rewritten in place.
+
+    ``wp.launch`` packs and checks every argument anew (22 µs on the host for a typical kernel, more than many kernels
+    take); here an argument that has the shape of last time costs one pointer.
+    """
+
+    def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
+        blank = [None if hasattr(a.type, "ndim") else 0 for a in kernel.adj.args]
+        self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
+        self.dim = 1
+        _bounds, self.first, *self.slots = self.launch.params
+        self.arguments = kernel.adj.args[1:]
+        self.shapes: list[Any] = [None] * len(self.slots)
+
+    def __call__(
+        self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None, shard: int = 0
+    ) -> None:
+        if dim != self.dim:
+            self.launch.set_dim(dim)
+            self.dim = dim
+        self.first.value = first
+        shapes = self.shapes
+        for index, (slot, value) in enumerate(zip(self.slots, arguments, strict=True)):
+            if type(value) is PerShard:
+                value = value.tensor[shard]
+            if isinstance(value, Tensor):
+                slot.data = value.data_ptr()
+                shape = value.shape
+                if shape != shapes[index]:
+                    _describe(self.arguments[index], slot, value)
+                    shapes[index] = shape
+            elif value is not None:
+                slot.value = value
+            elif shapes[index] is not None:
+                slot.data = 0
+                slot.shape[0] = 0
+                shapes[index] = None
+        self.launch.launch(stream)
+
+
+def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
+    """Writes a tensor's shape and strides into a kernel argument, after checking that the kernel may read it so."""
+    dtype, ndim = argument.type.dtype, argument.type.ndim
+    inner = getattr(dtype, "_shape_", ())
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    if wp.dtype_to_torch(scalar) != tensor.dtype or tuple(tensor.shape[ndim:]) != tuple(inner):
+        raise TypeError(
+            f"kernel argument {argument.label} is a {ndim}-d array of {dtype.__name__}, "
+            f"got {tuple(tensor.shape)} {tensor.dtype}"
+        )
+    if not tensor.is_contiguous():
+        raise TypeError(f"kernel argument {argument.label} must be contiguous")
+    slot.ndim = ndim
+    strides = tensor.stride()
+    for axis in range(ndim):
+        slot.shape[axis] = tensor.shape[axis]
+        slot.strides[axis] = strides[axis] * tensor.element_size()
+
+
+_commands = threading.local()
+_load_lock = threading.Lock()
+
+
+def command_for(kernel: wp.Kernel, device: torch.device, block_dim: int) -> Command:
+    """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
+    try:
+        return _commands.cache[kernel, device, block_dim]
+    except AttributeError:
+        _commands.cache = {}
+    except KeyError:
+        pass
+    with _load_lock:  # two threads that compile and load one module at once unload each other's code
+        made = _commands.cache[kernel, device, block_dim] = Command(kernel, wp.device_from_torch(device), block_dim)
+    return made
