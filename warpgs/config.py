@@ -197,7 +197,7 @@ class TrainConfig:
     vdp: bool = True
     """Visibility-driven pruning."""
     app: bool = True
-    """Appearance network of the static Gaussians, in stage II."""
+    """Appearance network of the static Gaussians, from ``schedule.relight_from`` on."""
     stage2: bool = True
     """Joint optimisation; without it, stage I takes its iterations too."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
