@@ -63,6 +63,11 @@ def test_what_is_saved_is_read_back_bit_for_bit(path):
     assert loaded.facts == FACTS
 
 
+def test_who_may_read_other_files_may_read_a_checkpoint(path, tmp_path):
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_a_scene_is_read_back_bit_for_bit(tmp_path):
     saved = scene()
     checkpoint.save(tmp_path / "a.safetensors", tensors_of(saved), FACTS)

@@ -96,10 +96,13 @@ def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": "warpgs", "version": str(VERSION), "facts": json.dumps(facts)}
     with beside(path) as partial:
+        partial.touch()
+        mode = partial.stat().st_mode
         try:
             save_file(plain, partial, metadata=metadata)
         except SafetensorError as error:
             raise OSError(str(error)) from error
+        partial.chmod(mode)  # safetensors lets nobody but the owner read it, unlike all else in a run
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
 
