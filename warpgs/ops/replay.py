@@ -9,6 +9,7 @@ To record is to wait for the GPU, and CUDA forbids every thread to wait for the 
 thread records and replays; other threads call plainly.
 """
 
+import atexit
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
@@ -210,6 +211,8 @@ class _Kind:
 
 _kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
 """By key, the least recently called first."""
+
+atexit.register(_kinds.clear)  # graphs go before CUDA does
 
 
 def _kind(key: Hashable) -> _Kind:
