@@ -44,6 +44,7 @@ class Logbook:
         self._total = num_iterations
         self._bar: Progress | None = None
         self._task: TaskID | None = None
+        self._first = first_iteration
         self._last = (first_iteration, time.monotonic())
         self._last_line = 0.0
         if sys.stdout.isatty():
@@ -86,8 +87,10 @@ class Logbook:
             self._bar.update(self._task, completed=status.iteration, description=status.stage, facts=facts)
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
-            left = (self._total - status.iteration) / max(rate, 1e-9)
-            self.say(f"{status.iteration}/{self._total} {status.stage}  {facts}  {left:.0f} s left")
+            left = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
+            if before == self._first:
+                left = ""  # kernels were compiled until now, which does not go on
+            self.say(f"{status.iteration}/{self._total} {status.stage}  {facts}{left}")
         self._write(status, rate)
 
     def _write(self, status: Status, rate: float) -> None:
