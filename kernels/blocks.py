@@ -53,6 +53,15 @@ def block_corner(group: int, images: int, width: int, block_width: int, block_he
 
 
 @wp.func
+def tile_lengths(tile: int, images: int, branch_lengths: wp.array[wp.vec2i]) -> wp.vec2i:
+    """How many static and dynamic Gaussians a tile has; zeros with one image, for which nobody counted them."""
+    lengths = wp.vec2i(0, 0)
+    if images > 1:
+        lengths = branch_lengths[tile]
+    return lengths
+
+
+@wp.func
 def tile_list(image: int, tile_range: wp.vec2i, lengths: wp.vec2i, half: int) -> wp.vec3i:
     """A tile's list of Gaussians in one image: where it begins, which way it runs, and its length (``split_tiles``)."""
     if image == 1:

@@ -20,7 +20,16 @@ import functools
 
 import warp as wp
 
-from .blocks import Counter, block_box, block_corner, module_options, stage_survivors, state_types, tile_list
+from .blocks import (
+    Counter,
+    block_box,
+    block_corner,
+    module_options,
+    stage_survivors,
+    state_types,
+    tile_lengths,
+    tile_list,
+)
 from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
@@ -87,16 +96,12 @@ def make_composite_fwd(
         corner = block_corner(thread / lane_count(), wp.static(images), width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        tile_range = tile_ranges[corner[0]]
-        lengths = wp.vec2i(0, 0)
-        walked = int(0)  # the image
-        if wp.static(images == 3):
-            lengths = branch_lengths[corner[0]]
-            walked = corner[3]
+        walked = corner[3]  # the image
+        lengths = tile_lengths(corner[0], wp.static(images), branch_lengths)
         is_mixed = lengths[0] > 0 and lengths[1] > 0
         if walked > 0 and not is_mixed:
             return  # the joint image's lane group writes this one
-        isects = tile_list(walked, tile_range, lengths, half)
+        isects = tile_list(walked, tile_ranges[corner[0]], lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()

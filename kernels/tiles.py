@@ -30,6 +30,8 @@ MANY_TILES = wp.constant(24)
 LOOKS = wp.constant(4)
 """Intersections that a lane looks at in one go when tiles are split: they are on their way together."""
 
+Looks = wp.types.vector(length=LOOKS, dtype=int)
+
 
 @wp.func
 def tile_index(position: float, num_tiles: int) -> int:
@@ -228,8 +230,8 @@ def split_tiles(
     num_dynamic = int(0)
     base = begin + lane
     while base - lane < end:
-        gaussians = wp.vec4i(-1)
-        branches = wp.vec4i(-1)
+        gaussians = Looks(-1)
+        branches = Looks(-1)
         for k in range(LOOKS):
             if base + k * lane_count() < end:
                 gaussians[k] = gaussian_from_isect[base + k * lane_count()]

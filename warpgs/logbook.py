@@ -87,9 +87,9 @@ class Logbook:
             self._bar.update(self._task, completed=status.iteration, description=status.stage, facts=facts)
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
-            left = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
-            if before == self._first:
-                left = ""  # kernels were compiled until now, which does not go on
+            left = ""
+            if before > self._first:  # else kernels were compiled until now, which does not go on
+                left = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
             self.say(f"{status.iteration}/{self._total} {status.stage}  {facts}{left}")
         self._write(status, rate)
 

@@ -97,14 +97,15 @@ class Recording:
     Args:
         op: As for ``differentiable``; what it reads besides its tensors must never change.
         tensors: Inputs like those that are to come.
+        wants: Whether gradients will be asked for, of the tensors that want them.
 
     Attributes:
         filled: Indices of the outputs that the way back writes to.
     """
 
-    def __init__(self, op: Op, tensors: Sequence[Tensor | None]) -> None:
+    def __init__(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> None:
         self._inputs = _Buffers(
-            [None if t is None else t.detach().clone().requires_grad_(t.requires_grad) for t in tensors]
+            [None if t is None else t.detach().clone().requires_grad_(wants and t.requires_grad) for t in tensors]
         )
         self._device = next(t.device for t in tensors if t is not None)
         self._stream_and_pool = _stream_and_pool(self._device)
@@ -191,7 +192,7 @@ class _Kind:
         self.calls = self.bytes = self.recordings = 0
         self.idle: list[Recording] = []
 
-    def lease(self, op: Op, tensors: Sequence[Tensor | None]) -> _Lease | None:
+    def lease(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> _Lease | None:
         """A recording for this call, if there is one or it is time to make one."""
         if self.calls < PLAIN_CALLS or self.bytes > LARGEST:
             return None
@@ -204,7 +205,7 @@ class _Kind:
             return None
         if not _make_room():
             return None
-        lease = _Lease(self, Recording(op, tensors))
+        lease = _Lease(self, Recording(op, tensors, wants))
         self.recordings += 1
         return lease
 
@@ -283,7 +284,7 @@ def repeated(key: Hashable, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ..
     wants = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     shapes = tuple(None if t is None else (t.shape, t.dtype, wants and t.requires_grad) for t in tensors)
     kind = _kind((key, device, _stream(device), shapes))
-    lease = kind.lease(op, tensors if wants else [None if t is None else t.detach() for t in tensors])
+    lease = kind.lease(op, tensors, wants)
     if lease is None:
         outputs = differentiable(op, *tensors)
         kind.calls += 1
