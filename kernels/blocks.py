@@ -37,33 +37,39 @@ def module_options(pixels_per_lane: int) -> dict[str, object]:
 
 
 @wp.func
-def block_corner(group: int, images: int, width: int, block_width: int, block_height: int) -> wp.vec4i:
-    """Tile index, left, top [px] and image of a lane group's block.
-
-    The blocks of a tile in one image follow each other, then come those of its next image.
-    """
+def block_corner(block: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
+    """Tile index, left and top [px] of an image's block; the blocks of a tile follow each other."""
     blocks_x = TILE_SIZE / block_width
     blocks = blocks_x * (TILE_SIZE / block_height)
-    tile = group / blocks / images
-    block = group % blocks
+    tile = block / blocks
     tiles_x = (width + TILE_SIZE - 1) / TILE_SIZE
-    left = (tile % tiles_x) * TILE_SIZE + (block % blocks_x) * block_width
-    top = (tile / tiles_x) * TILE_SIZE + (block / blocks_x) * block_height
-    return wp.vec4i(tile, left, top, group / blocks % images)
+    left = (tile % tiles_x) * TILE_SIZE + (block % blocks % blocks_x) * block_width
+    top = (tile / tiles_x) * TILE_SIZE + (block % blocks / blocks_x) * block_height
+    return wp.vec3i(tile, left, top)
 
 
 @wp.func
-def tile_lengths(tile: int, images: int, branch_lengths: wp.array[wp.vec2i]) -> wp.vec2i:
-    """How many static and dynamic Gaussians a tile has; zeros with one image, for which nobody counted them."""
-    lengths = wp.vec2i(0, 0)
-    if images > 1:
-        lengths = branch_lengths[tile]
-    return lengths
+def is_joint(image: int, looked: int) -> bool:
+    """Whether a branch's image of a block is the joint image, bit for bit.
+
+    It is where the joint image, before all of its pixels were opaque, looked at that branch's Gaussians alone.
+
+    Args:
+        image: 1 static, 2 dynamic.
+        looked: Bit m is set where the joint image looked at a Gaussian of image m, bit 0 once it is finished.
+    """
+    return looked == 1 or looked == 1 + (1 << image)
 
 
 @wp.func
-def tile_list(image: int, tile_range: wp.vec2i, lengths: wp.vec2i, half: int) -> wp.vec3i:
+def tile_list(
+    image: int, tile: int, tile_ranges: wp.array[wp.vec2i], branch_lengths: wp.array[wp.vec2i], half: int
+) -> wp.vec3i:
     """A tile's list of Gaussians in one image: where it begins, which way it runs, and its length (``split_tiles``)."""
+    tile_range = tile_ranges[tile]
+    lengths = wp.vec2i(0, 0)
+    if image > 0:
+        lengths = branch_lengths[tile]
     if image == 1:
         return wp.vec3i(half + tile_range[0], 1, lengths[0])
     if image == 2:
@@ -72,7 +78,7 @@ def tile_list(image: int, tile_range: wp.vec2i, lengths: wp.vec2i, half: int) ->
 
 
 @wp.func
-def block_box(corner: wp.vec4i, block_width: int, block_height: int, width: int, height: int) -> wp.vec4:
+def block_box(corner: wp.vec3i, block_width: int, block_height: int, width: int, height: int) -> wp.vec4:
     """Left, top, right, bottom of the outermost pixel centres of a block inside the image."""
     return wp.vec4(
         float(corner[1]) + 0.5,

@@ -14,8 +14,8 @@ import functools
 
 import warp as wp
 
-from .blocks import block_box, block_corner, module_options, stage_survivors, state_types, tile_lengths, tile_list
-from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN
+from .blocks import block_box, block_corner, is_joint, module_options, stage_survivors, state_types, tile_list
+from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -35,6 +35,19 @@ from .lanes import (
 from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 
 
+@wp.func_native(
+    """
+    const float* values = image == 0 ? joint.data : image == 1 ? of_static.data : of_dynamic.data;
+    return values ? values[i] : 0.0f;
+    """
+)
+def read_of(
+    image: int, joint: wp.array[float], of_static: wp.array[float], of_dynamic: wp.array[float], i: int
+) -> float:
+    """Element i of what arrived at an image."""
+    ...
+
+
 @functools.cache
 def make_composite_bwd(
     num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absolute: bool
@@ -42,12 +55,16 @@ def make_composite_bwd(
     """Reverse walk, launched like the forward kernel.
 
     Args:
-        num_features, with_depth, images, pixels: As in ``make_composite_fwd``; ``pixels`` may differ from the
-            forward kernel's.
+        num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
         absolute: Whether the absolute-value variant of the means' gradient is gathered too.
 
-    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero. Bit m of ``arrived`` says whether image
-    m has cotangents; where it has none, they are zero.
+    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero. Cotangents arrive image by image, and
+    an array of length 0 is zero everywhere; bit m of ``arrived`` says whether there are any of image m.
+
+    The walk knows depth as one more channel, D = Σ_i alpha_i T_i depth_i. What was made of it is, with A = max(alpha,
+    SMALLEST_ALPHA),
+
+        depth = D / A,      v_D = v_depth / A,      v_alpha += -v_depth D / A²  where alpha is not below SMALLEST_ALPHA.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
@@ -67,10 +84,19 @@ def make_composite_bwd(
         background_stride: int,
         width: int,
         height: int,
+        depth: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
-        v_image: wp.array2d[float],
-        v_alpha_image: wp.array[float],
+        looked: wp.array[int],
+        v_image_joint: wp.array[float],
+        v_image_static: wp.array[float],
+        v_image_dynamic: wp.array[float],
+        v_alpha_joint: wp.array[float],
+        v_alpha_static: wp.array[float],
+        v_alpha_dynamic: wp.array[float],
+        v_depth_joint: wp.array[float],
+        v_depth_static: wp.array[float],
+        v_depth_dynamic: wp.array[float],
         arrived: int,
         gradients: wp.array2d[float],
     ):
@@ -78,21 +104,29 @@ def make_composite_bwd(
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        corner = block_corner(thread / lane_count(), wp.static(images), width, block_width, block_height)
+        num_blocks = tile_ranges.shape[0] * (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
+        walked = thread / lane_count() / num_blocks  # the image
+        block = thread / lane_count() % num_blocks
+        corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        walked = corner[3]  # the image
-        lengths = tile_lengths(corner[0], wp.static(images), branch_lengths)
-        # Absolute values are those of each image's pixels, so that there each image is gone back alone.
-        is_alone = wp.static(absolute) or (lengths[0] > 0 and lengths[1] > 0)
-        if walked > 0 and not is_alone:
-            return  # the joint image's lane group goes this one's way
+        source = walked  # the image whose list is gone back along
         gone_back = 1 << walked
-        if not is_alone:
-            gone_back = 1 + 2 * int(lengths[0] > 0) + 4 * int(lengths[1] > 0)
+        if wp.static(images > 1):
+            for m in range(1, wp.static(images)):
+                if is_joint(m, looked[block]):
+                    # One way back serves both, as their cotangents add up. Absolute values do not: those are of each
+                    # image's pixels, so that there each image is gone back alone.
+                    if wp.static(not absolute):
+                        if walked == 0:
+                            gone_back = gone_back | (1 << m)
+                        if walked == m:
+                            return
+                    elif walked == m:
+                        source = 0
         if (arrived & gone_back) == 0:
             return
-        isects = tile_list(walked, tile_ranges[corner[0]], lengths, half)
+        isects = tile_list(source, corner[0], tile_ranges, branch_lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -110,21 +144,31 @@ def make_composite_bwd(
                 y = pixel_y + j * lane_rows()
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
-                    # In a tile of one branch its image is the joint one, and so their cotangents add up.
-                    for m in range(walked, wp.where(is_alone, walked + 1, wp.static(images))):
-                        if m == 0 or lengths[wp.max(m - 1, 0)] > 0:
-                            p = (m * height + y) * width + x
-                            T[k] = transmittance[p]
-                            n[k] = last[p]
-                            n_max = wp.max(n_max, n[k])
-                            behind = float(0.0)
-                            if v_alpha_image.shape[0] > 0:
-                                behind = -v_alpha_image[p]
-                            for c in range(wp.static(C)):
-                                v = v_image[p, c]
+                    pixel = y * width + x
+                    T[k] = transmittance[source * height * width + pixel]
+                    n[k] = last[source * height * width + pixel]
+                    n_max = wp.max(n_max, n[k])
+                    for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
+                        if (arrived & gone_back & (1 << m)) != 0:
+                            behind = -read_of(m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel)
+                            for c in range(wp.static(num_features)):
+                                v = read_of(
+                                    m,
+                                    v_image_joint,
+                                    v_image_static,
+                                    v_image_dynamic,
+                                    pixel * wp.static(num_features) + c,
+                                )
                                 v_color[k * wp.static(C) + c] += v
-                                if background.shape[0] > 0 and c < wp.static(num_features):
+                                if background.shape[0] > 0:
                                     behind += background[m * background_stride + c] * v
+                            if wp.static(with_depth):
+                                a = 1.0 - T[k]
+                                v_depth = read_of(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel)
+                                v_drawn = v_depth / wp.max(a, SMALLEST_ALPHA)
+                                v_color[k * wp.static(C) + wp.static(num_features)] += v_drawn
+                                if a >= SMALLEST_ALPHA:
+                                    behind += v_drawn * depth[m * height * width + pixel]
                             R[k] += T[k] * behind
         n_max = lane_max(n_max)  # from here on the lane group's
 

@@ -8,10 +8,12 @@ Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
 
 Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, SMALLEST_ALPHA).
 
-Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one launch. In a tile that holds
-both branches, each image has lane groups of its own, which walk a list of their own: state for one image leaves room
-for more groups on a multiprocessor, and no group passes over what is not its image's. A tile whose Gaussians all belong
-to one branch needs one walk: that branch's image is the joint one and the other is background.
+Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one launch. Each image has lane
+groups of its own, which walk a list of their own: state for one image leaves room for more groups on a multiprocessor,
+and no group passes over what is not its image's. Where the joint image of a block needed one branch's Gaussians alone,
+that branch's image is the same, and the joint image's group writes both. The joint image's groups come first in the
+launch, so that most of a branch's find in ``looked`` that there is nothing left to do. Who comes too early to find it
+draws the same bits again.
 
 A transmittance is kept negative once its pixel is done.
 """
@@ -24,13 +26,13 @@ from .blocks import (
     Counter,
     block_box,
     block_corner,
+    is_joint,
     module_options,
     stage_survivors,
     state_types,
-    tile_lengths,
     tile_list,
 )
-from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TILE_SIZE, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -38,6 +40,7 @@ from .lanes import (
     lane_bit_count,
     lane_columns,
     lane_count,
+    lane_or,
     lane_rows,
     lane_sum,
     lane_sync,
@@ -58,11 +61,12 @@ def make_composite_fwd(
     Args:
         num_features: Channels of an image, at least 1.
         with_depth: Whether Gaussians have their depth as one more channel.
-        images: 1 or 3, see above; ``branch_lengths`` and ``half`` are only read for 3.
+        images: 1 or 3, see above; ``branch_lengths``, ``half``, ``is_dynamic`` and ``looked`` are only used for 3.
         pixels: Columns and rows of pixels that a lane owns.
         statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
 
     The kernel's ``background`` has ``num_features`` values, those of the next image ``background_stride`` further on.
+    ``looked`` has one value for each block of an image, zero at first; see ``is_joint``.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
@@ -76,6 +80,7 @@ def make_composite_fwd(
         branch_lengths: wp.array[wp.vec2i],
         gaussian_from_isect: wp.array[int],
         half: int,
+        is_dynamic: wp.array[wp.uint8],
         rows: wp.array2d[wp.vec4],
         background: wp.array[float],
         background_stride: int,
@@ -86,6 +91,7 @@ def make_composite_fwd(
         alpha_image: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
+        looked: wp.array[int],
         contributed: wp.array[wp.uint8],
         weights: wp.array[float],
     ):
@@ -93,15 +99,17 @@ def make_composite_fwd(
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        corner = block_corner(thread / lane_count(), wp.static(images), width, block_width, block_height)
+        num_blocks = tile_ranges.shape[0] * (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
+        walked = thread / lane_count() / num_blocks  # the image
+        block = thread / lane_count() % num_blocks
+        corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        walked = corner[3]  # the image
-        lengths = tile_lengths(corner[0], wp.static(images), branch_lengths)
-        is_mixed = lengths[0] > 0 and lengths[1] > 0
-        if walked > 0 and not is_mixed:
-            return  # the joint image's lane group writes this one
-        isects = tile_list(walked, tile_ranges[corner[0]], lengths, half)
+        if wp.static(images > 1):
+            # Of a tile without Gaussians of the other branch that is known beforehand.
+            if walked > 0 and (is_joint(walked, looked[block]) or branch_lengths[corner[0]][2 - walked] == 0):
+                return  # the joint image's lane group writes this one
+        isects = tile_list(walked, corner[0], tile_ranges, branch_lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -112,6 +120,7 @@ def make_composite_fwd(
         n = integers()
         color = colors()
         open_pixels = Counter()  # of this lane
+        seen = Counter()  # by this lane, as bits of ``looked``
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 if pixel_x + i * lane_columns() < width and pixel_y + j * lane_rows() < height:
@@ -124,15 +133,22 @@ def make_composite_fwd(
             if lane_any(open_pixels[0]) == 0:
                 break
             own_g = int(-1)
+            tag = base + lane + 1
             if base + lane < isects[2]:
                 own_g = gaussian_from_isect[isects[0] + isects[1] * (base + lane)]
-            ballot, own0, own1, own2 = stage_survivors(own_g, base + lane + 1, box, rows, lane, stage)
+                if wp.static(images > 1):
+                    tag = 2 * tag + int(is_dynamic[own_g])
+            ballot, own0, own1, own2 = stage_survivors(own_g, tag, box, rows, lane, stage)
             for slot in range(lane_bit_count(ballot)):
                 row0 = stage_get(stage, slot, 0, own0)
                 row1 = stage_get(stage, slot, 1, own1)
                 quad = stage_get(stage, slot, 2, own2)
                 g = wp.cast(row1[2], wp.int32)
                 position = wp.cast(row1[3], wp.int32)
+                branch = int(0)
+                if wp.static(images > 1):
+                    branch = position & 1
+                    position = position >> 1
                 features = features_vector()
                 for c in range(wp.static(min(C, 4))):
                     features[c] = quad[c]
@@ -158,6 +174,8 @@ def make_composite_fwd(
                             k = j * wp.static(columns) + i
                             t = T[k]
                             if t > 0.0:
+                                if wp.static(images > 1):
+                                    seen[0] = seen[0] | (2 << branch)
                                 t_next = t - alpha * t
                                 if t_next <= TRANSMITTANCE_MIN:
                                     T[k] = -t
@@ -177,28 +195,31 @@ def make_composite_fwd(
             lane_sync()
             base += lane_count()
 
+        finished = int(1)
+        if wp.static(images > 1):
+            finished = 1 | lane_or(seen[0])
+            if walked == 0 and lane == 0:
+                looked[block] = finished
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
                 y = pixel_y + j * lane_rows()
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
-                    for m in range(walked, wp.where(is_mixed, walked + 1, wp.static(images))):
-                        kept = float(1.0)  # 0 for the image of a branch that this tile holds nothing of
-                        if m > 0 and lengths[wp.max(m - 1, 0)] == 0:
-                            kept = 0.0
-                        p = (m * height + y) * width + x
-                        t = 1.0 - kept + kept * wp.abs(T[k])
-                        alpha_image[p] = 1.0 - t
-                        transmittance[p] = t
-                        last[p] = n[k] * int(kept)
-                        for c in range(wp.static(num_features)):
-                            value = kept * color[k * wp.static(C) + c]
-                            if background.shape[0] > 0:
-                                value += t * background[m * background_stride + c]
-                            image[p, c] = value
-                        if wp.static(num_features < C):
-                            drawn = kept * color[k * wp.static(C) + wp.static(num_features)]
-                            depth[p] = drawn / wp.max(1.0 - t, SMALLEST_ALPHA)
+                    t = wp.abs(T[k])
+                    for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
+                        if m == walked or is_joint(m, finished):
+                            p = (m * height + y) * width + x
+                            alpha_image[p] = 1.0 - t
+                            transmittance[p] = t
+                            last[p] = n[k]
+                            for c in range(wp.static(num_features)):
+                                value = color[k * wp.static(C) + c]
+                                if background.shape[0] > 0:
+                                    value += t * background[m * background_stride + c]
+                                image[p, c] = value
+                            if wp.static(num_features < C):
+                                drawn = color[k * wp.static(C) + wp.static(num_features)]
+                                depth[p] = drawn / wp.max(1.0 - t, SMALLEST_ALPHA)
 
     return composite_fwd

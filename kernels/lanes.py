@@ -48,6 +48,10 @@ def lane_any(x: int) -> int: ...
 def lane_max(x: int) -> int: ...
 
 
+@wp.func_native(native("return __reduce_or_sync(0xffffffffu, x);", "return x;"))
+def lane_or(x: int) -> int: ...
+
+
 @wp.func_native(
     native("for (int o = 16; o > 0; o >>= 1) x += __shfl_xor_sync(0xffffffffu, x, o); return x;", "return x;")
 )

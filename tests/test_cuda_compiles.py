@@ -8,7 +8,6 @@ import warp as wp
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
-from warpgs.kernels.layers import make_layers_bwd
 from warpgs.kernels.rows import make_pack_features, make_unpack
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
 from warpgs.ops.compositing import CUDA_PIXELS, CUDA_PIXELS_OF_SMALL
@@ -39,11 +38,6 @@ def test_the_encoding_compiles(half, tmp_path):
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_rows_compile(make, with_depth, tmp_path):
     assert_compiles(make(3, with_depth).module, tmp_path)
-
-
-@pytest.mark.parametrize("with_depth", [False, True])
-def test_layers_compile(with_depth, tmp_path):
-    assert_compiles(make_layers_bwd(3, with_depth).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_ssim_fwd, make_ssim_bwd])

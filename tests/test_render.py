@@ -138,24 +138,41 @@ def test_any_number_of_channels_can_be_drawn(channels):
         assert relative_error(gradient, doubles[name].grad) < 1e-5, name
 
 
-def test_depth_is_the_mean_of_what_was_drawn_with_its_gradient():
-    splats = as_leaves(make_splats())
-    result = render(splats, CAMERA, background(), RenderSettings(depth=True)).joint
+@pytest.mark.parametrize("branches", [False, True])
+@pytest.mark.parametrize("arrives", [lambda k: True, lambda k: k % 2 == 0, lambda k: k % 2 == 1, lambda k: k == 0])
+def test_depth_is_the_mean_of_what_was_drawn_and_gradients_come_from_wherever_something_arrives(branches, arrives):
+    splats = as_leaves(make_splats(channels=3))
+    rendering = render(splats, CAMERA, background(), RenderSettings(depth=True, branches=branches))
+    plain = render(splats, CAMERA, background(), RenderSettings(branches=branches))
+    for actual, wanted in zip(outputs(rendering), outputs(plain), strict=True):
+        assert torch.equal(actual, wanted)
     doubles = as_doubles(splats)
     viewmat = CAMERA.viewmat.double()
     depths = doubles["means"] @ viewmat[2, :3] + viewmat[2, 3]
-    drawn, alpha, _ = reference({**doubles, "colors": depths[:, None]}, CAMERA, torch.zeros(1, dtype=torch.float64))
-    expected = drawn[..., 0] / alpha.clamp_min(1e-6)
-    empty = alpha == 0
-    assert not result.depth[empty].any()
-    assert relative_error(result.depth, expected) < 1e-5
-    plain = render(splats, CAMERA, background()).joint
-    assert torch.equal(result.image, plain.image)
-    weight = random_like([expected])[0] * alpha.detach()  # smooth, where dividing by alpha is not
-    pulled([result.depth], [weight.float()]).backward()
-    pulled([expected], [weight.float()]).backward()
-    for name in GEOMETRY:
-        assert relative_error(gradients(splats)[name], doubles[name].grad) < 1e-5, name
+    colors = torch.cat([doubles["colors"], depths[:, None]], -1)
+    behind = torch.cat([background(), torch.zeros(1)]).double()
+    actual, expected, smooth = [], [], []
+    for mask in (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,):
+        drawn, alpha, _ = reference({**doubles, "colors": colors}, CAMERA, behind, drawn=mask)
+        expected += [drawn[..., :3], alpha, drawn[..., 3] / alpha.clamp_min(1e-6)]
+        smooth += [1.0, 1.0, alpha.detach()]  # depth is not where it is divided by an alpha near 0
+    for layer in (rendering.joint, rendering.static, rendering.dynamic)[: 3 if branches else 1]:
+        assert not layer.depth[layer.alpha == 0].any()
+        actual += [layer.image, layer.alpha, layer.depth]
+    for k, (a, e) in enumerate(zip(actual, expected, strict=True)):
+        assert relative_error(a, e) < (1e-5 if k % 3 == 2 else 2e-6)
+    weights = [(w * s).float() for w, s in zip(random_like(expected), smooth, strict=True)]
+    for values in (actual, expected):
+        torch.autograd.backward(
+            [v for k, v in enumerate(values) if arrives(k)],
+            [w.to(values[k].dtype) for k, w in enumerate(weights) if arrives(k)],
+        )
+    for name in (*GEOMETRY, "colors"):
+        wanted = doubles[name].grad
+        if wanted is None:
+            assert not gradients(splats)[name].any()
+        else:
+            assert relative_error(gradients(splats)[name], wanted) < 1e-5, name
 
 
 @pytest.mark.parametrize("settings", [RenderSettings(absgrad=True), RenderSettings(absgrad=True, branches=True)])

@@ -40,7 +40,7 @@ STAGES = {
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
-    "composite_bwd": ("layers_bwd", "composite_bwd"),
+    "composite_bwd": ("composite_bwd",),
     "unproject": ("unpack", "sh_bwd", "project_bwd"),
     "ssim": ("ssim_fwd", "ssim_bwd"),
 }

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from .cameras import Camera
 from .config import RenderSettings
-from .ops.compositing import Composite, record_composite
+from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
 from .ops.contracts import check_same_device, check_tensor
-from .ops.layers import NUM_BRANCH_IMAGES
 from .ops.projection import record_projection
 from .ops.replay import repeated
 from .ops.rows import Rows

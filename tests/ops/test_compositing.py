@@ -31,6 +31,15 @@ def ours(inputs, size=SIZE, **options):
     return composite(splats, features, size, background=background, **options)
 
 
+def make_walled_inputs(num=40, size=SIZE):
+    """Inputs whose first twelve splats are an opaque wall in front of all others."""
+    inputs = make_inputs(num, size)
+    inputs[1][:12] = torch.tensor([1e-4, 0.0, 1e-4])
+    inputs[2][:12] = 0.8
+    inputs[5][:12] -= 1
+    return inputs
+
+
 def theirs(inputs, size=SIZE, drawn=None):
     means2d, conics, opacities, features, background, depths = inputs
     drawn = torch.ones(means2d.shape[0], dtype=torch.bool) if drawn is None else drawn
@@ -148,10 +157,43 @@ def test_each_image_alone_can_be_gone_back_from(share, k):
         assert error(a.grad, wanted) < 1e-5 * (1 + wanted.abs().max()), name
 
 
-@pytest.mark.parametrize("dynamic", [None, torch.arange(8) < 0, torch.arange(8) < 3, torch.arange(8) < 8])
-def test_absolute_norms_sum_the_lengths_pixel_by_pixel(dynamic):
+@pytest.mark.parametrize("wall_is_dynamic", [False, True])
+def test_behind_a_wall_of_one_branch_the_other_has_an_image_of_its_own(wall_is_dynamic):
+    inputs = make_walled_inputs()
+    dynamic = (torch.arange(40) < 12) == wall_is_dynamic
+    dynamic[20:25] = wall_is_dynamic
+    single, double = leaves(inputs), leaves(inputs, torch.float64)
+    result = ours(single, is_dynamic=dynamic)
+    outputs = [*result.images, *result.alphas]
+    for k in (0, 3):
+        assert torch.equal(outputs[k], outputs[k + 1 + wall_is_dynamic])
+    expected = [theirs(double, drawn=drawn) for drawn in (None, ~dynamic, dynamic)]
+    expected = [e[k] for k in (0, 1) for e in expected]
+    for actual, wanted in zip(outputs, expected, strict=True):
+        assert error(actual, wanted) < 2e-6
+    cotangents = random_like(outputs)
+    pulled(outputs, cotangents).backward()
+    pulled(expected, cotangents).backward()
+    for name, actual, wanted in zip(INPUTS, single, double, strict=False):
+        assert relative_error(actual.grad, wanted.grad) < 1e-5, name
+
+
+FEW = make_inputs(8, size=(20, 17))
+
+
+@pytest.mark.parametrize(
+    ("inputs", "dynamic"),
+    [
+        (FEW, None),
+        (FEW, torch.arange(8) < 0),
+        (FEW, torch.arange(8) < 3),
+        (FEW, torch.arange(8) < 8),
+        (make_walled_inputs(16, (20, 17)), torch.arange(16) < 12),
+        (make_walled_inputs(16, (20, 17)), torch.arange(16) >= 12),
+    ],
+)
+def test_absolute_norms_sum_the_lengths_pixel_by_pixel(inputs, dynamic):
     size = (20, 17)
-    inputs = make_inputs(8, size=size)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result = ours(single, size, absgrad=True, is_dynamic=dynamic)
     images = [theirs(double, size, drawn)[0] for drawn in ([None] if dynamic is None else [None, ~dynamic, dynamic])]

@@ -15,11 +15,13 @@ from warpgs.kernels.rows import gradient_stride
 
 from .commands import PerShard
 from .contracts import check_image_size, check_same_device, check_tensor
-from .layers import NUM_BRANCH_IMAGES, Layers, gather_adjoints
 from .projection import Projection
 from .rows import Rows
 from .tape import Run, differentiable
 from .tiles import Tiles, record_split_tiles, record_tiles
+
+NUM_BRANCH_IMAGES = 3
+"""Joint, static only, dynamic only."""
 
 CUDA_PIXELS = (1, 2)
 """Columns and rows of pixels that a lane composites on CUDA; the alternatives are in docs/performance.md."""
@@ -71,31 +73,11 @@ def is_small(size: tuple[int, int]) -> bool:
     return size[0] * size[1] <= SMALL
 
 
-def _launch(
-    run: Run,
-    make_kernel: Callable[..., Any],
-    rows: Rows,
-    images: int,
-    flag: bool,
-    size: tuple[int, int],
-    tiles: Tiles,
-    *arguments: Any,
-) -> None:
-    """Launches a compositing kernel over all blocks of pixels in all images."""
-    lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    pixels = CPU_PIXELS
-    if run.is_cuda:
-        pixels = CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
-    blocks = (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
-
-    run.launch(
-        make_kernel(rows.num_features, rows.with_depth, images, pixels, flag),
-        tiles.ranges.shape[0] * images * blocks * lanes,
-        tiles.ranges,
-        *arguments,
-        block_dim=BLOCK_DIM,
-        work=TILE_SIZE * TILE_SIZE,
-    )
+def _pixels(run: Run, size: tuple[int, int]) -> tuple[int, int]:
+    """Columns and rows of pixels that a lane composites."""
+    if not run.is_cuda:
+        return CPU_PIXELS
+    return CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
 
 
 def record_composite(
@@ -114,78 +96,89 @@ def record_composite(
     behind depth.
     """
     width, height = size
-    C = rows.num_channels
+    C, num_features = rows.num_channels, rows.num_features
     N = rows.packed.shape[0]
     images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
     lengths = None if is_dynamic is None else record_split_tiles(run, tiles, is_dynamic)
-    num_features = rows.num_features
     image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None
-    layers = Layers(tuple(image), tuple(alpha), () if depth is None else tuple(depth))
+    layers = (tuple(image), tuple(alpha), () if depth is None else tuple(depth))
     transmittance, last = run.empty(alpha.numel()), run.empty(alpha.numel(), dtype=torch.int32)
     behind = None if background is None else background.view(-1)
     stride = 0 if background is None or background.ndim == 1 else num_features
     contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
     weights = run.zeros(run.num_shards, N) if statistics else None
-    _launch(
+
+    pixels = _pixels(run, size)
+    lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
+    blocks = len(tiles.ranges) * (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
+    looked = None if is_dynamic is None else run.zeros(blocks, dtype=torch.int32)
+
+    def launch(run: Run, make_kernel: Callable[..., Any], flag: bool, *arguments: Any) -> None:
+        """Launches a compositing kernel over all blocks of pixels in all images."""
+        run.launch(
+            make_kernel(num_features, rows.with_depth, images, pixels, flag),
+            images * blocks * lanes,
+            *arguments,
+            block_dim=BLOCK_DIM,
+            work=TILE_SIZE * TILE_SIZE,
+        )
+
+    lists = (tiles.ranges, lengths, tiles.gaussian_from_isect, tiles.half)
+    drawn = None if depth is None else depth.view(-1)
+    launch(
         run,
         make_composite_fwd,
-        rows,
-        images,
         statistics,
-        size,
-        tiles,
-        lengths,
-        tiles.gaussian_from_isect,
-        tiles.half,
+        *lists,
+        is_dynamic,
         rows.packed,
         behind,
         stride,
         width,
         height,
         image.view(-1, num_features),
-        None if depth is None else depth.view(-1),
+        drawn,
         alpha.view(-1),
         transmittance,
         last,
+        looked,
         contributed,
         None if weights is None else PerShard(weights),
     )
 
     def backward(run: Run) -> None:
-        v_image, v_alpha, arrived = gather_adjoints(run, layers, alpha, depth)
+        v_layers = [[run.adjoint(t) for t in tensors] for tensors in layers]
+        arrived = sum({1 << m for values in v_layers for m, v in enumerate(values) if v is not None})
         if arrived == 0:
             return
-        v_image = run.zeros(images, height, width, C) if v_image is None else v_image
+        missing: list[Tensor | None] = [None] * NUM_BRANCH_IMAGES
         gradients = run.zeros(run.num_shards, N, gradient_stride(C))
-        _launch(
+        launch(
             run,
             make_composite_bwd,
-            rows,
-            images,
             absgrad,
-            size,
-            tiles,
-            lengths,
-            tiles.gaussian_from_isect,
-            tiles.half,
+            *lists,
             rows.packed,
             behind,
             stride,
             width,
             height,
+            drawn,
             transmittance,
             last,
-            v_image.view(-1, C),
-            None if v_alpha is None else v_alpha.view(-1),
+            looked,
+            *(None if v is None else v.view(-1) for values in v_layers for v in (values + missing)[:NUM_BRANCH_IMAGES]),
             arrived,
             PerShard(gradients),
         )
         run.add_adjoint(rows.packed, gradients)
         if background is not None and run.wants(background):
-            pixels = height * width
-            v_behind = transmittance.view(images, 1, pixels) @ v_image.view(images, pixels, C)
-            v_behind = v_behind[:, 0, :num_features]
+            seen = transmittance.view(images, 1, -1)
+            v_behind = torch.zeros(images, num_features, device=run.device)
+            for m, v_image in enumerate(v_layers[0]):
+                if v_image is not None:
+                    v_behind[m] = (seen[m] @ v_image.view(-1, num_features))[0]
             run.add_adjoint(background, v_behind.sum(0) if background.ndim == 1 else v_behind)
 
     run.on_backward(backward)
