@@ -33,6 +33,7 @@ from .lanes import (
     stage_get,
 )
 from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
+from .tiles import DYNAMIC
 
 
 @wp.func_native(
@@ -179,6 +180,8 @@ def make_composite_bwd(
             own_g = int(-1)
             if index < n_max:
                 own_g = gaussian_from_isect[isects[0] + isects[1] * index]
+                if wp.static(images > 1):
+                    own_g = own_g & ~DYNAMIC
             ballot, own0, own1, own2 = stage_survivors(own_g, index + 1, box, rows, lane, stage)
             count = lane_bit_count(ballot)
             for back in range(count):

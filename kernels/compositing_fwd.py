@@ -50,6 +50,7 @@ from .lanes import (
     stage_get,
 )
 from .rows import GEOMETRY_PARTS, row_load
+from .tiles import DYNAMIC
 
 
 @functools.cache
@@ -61,7 +62,7 @@ def make_composite_fwd(
     Args:
         num_features: Channels of an image, at least 1.
         with_depth: Whether Gaussians have their depth as one more channel.
-        images: 1 or 3, see above; ``branch_lengths``, ``half``, ``is_dynamic`` and ``looked`` are only used for 3.
+        images: 1 or 3, see above; ``branch_lengths``, ``half`` and ``looked`` are only used for 3.
         pixels: Columns and rows of pixels that a lane owns.
         statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
 
@@ -80,7 +81,6 @@ def make_composite_fwd(
         branch_lengths: wp.array[wp.vec2i],
         gaussian_from_isect: wp.array[int],
         half: int,
-        is_dynamic: wp.array[wp.uint8],
         rows: wp.array2d[wp.vec4],
         background: wp.array[float],
         background_stride: int,
@@ -133,22 +133,20 @@ def make_composite_fwd(
             if lane_any(open_pixels[0]) == 0:
                 break
             own_g = int(-1)
-            tag = base + lane + 1
+            own_tag = base + lane + 1
             if base + lane < isects[2]:
                 own_g = gaussian_from_isect[isects[0] + isects[1] * (base + lane)]
                 if wp.static(images > 1):
-                    tag = 2 * tag + int(is_dynamic[own_g])
-            ballot, own0, own1, own2 = stage_survivors(own_g, tag, box, rows, lane, stage)
+                    # The lowest two bits say of which branch it is; the joint image's lists alone need to know.
+                    own_tag = 4 * own_tag + wp.where(own_g < DYNAMIC, 1, 2)
+                    own_g = own_g & ~DYNAMIC
+            ballot, own0, own1, own2 = stage_survivors(own_g, own_tag, box, rows, lane, stage)
             for slot in range(lane_bit_count(ballot)):
                 row0 = stage_get(stage, slot, 0, own0)
                 row1 = stage_get(stage, slot, 1, own1)
                 quad = stage_get(stage, slot, 2, own2)
                 g = wp.cast(row1[2], wp.int32)
-                position = wp.cast(row1[3], wp.int32)
-                branch = int(0)
-                if wp.static(images > 1):
-                    branch = position & 1
-                    position = position >> 1
+                tag = wp.cast(row1[3], wp.int32)
                 features = features_vector()
                 for c in range(wp.static(min(C, 4))):
                     features[c] = quad[c]
@@ -175,7 +173,7 @@ def make_composite_fwd(
                             t = T[k]
                             if t > 0.0:
                                 if wp.static(images > 1):
-                                    seen[0] = seen[0] | (2 << branch)
+                                    seen[0] = seen[0] | tag
                                 t_next = t - alpha * t
                                 if t_next <= TRANSMITTANCE_MIN:
                                     T[k] = -t
@@ -185,7 +183,7 @@ def make_composite_fwd(
                                     for c in range(wp.static(C)):
                                         color[k * wp.static(C) + c] += w * features[c]
                                     T[k] = t_next
-                                    n[k] = position
+                                    n[k] = tag
                                     weight += w
                 if wp.static(statistics) and walked == 0:
                     weight = lane_sum(weight)
@@ -197,7 +195,7 @@ def make_composite_fwd(
 
         finished = int(1)
         if wp.static(images > 1):
-            finished = 1 | lane_or(seen[0])
+            finished = 1 | (lane_or(seen[0] & 3) << 1)
             if walked == 0 and lane == 0:
                 looked[block] = finished
         for j in range(wp.static(rows_per_lane)):
@@ -212,7 +210,7 @@ def make_composite_fwd(
                             p = (m * height + y) * width + x
                             alpha_image[p] = 1.0 - t
                             transmittance[p] = t
-                            last[p] = n[k]
+                            last[p] = n[k] / wp.static(4 if images > 1 else 1)
                             for c in range(wp.static(num_features)):
                                 value = color[k * wp.static(C) + c]
                                 if background.shape[0] > 0:

@@ -9,7 +9,8 @@ intersections that do not exist have the tile index ``num_tiles`` and sort to th
 tile looks at all Gaussians in depth order instead, which is slow but draws the same image. M is written to ``demand``
 in host memory, from where the next call sizes its buffers.
 
-For images of one branch alone, ``split_tiles`` makes two lists of each tile's.
+For images of one branch alone, intersections say of which branch their Gaussian is, and ``split_tiles`` makes two lists
+of each tile's.
 """
 
 import warp as wp
@@ -27,10 +28,24 @@ MANY_TILES = wp.constant(24)
 """Intersections above which a Gaussian's are written by a whole lane group instead of one thread."""
 
 
+DYNAMIC = wp.constant(1 << 30)
+"""Bit of an intersection whose Gaussian is dynamic, where there are branches; the others are the Gaussian's index. To
+look the branch up for every intersection would be to read all over memory."""
+
+
 LOOKS = wp.constant(4)
 """Intersections that a lane looks at in one go when tiles are split: they are on their way together."""
 
 Looks = wp.types.vector(length=LOOKS, dtype=int)
+
+
+@wp.func
+def make_isect(g: int, is_dynamic: wp.array[wp.uint8]) -> int:
+    """What stands for a Gaussian in its intersections; without branches it is its index."""
+    isect = g
+    if is_dynamic.shape[0] > 0:
+        isect = g | (int(is_dynamic[g] != wp.uint8(0)) * DYNAMIC)
+    return isect
 
 
 @wp.func
@@ -91,6 +106,7 @@ def emit_isects(
     rows: wp.array2d[wp.vec4],
     gaussian_from_rank: wp.array[int],
     end_of_rank: wp.array[wp.int64],
+    is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     tiles_x: int,
     tiles_y: int,
@@ -111,8 +127,10 @@ def emit_isects(
     isect = int(0)
     end = int(0)
     g = int(0)
+    gaussian = int(0)  # as it stands in intersections
     if thread < num_gaussians:
         g = gaussian_from_rank[thread]
+        gaussian = make_isect(g, is_dynamic)
         end = int(end_of_rank[thread])
         if thread > 0:
             isect = int(end_of_rank[thread - 1])
@@ -128,11 +146,11 @@ def emit_isects(
                 # The count came from another kernel, whose rounding may differ: never write past it.
                 if isect < end:
                     tile_from_isect[isect] = y * tiles_x + x
-                    gaussian_from_isect[isect] = g
+                    gaussian_from_isect[isect] = gaussian
                     isect += 1
         while isect < end:
             tile_from_isect[isect] = tiles_x * tiles_y
-            gaussian_from_isect[isect] = g
+            gaussian_from_isect[isect] = gaussian
             isect += 1
     # Gaussians with many tiles are written by the whole lane group, one after the other: a thread on its own would
     # keep everyone waiting for the few that cover the image.
@@ -141,6 +159,7 @@ def emit_isects(
         writer = lane_lowest(ballot)
         ballot = ballot & (ballot - wp.uint32(1))
         big_g = lane_broadcast(g, writer)
+        big_gaussian = lane_broadcast(gaussian, writer)
         big_isect = lane_broadcast(isect, writer)
         big_end = lane_broadcast(end, writer)
         row0 = row_load(rows, big_g, 0)
@@ -161,12 +180,12 @@ def emit_isects(
                 for x in range(lane, row_length, lane_count()):
                     if row_isect + x < big_end:
                         tile_from_isect[row_isect + x] = (y_base + k) * tiles_x + row_begin + x
-                        gaussian_from_isect[row_isect + x] = big_g
+                        gaussian_from_isect[row_isect + x] = big_gaussian
             big_isect += lane_broadcast(before + length, lane_count() - 1)
             y_base += lane_count()
         for k in range(big_isect + lane, big_end, lane_count()):
             tile_from_isect[k] = tiles_x * tiles_y
-            gaussian_from_isect[k] = big_g
+            gaussian_from_isect[k] = big_gaussian
 
 
 @wp.kernel(enable_backward=False)
@@ -174,6 +193,7 @@ def tile_ranges(
     first: int,
     end_of_rank: wp.array[wp.int64],
     gaussian_from_rank: wp.array[int],
+    is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     num_tiles: int,
     capacity: int,
@@ -185,7 +205,7 @@ def tile_ranges(
     thread = first + wp.tid()
     if end_of_rank[num_gaussians - 1] > wp.int64(capacity):
         if thread < num_gaussians:
-            gaussian_from_isect[thread] = gaussian_from_rank[thread]
+            gaussian_from_isect[thread] = make_isect(gaussian_from_rank[thread], is_dynamic)
         if thread < num_tiles:
             ranges[thread, 0] = 0
             ranges[thread, 1] = num_gaussians
@@ -210,7 +230,6 @@ def tile_ranges(
 def split_tiles(
     first: int,
     ranges: wp.array2d[int],
-    is_dynamic: wp.array[wp.uint8],
     half: int,
     gaussian_from_isect: wp.array[int],
     lengths: wp.array2d[int],
@@ -230,21 +249,20 @@ def split_tiles(
     num_dynamic = int(0)
     base = begin + lane
     while base - lane < end:
-        gaussians = Looks(-1)
-        branches = Looks(-1)
+        isects = Looks(-1)
         for k in range(LOOKS):
             if base + k * lane_count() < end:
-                gaussians[k] = gaussian_from_isect[base + k * lane_count()]
+                isects[k] = gaussian_from_isect[base + k * lane_count()]
         for k in range(LOOKS):
-            if gaussians[k] >= 0:
-                branches[k] = int(is_dynamic[gaussians[k]] != wp.uint8(0))
-        for k in range(LOOKS):
-            static_ballot = lane_ballot(int(branches[k] == 0))
-            dynamic_ballot = lane_ballot(int(branches[k] == 1))
-            if branches[k] == 0:
-                gaussian_from_isect[half + begin + num_static + lane_rank(static_ballot, lane)] = gaussians[k]
-            if branches[k] == 1:
-                gaussian_from_isect[half + end - 1 - num_dynamic - lane_rank(dynamic_ballot, lane)] = gaussians[k]
+            g = isects[k] & ~DYNAMIC
+            is_static = isects[k] == g
+            is_dynamic = isects[k] >= 0 and not is_static
+            static_ballot = lane_ballot(int(is_static))
+            dynamic_ballot = lane_ballot(int(is_dynamic))
+            if is_static:
+                gaussian_from_isect[half + begin + num_static + lane_rank(static_ballot, lane)] = g
+            if is_dynamic:
+                gaussian_from_isect[half + end - 1 - num_dynamic - lane_rank(dynamic_ballot, lane)] = g
             num_static += lane_bit_count(static_ballot)
             num_dynamic += lane_bit_count(dynamic_ballot)
         base += LOOKS * lane_count()

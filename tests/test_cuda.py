@@ -120,7 +120,7 @@ def test_renders_that_repeat_are_replayed(settings, monkeypatch):
     for seed in range(2 * PLAIN_CALLS):
         plain = drawn("cuda", dataclasses.replace(settings, replay=False), seed=seed)
         for actual, expected in zip(drawn("cuda", settings, seed=seed), plain, strict=True):
-            assert relative_error(actual, expected) < 1e-5
+            assert relative_error(actual, expected) < 1e-4  # two plain calls differ by up to 1e-5, in their atomic sums
     (kind,) = replay._kinds.values()
     assert kind.recordings == 1
 

@@ -148,13 +148,13 @@ def _make_op(
         geometry = (means, quats, scales, opacities, viewmat, K)
         projection = record_projection(run, *geometry, size, settings.near, settings.antialias)
         rows = Rows(run, projection, num_channels, settings.depth, size)
-        tiles = record_tiles(run, rows, size)
+        tiles = record_tiles(run, rows, size, branch)
         join(sh_stream)
         features = appearance
         if sh_degree is not None:
             features = record_sh(run, means, appearance, viewmat, projection.radii, sh_degree)
         rows.add_features(run, features)
-        composite = record_composite(run, rows, tiles, size, background, branch, settings.statistics, settings.absgrad)
+        composite = record_composite(run, rows, tiles, size, background, settings.statistics, settings.absgrad)
         return (projection.radii, *composite.flat())
 
     return op

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
+from warpgs.kernels import tiles as kernels
 from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
@@ -218,20 +219,21 @@ def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
     ]
 
 
-def test_the_lists_of_tiles_are_split_by_branch_in_order():
-    random = generator()
-    lengths = torch.randint(0, 40, (60,), generator=random)
-    lengths[:3] = torch.tensor([0, 1, 300])
-    bounds = torch.cat([torch.zeros(1, dtype=torch.int64), lengths.cumsum(0)])
-    ranges = torch.stack([bounds[:-1], bounds[1:]], 1).int()
-    is_dynamic = torch.rand(500, generator=random) < torch.rand(500, generator=random) ** 4
-    gaussians = torch.randint(0, 500, (int(lengths.sum()),), dtype=torch.int32, generator=random)
-    joint = tiles.Tiles(ranges, torch.cat([gaussians, gaussians.new_full(gaussians.shape, -1)]), torch.zeros(1))
-    split = tiles.record_split_tiles(Run(torch.device("cpu"), []), joint, is_dynamic.view(torch.uint8))
-    assert torch.equal(joint.gaussian_from_isect[: joint.half], gaussians)
-    for (begin, end), (num_static, num_dynamic) in zip(ranges.tolist(), split.tolist(), strict=True):
-        listed = gaussians[begin:end]
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
+def test_the_lists_of_tiles_are_split_by_branch_in_order(share):
+    splats = projected()
+    is_dynamic = torch.rand(NUM, generator=generator()) < share
+    run = Run(torch.device("cpu"), [])
+    rows = Rows(run, splats, 3, False, (WIDTH, HEIGHT))
+    result = tiles.record_tiles(run, rows, (WIDTH, HEIGHT), is_dynamic.view(torch.uint8))
+    joint, _ = binned(splats)
+    assert len(joint) == len(result.ranges)
+    for listed, (begin, end), (num_static, num_dynamic) in zip(
+        joint, result.ranges.tolist(), result.branch_lengths.tolist(), strict=True
+    ):
+        listed = torch.tensor(listed, dtype=torch.int32)
         moves = is_dynamic[listed.long()]
-        room = joint.gaussian_from_isect[joint.half + begin : joint.half + end]
+        assert torch.equal(result.gaussian_from_isect[begin:end], listed + moves * kernels.DYNAMIC)
+        room = result.gaussian_from_isect[result.half + begin : result.half + end]
         assert torch.equal(room[:num_static], listed[~moves])
         assert torch.equal(room.flip(0)[:num_dynamic], listed[moves])

@@ -18,7 +18,7 @@ from .contracts import check_image_size, check_same_device, check_tensor
 from .projection import Projection
 from .rows import Rows
 from .tape import Run, differentiable
-from .tiles import Tiles, record_split_tiles, record_tiles
+from .tiles import Tiles, record_tiles
 
 NUM_BRANCH_IMAGES = 3
 """Joint, static only, dynamic only."""
@@ -86,11 +86,10 @@ def record_composite(
     tiles: Tiles,
     size: tuple[int, int],
     background: Tensor | None,
-    is_dynamic: Tensor | None,
     statistics: bool,
     absgrad: bool,
 ) -> Composite:
-    """Composites packed rows. With ``is_dynamic`` [N] uint8 three images come out, otherwise one.
+    """Composites packed rows. Of tiles with branches three images come out, otherwise one.
 
     ``background`` is [features], or [images, features] with another one for each image; none is black. There is none
     behind depth.
@@ -98,8 +97,7 @@ def record_composite(
     width, height = size
     C, num_features = rows.num_channels, rows.num_features
     N = rows.packed.shape[0]
-    images = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
-    lengths = None if is_dynamic is None else record_split_tiles(run, tiles, is_dynamic)
+    images = 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
     image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None
     layers = (tuple(image), tuple(alpha), () if depth is None else tuple(depth))
@@ -112,7 +110,7 @@ def record_composite(
     pixels = _pixels(run, size)
     lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
     blocks = len(tiles.ranges) * (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
-    looked = None if is_dynamic is None else run.zeros(blocks, dtype=torch.int32)
+    looked = None if images == 1 else run.zeros(blocks, dtype=torch.int32)
 
     def launch(run: Run, make_kernel: Callable[..., Any], flag: bool, *arguments: Any) -> None:
         """Launches a compositing kernel over all blocks of pixels in all images."""
@@ -124,14 +122,13 @@ def record_composite(
             work=TILE_SIZE * TILE_SIZE,
         )
 
-    lists = (tiles.ranges, lengths, tiles.gaussian_from_isect, tiles.half)
+    lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
     drawn = None if depth is None else depth.view(-1)
     launch(
         run,
         make_composite_fwd,
         statistics,
         *lists,
-        is_dynamic,
         rows.packed,
         behind,
         stride,
@@ -247,9 +244,9 @@ def composite(
     ) -> tuple[Tensor, ...]:
         projection = Projection(means2d, conics, depths, opacities, splats.radii)
         rows = Rows(run, projection, features.shape[1], False, size)
-        tiles = record_tiles(run, rows, size)
+        tiles = record_tiles(run, rows, size, branch)
         rows.add_features(run, features)
-        return record_composite(run, rows, tiles, size, behind, branch, statistics, absgrad).flat()
+        return record_composite(run, rows, tiles, size, behind, statistics, absgrad).flat()
 
     tensors = differentiable(op, splats.means2d, splats.conics, splats.depths, splats.opacities, features, background)
     return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES, with_depth=False)

@@ -29,12 +29,15 @@ class Tiles(NamedTuple):
     Attributes:
         ranges: [num_tiles, 2] int32 begin and end of each tile's run in ``gaussian_from_isect``.
         gaussian_from_isect: int32, in its first half the Gaussian of each (Gaussian, tile) intersection, by tile, then
-            front to back; longer than the last range's end. The second half is ``record_split_tiles``'s.
+            front to back; longer than the last range's end. With branches, those of dynamic ones have the bit
+            ``kernels.DYNAMIC``, and the second half has the lists of each branch alone (``kernels.split_tiles``).
+        branch_lengths: [num_tiles, 2] int32 number of static and of dynamic Gaussians of each tile, with branches.
         demand: [1] int64 number of intersections, in host memory; valid once the device has come this far.
     """
 
     ranges: Tensor
     gaussian_from_isect: Tensor
+    branch_lengths: Tensor | None
     demand: Tensor
 
     @property
@@ -92,8 +95,8 @@ def num_tiles(width: int, height: int) -> tuple[int, int]:
     return -(-width // TILE_SIZE), -(-height // TILE_SIZE)
 
 
-def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
-    """Bins splats into the tiles of an image of ``size`` (width, height).
+def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int], is_dynamic: Tensor | None = None) -> Tiles:
+    """Bins splats into the tiles of an image of ``size`` (width, height), with ``is_dynamic`` [N] uint8 by branch, too.
 
     Waits for the device only on the first frame of a size; later frames provide for what earlier ones needed.
     """
@@ -103,7 +106,9 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
     total = tiles_x * tiles_y
     int32 = torch.int32
     if N == 0 or total == 0:
-        return Tiles(run.zeros(total, 2, dtype=int32), run.empty(1, dtype=int32), torch.zeros(1, dtype=torch.int64))
+        nothing = run.zeros(total, 2, dtype=int32)
+        demand = torch.zeros(1, dtype=torch.int64)
+        return Tiles(nothing, run.empty(1, dtype=int32), None if is_dynamic is None else nothing, demand)
     run.sort_pairs(splat_rows.depth_keys, gaussian_from_rank, N, DEPTH_BITS)
     end_of_rank = run.empty(N, dtype=torch.int64)
     run.launch(kernels.count_tiles, N, rows, gaussian_from_rank, tiles_x, tiles_y, end_of_rank)
@@ -121,6 +126,7 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
         rows,
         gaussian_from_rank,
         end_of_rank,
+        is_dynamic,
         N,
         tiles_x,
         tiles_y,
@@ -136,6 +142,7 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
         max(capacity, total) + 1,
         end_of_rank,
         gaussian_from_rank,
+        is_dynamic,
         N,
         total,
         capacity,
@@ -143,24 +150,15 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int]) -> Tiles:
         gaussian_from_isect,
         ranges,
     )
-    return Tiles(ranges, gaussian_from_isect, budget.demand)
-
-
-def record_split_tiles(run: Run, tiles: Tiles, is_dynamic: Tensor) -> Tensor:
-    """Splits each tile's list by branch, into the second half of ``gaussian_from_isect``.
-
-    Returns:
-        [num_tiles, 2] int32: how many static and how many dynamic Gaussians each tile has.
-    """
-    lengths = torch.empty_like(tiles.ranges)
-    run.launch(
-        kernels.split_tiles,
-        len(lengths) * (WARP_SIZE if run.is_cuda else 1),
-        tiles.ranges,
-        is_dynamic,
-        tiles.half,
-        tiles.gaussian_from_isect,
-        lengths,
-        block_dim=BLOCK_DIM,
-    )
-    return lengths
+    tiles = Tiles(ranges, gaussian_from_isect, None if is_dynamic is None else torch.empty_like(ranges), budget.demand)
+    if tiles.branch_lengths is not None:
+        run.launch(
+            kernels.split_tiles,
+            total * (WARP_SIZE if run.is_cuda else 1),
+            ranges,
+            tiles.half,
+            gaussian_from_isect,
+            tiles.branch_lengths,
+            block_dim=BLOCK_DIM,
+        )
+    return tiles
