@@ -67,12 +67,16 @@ def make_composite_fwd(
         statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
 
     The kernel's ``background`` has ``num_features`` values, those of the next image ``background_stride`` further on.
-    ``looked`` has one value for each block of an image, zero at first; see ``is_joint``.
+    ``looked`` has one value for each block of an image, zero at first; see ``is_joint``. ``transmittance`` and
+    ``last``, for the way back, are those of each image's own walk: where an image is the joint one there may be none.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, P)
+    # With branches, the lowest two bits of a Gaussian's tag say which is its, and those of a pixel's all that it has
+    # looked at; the rest is the position in the list. (Of lists of one branch nobody asks.)
+    branch_bits = 3 if images > 1 else 0
 
     @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_fwd(
@@ -120,7 +124,6 @@ def make_composite_fwd(
         n = integers()
         color = colors()
         open_pixels = Counter()  # of this lane
-        seen = Counter()  # by this lane, as bits of ``looked``
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 if pixel_x + i * lane_columns() < width and pixel_y + j * lane_rows() < height:
@@ -137,7 +140,6 @@ def make_composite_fwd(
             if base + lane < isects[2]:
                 own_g = gaussian_from_isect[isects[0] + isects[1] * (base + lane)]
                 if wp.static(images > 1):
-                    # The lowest two bits say of which branch it is; the joint image's lists alone need to know.
                     own_tag = 4 * own_tag + wp.where(own_g < DYNAMIC, 1, 2)
                     own_g = own_g & ~DYNAMIC
             ballot, own0, own1, own2 = stage_survivors(own_g, own_tag, box, rows, lane, stage)
@@ -172,18 +174,17 @@ def make_composite_fwd(
                             k = j * wp.static(columns) + i
                             t = T[k]
                             if t > 0.0:
-                                if wp.static(images > 1):
-                                    seen[0] = seen[0] | tag
                                 t_next = t - alpha * t
                                 if t_next <= TRANSMITTANCE_MIN:
                                     T[k] = -t
                                     open_pixels[0] -= 1
+                                    n[k] = n[k] | (tag & wp.static(branch_bits))
                                 else:
                                     w = alpha * t
                                     for c in range(wp.static(C)):
                                         color[k * wp.static(C) + c] += w * features[c]
                                     T[k] = t_next
-                                    n[k] = tag
+                                    n[k] = tag | (n[k] & wp.static(branch_bits))
                                     weight += w
                 if wp.static(statistics) and walked == 0:
                     weight = lane_sum(weight)
@@ -195,7 +196,10 @@ def make_composite_fwd(
 
         finished = int(1)
         if wp.static(images > 1):
-            finished = 1 | (lane_or(seen[0] & 3) << 1)
+            seen = int(0)
+            for k in range(wp.static(P)):
+                seen = seen | (n[k] & wp.static(branch_bits))
+            finished = 1 | 2 * lane_or(seen)
             if walked == 0 and lane == 0:
                 looked[block] = finished
         for j in range(wp.static(rows_per_lane)):
@@ -205,12 +209,12 @@ def make_composite_fwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     t = wp.abs(T[k])
+                    transmittance[(walked * height + y) * width + x] = t
+                    last[(walked * height + y) * width + x] = n[k] / wp.static(branch_bits + 1)
                     for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
                         if m == walked or is_joint(m, finished):
                             p = (m * height + y) * width + x
                             alpha_image[p] = 1.0 - t
-                            transmittance[p] = t
-                            last[p] = n[k] / wp.static(4 if images > 1 else 1)
                             for c in range(wp.static(num_features)):
                                 value = color[k * wp.static(C) + c]
                                 if background.shape[0] > 0:

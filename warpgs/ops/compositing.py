@@ -171,7 +171,7 @@ def record_composite(
         )
         run.add_adjoint(rows.packed, gradients)
         if background is not None and run.wants(background):
-            seen = transmittance.view(images, 1, -1)
+            seen = (1.0 - alpha).view(images, 1, -1)
             v_behind = torch.zeros(images, num_features, device=run.device)
             for m, v_image in enumerate(v_layers[0]):
                 if v_image is not None:
