@@ -14,6 +14,8 @@ q = a b of quaternions v_a = v_q b*, v_b = a* v_q, with the conjugate *.
 
 import warp as wp
 
+from .lean import lean_kernel
+
 IDENTITY = wp.constant(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
 
@@ -39,7 +41,7 @@ def turn_of(offsets: wp.array2d[float], i: int) -> wp.vec4:
     return IDENTITY + wp.vec4(offsets[i, 3], offsets[i, 4], offsets[i, 5], offsets[i, 6])
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def activate_fwd(
     first: int,
     first_row: int,
@@ -72,7 +74,7 @@ def activate_fwd(
     out_opacities[row] = 1.0 / (1.0 + wp.exp(-logit))
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def activate_bwd(
     first: int,
     first_row: int,
@@ -110,7 +112,7 @@ def activate_bwd(
     v_quats[i] = v_quat
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def join_sh_fwd(
     first: int,
     first_row: int,
@@ -134,7 +136,7 @@ def join_sh_fwd(
     sh[first_row + i, k] = value
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def join_sh_bwd(
     first: int,
     first_row: int,

@@ -32,6 +32,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
+from .lean import lean_kernel
 from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
 from .tiles import DYNAMIC
 
@@ -73,8 +74,7 @@ def make_composite_bwd(
     scalars, integers, colors, features_vector = state_types(C, P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
-    # Without a grid-stride loop, which nothing here needs, the kernel takes 4 % less time (docs/performance.md).
-    @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P), grid_stride=False)
+    @lean_kernel(module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],

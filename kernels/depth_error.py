@@ -12,6 +12,7 @@ import warp as wp
 
 from .absolute import slope_of_abs
 from .constants import SMALLEST_INVERSE_DEPTH
+from .lean import lean_kernel
 
 OPAQUE = wp.constant(0.5)
 """Opacity that a pixel must exceed to have a depth to speak of."""
@@ -34,7 +35,7 @@ def depth_difference(
     return result
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def depth_error_fwd(
     first: int,
     depth: wp.array[float],
@@ -49,7 +50,7 @@ def depth_error_fwd(
     errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, region, p))
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def depth_error_bwd(
     first: int,
     depth: wp.array[float],

@@ -10,6 +10,8 @@ import math
 
 import warp as wp
 
+from .lean import lean_kernel
+
 C0 = wp.constant(0.5 * math.sqrt(1.0 / math.pi))
 C1 = wp.constant(0.5 * math.sqrt(3.0 / math.pi))
 C2_XY = wp.constant(0.5 * math.sqrt(15.0 / math.pi))
@@ -97,7 +99,7 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
     return wp.vec3(0.0)
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def sh_fwd(
     first: int,
     means: wp.array[wp.vec3],
@@ -122,7 +124,7 @@ def sh_fwd(
     colors[i] = color
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def sh_bwd(
     first: int,
     means: wp.array[wp.vec3],

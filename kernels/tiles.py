@@ -18,6 +18,7 @@ import warp as wp
 from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
 from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
+from .lean import lean_kernel
 from .rows import row_load
 
 SLACK = wp.constant(0.01)
@@ -77,7 +78,7 @@ def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, 
     return wp.vec2i(wp.max(low, 0), wp.min(high, tiles_x - 1) + 1)
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def count_tiles(
     first: int,
     rows: wp.array2d[wp.vec4],
@@ -100,7 +101,7 @@ def count_tiles(
     num_tiles_of_rank[rank] = wp.int64(count)
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def emit_isects(
     first: int,
     rows: wp.array2d[wp.vec4],
@@ -188,7 +189,7 @@ def emit_isects(
             gaussian_from_isect[k] = big_gaussian
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def tile_ranges(
     first: int,
     end_of_rank: wp.array[wp.int64],
@@ -226,7 +227,7 @@ def tile_ranges(
             ranges[tile + 1, 0] = thread
 
 
-@wp.kernel(enable_backward=False)
+@lean_kernel
 def split_tiles(
     first: int,
     ranges: wp.array2d[int],
