@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import json
 
 import pytest
@@ -6,7 +7,7 @@ import torch
 
 from tests import tiny
 from warpgs import runs
-from warpgs.bench import STAGES, Bench, bench
+from warpgs.bench import STAGES, Bench, bench, time_in_turn
 from warpgs.bench_scenes import SCENES, Scene, random_splats
 from warpgs.bench_training import measure_steps, random_scene
 from warpgs.cli import main
@@ -41,6 +42,13 @@ def test_the_report_has_times_of_all_stages_and_of_the_whole(tmp_path):
     assert set(result["one_image"]) == {"forward_ms", "forward_backward_ms", "stages_ms"}
     assert set(result["one_image"]["stages_ms"]) == set(STAGES)
     assert all(isinstance(ms, float) and ms > 0 for ms in result["one_image"]["stages_ms"].values())
+
+
+def test_what_is_compared_takes_turns():
+    calls = []
+    times = time_in_turn({name: functools.partial(calls.append, name) for name in "ab"}, OPTIONS)
+    assert calls == [*"ab", *"ab", *"ab"]  # the first warms up
+    assert set(times) == {"a", "b"}
 
 
 def test_the_report_counts_gaussians_and_intersections(tmp_path):

@@ -176,25 +176,29 @@ def measure(options: Bench, scene: Scene) -> tuple[Measurements, list[KernelTime
 
 
 def time_passes(workloads: dict[str, Workload], graphed: list[str], options: Bench) -> dict[tuple[str, str], float]:
-    """Median times [ms] by workload and figure, of runs that take turns so that all see the same clock rates."""
-    steps: dict[tuple[str, str], Callable[[], object]] = {}
-    for name, workload in workloads.items():
-        steps[name, "forward_ms"] = workload.forward
-    for name, workload in workloads.items():
-        steps[name, "forward_backward_ms"] = workload.forward_backward
+    """Median times [ms] by workload and figure; each figure has a loop of its own."""
+    figures: dict[str, dict[str, Callable[[], object]]] = {
+        "forward_ms": {name: workload.forward for name, workload in workloads.items()},
+        "forward_backward_ms": {name: workload.forward_backward for name, workload in workloads.items()},
+    }
     if options.device == "cuda":
-        for name, workload in workloads.items():
-            steps[name, "one_thread_forward_backward_ms"] = workload.forward_backward_on_one_thread
-    for name in graphed:
-        steps[name, "graph_forward_backward_ms"] = capture(workloads[name].forward_backward)
+        figures["one_thread_forward_backward_ms"] = {
+            name: workload.forward_backward_on_one_thread for name, workload in workloads.items()
+        }
+    figures["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphed}
+    return {(n, figure): ms for figure, steps in figures.items() for n, ms in time_in_turn(steps, options).items()}
+
+
+def time_in_turn(steps: dict[str, Callable[[], object]], options: Bench) -> dict[str, float]:
+    """Median times [ms] of steps that take turns, so that all see the same clock rates, and threads as awake."""
     for _ in range(WARM_UPS[options.device]):
         for step in steps.values():
             step()
-    samples: dict[tuple[str, str], list[float]] = {key: [] for key in steps}
+    samples: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(options.repeats):
-        for key, step in steps.items():
-            samples[key].append(milliseconds(step, options.device))
-    return {key: statistics.median(values) for key, values in samples.items()}
+        for name, step in steps.items():
+            samples[name].append(milliseconds(step, options.device))
+    return {name: statistics.median(values) for name, values in samples.items()}
 
 
 def time_stages(workload: Workload, options: Bench) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """Rendering: splats, camera, background → images."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -16,9 +17,11 @@ from .ops.replay import repeated
 from .ops.rows import Rows
 from .ops.sh import record_sh
 from .ops.streams import join
-from .ops.tape import Op, Run, differentiable
+from .ops.tape import Run, differentiable
 from .ops.tiles import record_tiles
 from .scene.splats import Splats
+
+DEFAULTS = RenderSettings()
 
 
 class Layer(NamedTuple):
@@ -84,12 +87,14 @@ def render(
         ValueError: If the background does not fit the splats, devices differ, or branches are asked for of splats
             without ``is_dynamic``.
     """
-    settings = settings or RenderSettings()
+    settings = settings or DEFAULTS
     C = splats.num_channels
     if background is not None:
         is_one_each = settings.branches and isinstance(background, Tensor) and background.ndim == 2
         check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_one_each else (C,), {})
-    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
+    device = splats.means.device
+    if camera.viewmat.device != device or (background is not None and background.device != device):
+        check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
     branch = None
     if settings.branches:
         if splats.is_dynamic is None:
@@ -101,60 +106,56 @@ def render(
 
     appearance = splats.colors if splats.sh is None else splats.sh
     geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
-    tensors = (*geometry, appearance, background, camera.viewmat.detach(), camera.K.detach(), branch)
+    view = [t.detach() if t.requires_grad else t for t in (camera.viewmat, camera.K)]
+    tensors = (*geometry, appearance, background, *view, branch)
     kind = (camera.size, C, settings, degree)
-    op = _make_op(*kind, splats.sh_stream)
-    is_empty = 0 in (len(splats.means), *camera.size)
+    op = partial(_record, *kind, splats.sh_stream)
+    is_empty = 0 in (splats.means.shape[0], *camera.size)
     if settings.replay and splats.sh_stream is None and not is_empty:
-        radii, *flat = repeated(kind, op, *tensors)
+        outputs = repeated(kind, op, *tensors)
     else:
-        radii, *flat = differentiable(op, *tensors)
+        outputs = differentiable(op, *tensors)
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
-    composite = Composite.from_flat(tuple(flat), num_images, settings.depth)
+    composite = Composite.from_flat(outputs[1:], num_images, settings.depth)
     depths = composite.depths or (None,) * num_images
-    layers = [Layer(*parts) for parts in zip(composite.images, composite.alphas, depths, strict=True)]
+    layers = list(map(Layer, composite.images, composite.alphas, depths))
     return Rendering(
         joint=layers[0],
         static=layers[1] if settings.branches else None,
         dynamic=layers[2] if settings.branches else None,
-        radii=radii,
+        radii=outputs[0],
         gradient_norms=composite.norms,
         contributed=composite.contributed,
         weights=composite.weights,
     )
 
 
-def _make_op(
+def _record(
     size: tuple[int, int],
     num_channels: int,
     settings: RenderSettings,
     sh_degree: int | None,
     sh_stream: torch.cuda.Stream | None,
-) -> Op:
+    run: Run,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    appearance: Tensor,
+    background: Tensor | None,
+    viewmat: Tensor,
+    K: Tensor,
+    branch: Tensor | None,
+) -> tuple[Tensor, ...]:
     """What is done with the tensors of a render; it depends on nothing else than what is given here."""
-
-    def op(
-        run: Run,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        appearance: Tensor,
-        background: Tensor | None,
-        viewmat: Tensor,
-        K: Tensor,
-        branch: Tensor | None,
-    ) -> tuple[Tensor, ...]:
-        geometry = (means, quats, scales, opacities, viewmat, K)
-        projection = record_projection(run, *geometry, size, settings.near, settings.antialias)
-        rows = Rows(run, projection, num_channels, settings.depth, size)
-        tiles = record_tiles(run, rows, size, branch)
-        join(sh_stream)
-        features = appearance
-        if sh_degree is not None:
-            features = record_sh(run, means, appearance, viewmat, projection.radii, sh_degree)
-        rows.add_features(run, features)
-        composite = record_composite(run, rows, tiles, size, background, settings.statistics, settings.absgrad)
-        return (projection.radii, *composite.flat())
-
-    return op
+    geometry = (means, quats, scales, opacities, viewmat, K)
+    projection = record_projection(run, *geometry, size, settings.near, settings.antialias)
+    rows = Rows(run, projection, num_channels, settings.depth, size)
+    tiles = record_tiles(run, rows, size, branch)
+    join(sh_stream)
+    features = appearance
+    if sh_degree is not None:
+        features = record_sh(run, means, appearance, viewmat, projection.radii, sh_degree)
+    rows.add_features(run, features)
+    composite = record_composite(run, rows, tiles, size, background, settings.statistics, settings.absgrad)
+    return (projection.radii, *composite.flat())

@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -31,7 +30,7 @@ def recordings(monkeypatch):
     monkeypatch.setattr(replay, "_stream_and_pool", lambda device: (None, None))
     monkeypatch.setattr(replay, "_stream", lambda device: 0)
     monkeypatch.setattr(replay, "_can_replay", lambda device: True)
-    monkeypatch.setattr(replay, "_kinds", OrderedDict())
+    monkeypatch.setattr(replay, "_kinds", {})
     return made
 
 

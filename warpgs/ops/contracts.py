@@ -41,15 +41,13 @@ def check_tensor(
 
 def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
     """Raises ``ValueError`` unless all tensors lie on one CPU or CUDA device."""
-    given = {name: t for name, t in tensors.items() if t is not None}
-    first_name, first = next(iter(given.items()))
-    if first.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first.device}")
-    for name, tensor in given.items():
-        if tensor.device != first.device:
-            raise ValueError(
-                f"all tensors must be on one device: {first_name} is on {first.device}, {name} on {tensor.device}"
-            )
+    devices = [(name, t.device) for name, t in tensors.items() if t is not None]
+    first_name, first = devices[0]
+    if first.type not in ("cpu", "cuda"):
+        raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
+    for name, device in devices:
+        if device != first:
+            raise ValueError(f"all tensors must be on one device: {first_name} is on {first}, {name} on {device}")
 
 
 def check_image_size(width: int, height: int) -> None:

@@ -10,8 +10,8 @@ thread records and replays; other threads call plainly.
 """
 
 import atexit
+import itertools
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
@@ -22,6 +22,8 @@ from . import profiling
 from .graph import record
 from .streams import PRIORITY
 from .tape import Op, Run, differentiable
+
+CPU = torch.device("cpu")
 
 PLAIN_CALLS = 8
 """Calls of one kind before one is recorded. They load kernels, find out how many intersections to expect, and show that
@@ -48,29 +50,30 @@ class _Buffers:
 
     def __init__(self, tensors: Sequence[Tensor | None]) -> None:
         self.tensors: list[Any] = list(tensors)
-        given = [(k, t.detach()) for k, t in enumerate(tensors) if t is not None]
-        self._words = [(k, t.dtype) for k, t in given if t.element_size() == 4]
-        self._words_at = [t.view(torch.float32) for _, t in given if t.element_size() == 4]
-        self._others = [(k, t) for k, t in given if t.element_size() != 4]
+        given = [(k, t) for k, t in enumerate(tensors) if t is not None]
+        self._words = [(k, t.is_floating_point()) for k, t in given if t.element_size() == 4]
+        self._others = [k for k, t in given if t.element_size() != 4]
+        self._own_words = [t.detach() for t in self._as_floats(tensors)]
 
     def fill(self, sources: Sequence[Any]) -> None:
         """Copies tensors of the same shapes into these."""
         if self._words:
-            torch._foreach_copy_(self._words_at, [sources[k].view(torch.float32) for k, _ in self._words])
-        for k, target in self._others:
-            target.copy_(sources[k])
+            torch._foreach_copy_(self._own_words, self._as_floats(sources))
+        for k in self._others:
+            self.tensors[k].copy_(sources[k])
 
     def copies(self) -> list[Any]:
         """New tensors with what these hold."""
-        words = [torch.empty_like(t) for t in self._words_at]
-        if words:
-            torch._foreach_copy_(words, self._words_at)
-        result: list[Any] = [None] * len(self.tensors)
-        for (k, dtype), copy in zip(self._words, words, strict=True):
-            result[k] = copy.view(dtype)
-        for k, tensor in self._others:
-            result[k] = tensor.clone()
-        return result
+        copies: list[Any] = [None if t is None else torch.empty_like(t) for t in self.tensors]
+        if self._words:
+            torch._foreach_copy_(self._as_floats(copies), self._own_words)
+        for k in self._others:
+            copies[k].copy_(self.tensors[k])
+        return copies
+
+    def _as_floats(self, tensors: Sequence[Any]) -> list[Tensor]:
+        """Those of elements of four bytes, whatever these are."""
+        return [tensors[k] if is_float else tensors[k].view(torch.float32) for k, is_float in self._words]
 
 
 class _WayBack:
@@ -116,15 +119,18 @@ class Recording:
         """Whether what was assumed when it was recorded still holds."""
         return all(condition() for condition in self._run.conditions)
 
-    def forward(self, tensors: Sequence[Tensor | None]) -> list[Tensor]:
-        """Outputs for other inputs."""
+    def launch(self, tensors: Sequence[Tensor | None]) -> None:
+        """Sets off with other inputs."""
         self._inputs.fill(tensors)
         self._replay()
+
+    def outputs(self) -> list[Tensor]:
+        """What came out of the last ``launch``."""
         return self._outputs.copies()
 
     def backward(self, cotangents: Sequence[Tensor | None], filled: Sequence[Tensor]) -> list[Tensor | None]:
-        """Gradients of the inputs of the last ``forward``; writes to those of its outputs that ``self.filled`` says."""
-        arrived = tuple(c is not None for c in cotangents)
+        """Gradients of the inputs of the last ``launch``; writes to those of its outputs that ``self.filled`` says."""
+        arrived = tuple([c is not None for c in cotangents])
         way = self._ways_back.get(arrived)
         if way is None and arrived in self._ways_back:
             way = self._ways_back[arrived] = _WayBack(self, cotangents)
@@ -186,10 +192,11 @@ class _Kind:
         bytes: Of inputs and outputs.
         idle: Recordings that are not in use.
         recordings: How many there are.
+        last_call: Number of the last of them, among all calls.
     """
 
     def __init__(self) -> None:
-        self.calls = self.bytes = self.recordings = 0
+        self.calls = self.bytes = self.recordings = self.last_call = 0
         self.idle: list[Recording] = []
 
     def lease(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> _Lease | None:
@@ -210,31 +217,34 @@ class _Kind:
         return lease
 
 
-_kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
-"""By key, the least recently called first."""
+_kinds: dict[Hashable, _Kind] = {}
+"""By key."""
+
+_calls = itertools.count()
 
 atexit.register(_kinds.clear)  # graphs go before CUDA does
 
 
 def _kind(key: Hashable) -> _Kind:
-    if key not in _kinds:
-        _kinds[key] = _Kind()
-        if len(_kinds) > MOST_KINDS:
-            _kinds.popitem(last=False)
-    _kinds.move_to_end(key)
-    return _kinds[key]
+    kind = _kinds.get(key)
+    if kind is None:
+        if len(_kinds) == MOST_KINDS:
+            del _kinds[min(_kinds, key=lambda key: _kinds[key].last_call)]
+        kind = _kinds[key] = _Kind()
+    kind.last_call = next(_calls)
+    return kind
 
 
 def _make_room() -> bool:
     """Whether another recording may be made; drops one of the least recent kind that has one to spare."""
     if sum(kind.recordings for kind in _kinds.values()) < MOST_RECORDINGS:
         return True
-    for kind in _kinds.values():
-        if kind.idle:
-            kind.idle.pop()
-            kind.recordings -= 1
-            return True
-    return False
+    to_spare = [kind for kind in _kinds.values() if kind.idle]
+    if to_spare:
+        kind = min(to_spare, key=lambda kind: kind.last_call)
+        kind.idle.pop()
+        kind.recordings -= 1
+    return bool(to_spare)
 
 
 class _Replayed(torch.autograd.Function):
@@ -244,25 +254,25 @@ class _Replayed(torch.autograd.Function):
         ctx.lease = lease
         # The recording has copies; but where a plain call could not be gone back from, this one cannot either.
         ctx.save_for_backward(*tensors)
-        outputs = lease.recording.forward(tensors)
+        outputs = lease.recording.outputs()
         ctx.filled = [outputs[k].detach() for k in lease.recording.filled]  # without their graph, which holds this
-        ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
+        ctx.mark_non_differentiable(*[o for o in outputs if not o.is_floating_point()])
         return tuple(outputs)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
-        with torch.no_grad():
+        with torch.set_grad_enabled(False):  # which is quicker than no_grad
             return None, *ctx.lease.recording.backward(cotangents, ctx.filled)
 
 
 def _stream(device: torch.device) -> int:
-    return torch.cuda.current_stream(device).cuda_stream
+    return torch.accelerator.current_stream(device.index).stream_id
 
 
 def _can_replay(device: torch.device) -> bool:
     return (
-        device.type == "cuda"
+        device != CPU  # device.type would be a string made anew
         and threading.current_thread() is threading.main_thread()
         and not profiling.is_on()
         and not torch.is_inference_mode_enabled()
@@ -282,7 +292,7 @@ def repeated(key: Hashable, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ..
     if not _can_replay(device):
         return differentiable(op, *tensors)
     wants = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
-    shapes = tuple(None if t is None else (t.shape, t.dtype, wants and t.requires_grad) for t in tensors)
+    shapes = tuple([None if t is None else (t.shape, t.dtype, wants and t.requires_grad) for t in tensors])
     kind = _kind((key, device, _stream(device), shapes))
     lease = kind.lease(op, tensors, wants)
     if lease is None:
@@ -290,6 +300,7 @@ def repeated(key: Hashable, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ..
         kind.calls += 1
         kind.bytes = sum(t.numel() * t.element_size() for t in (*tensors, *outputs) if t is not None)
         return outputs
-    if wants:
-        return _Replayed.apply(lease, *tensors)
-    return tuple(lease.recording.forward(tensors))
+    # The GPU has nothing to do until here, and enough while autograd takes its time.
+    with torch.set_grad_enabled(False):
+        lease.recording.launch(tensors)
+    return _Replayed.apply(lease, *tensors) if wants else tuple(lease.recording.outputs())
