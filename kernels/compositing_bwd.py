@@ -106,9 +106,11 @@ def make_composite_bwd(
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        num_blocks = tile_ranges.shape[0] * (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
-        walked = thread / lane_count() / num_blocks  # the image
-        block = thread / lane_count() % num_blocks
+        # The images of a tile follow each other, as much of what they read and add to is the same.
+        blocks_of_tile = (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
+        group = thread / lane_count()
+        walked = group / blocks_of_tile % wp.static(images)  # the image
+        block = group / (blocks_of_tile * wp.static(images)) * blocks_of_tile + group % blocks_of_tile
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves

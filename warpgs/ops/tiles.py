@@ -56,6 +56,7 @@ class _Budget:
 
     device: torch.device
     most: float | None = None
+    last: int = 0
     demand: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
@@ -64,14 +65,16 @@ class _Budget:
 
     def capacity(self, num_gaussians: int) -> int:
         """Buffer size for the next frame, in steps of an eighth so that the allocator sees few sizes."""
-        self.most = max(float(self.demand.item()), (self.most or 0.0) * DECAY)
+        self.last = int(self.demand.item())
+        self.most = max(float(self.last), (self.most or 0.0) * DECAY)
         wanted = max(int(self.most * HEADROOM), num_gaussians, 1024)
         step = 1 << max(wanted.bit_length() - 4, 0)
         return -(-wanted // step) * step
 
     def fits(self, capacity: int, num_gaussians: int) -> bool:
         """Whether buffers of a size hold what was needed last, and not much more than will be."""
-        return self.demand.item() <= capacity <= 2 * self.capacity(num_gaussians)
+        most_fitting = 2 * self.capacity(num_gaussians)
+        return self.last <= capacity <= most_fitting
 
 
 _budgets = threading.local()
