@@ -30,8 +30,8 @@ from .ops.tiles import forget_budgets, record_tiles
 from .scene.splats import Splats
 
 WARM_UPS = {"cuda": 50 + PLAIN_CALLS, "cpu": 1}
-"""Runs before the first that counts, until replays are recorded and clocks and threads are as in a long run; on CPU only
-compilation is to be kept out, and runs are long."""
+"""Runs before the first that counts, until replays are recorded and clocks and threads are as in the long run; on CPU
+only compilation is to be kept out, and runs are long."""
 
 VISIBLE_DIFFERENCE = 1e-3
 """Pixels that differ by more than this in any channel are counted."""
