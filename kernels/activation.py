@@ -14,8 +14,6 @@ q = a b of quaternions v_a = v_q b*, v_b = a* v_q, with the conjugate *.
 
 import warp as wp
 
-from .lean import lean_kernel
-
 IDENTITY = wp.constant(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
 
@@ -41,7 +39,7 @@ def turn_of(offsets: wp.array2d[float], i: int) -> wp.vec4:
     return IDENTITY + wp.vec4(offsets[i, 3], offsets[i, 4], offsets[i, 5], offsets[i, 6])
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def activate_fwd(
     first: int,
     first_row: int,
@@ -74,7 +72,7 @@ def activate_fwd(
     out_opacities[row] = 1.0 / (1.0 + wp.exp(-logit))
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def activate_bwd(
     first: int,
     first_row: int,
@@ -112,7 +110,7 @@ def activate_bwd(
     v_quats[i] = v_quat
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def join_sh_fwd(
     first: int,
     first_row: int,
@@ -136,7 +134,7 @@ def join_sh_fwd(
     sh[first_row + i, k] = value
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def join_sh_bwd(
     first: int,
     first_row: int,

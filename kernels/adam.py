@@ -7,8 +7,6 @@ m ← β₁ m + (1 − β₁) g,   v ← β₂ v + (1 − β₂) g²,   p ← p 
 
 import warp as wp
 
-from .lean import lean_kernel
-
 
 @wp.func
 def one_minus_power(log_base: float, exponent: float) -> float:
@@ -19,7 +17,7 @@ def one_minus_power(log_base: float, exponent: float) -> float:
     return 1.0 - wp.exp(x)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def adam_step(
     first: int,
     gradients: wp.array[float],

@@ -49,7 +49,6 @@ from .lanes import (
     stage_address,
     stage_get,
 )
-from .lean import lean_kernel
 from .rows import GEOMETRY_PARTS, row_load
 from .tiles import DYNAMIC
 
@@ -79,7 +78,7 @@ def make_composite_fwd(
     # looked at; the rest is the position in the list. (Of lists of one branch nobody asks.)
     branch_bits = 3 if images > 1 else 0
 
-    @lean_kernel(module="unique", module_options=module_options(P))
+    @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_fwd(
         first: int,
         tile_ranges: wp.array[wp.vec2i],

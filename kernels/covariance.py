@@ -15,7 +15,7 @@ def scaled_rotation(q: wp.vec4, s: wp.vec3) -> wp.mat33:
     return quaternion_to_rotation(q) * wp.diag(s)
 
 
-@wp.kernel(grid_stride=False)
+@wp.kernel
 def covariance(first: int, quats: wp.array[wp.vec4], scales: wp.array[wp.vec3], covariances: wp.array[wp.mat33]):
     i = first + wp.tid()
     if wp.length_sq(quats[i]) > 0.0:

@@ -12,7 +12,6 @@ import warp as wp
 
 from .absolute import slope_of_abs
 from .constants import SMALLEST_INVERSE_DEPTH
-from .lean import lean_kernel
 
 OPAQUE = wp.constant(0.5)
 """Opacity that a pixel must exceed to have a depth to speak of."""
@@ -35,7 +34,7 @@ def depth_difference(
     return result
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def depth_error_fwd(
     first: int,
     depth: wp.array[float],
@@ -50,7 +49,7 @@ def depth_error_fwd(
     errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, region, p))
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def depth_error_bwd(
     first: int,
     depth: wp.array[float],

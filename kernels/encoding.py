@@ -13,8 +13,6 @@ import math
 
 import warp as wp
 
-from .lean import lean_kernel
-
 CUDA_LANES_LOG2 = 3
 """Logarithm of the number of threads that share the frequencies of a value on CUDA."""
 
@@ -28,7 +26,7 @@ def make_encode(half: bool) -> wp.Kernel:
     """
     number = wp.float16 if half else wp.float32
 
-    @lean_kernel(module="unique", module_options={"fast_math": half})
+    @wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": half})
     def encode(
         first: int,
         means: wp.array2d[float],

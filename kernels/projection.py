@@ -25,7 +25,6 @@ import warp as wp
 
 from .constants import ALPHA_MIN, FIELD_OF_VIEW_MARGIN, LOW_PASS
 from .covariance import scaled_rotation
-from .lean import lean_kernel
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
@@ -69,7 +68,7 @@ def projection_jacobian(t: wp.vec3, fx: float, fy: float, u: float, v: float) ->
     return mat23(fx * rz, 0.0, -fx * u * rz, 0.0, fy * rz, -fy * v * rz)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def project_fwd(
     first: int,
     means: wp.array[wp.vec3],
@@ -142,7 +141,7 @@ def project_fwd(
     splat_opacities[i] = opacity
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def project_bwd(
     first: int,
     means: wp.array[wp.vec3],

@@ -18,8 +18,6 @@ pixel by interleaved gradient noise (Jimenez 2014), whose values differ as much 
 
 import warp as wp
 
-from .lean import lean_kernel
-
 SPHERE = wp.constant(0)
 CUBE = wp.constant(1)
 TORUS = wp.constant(2)
@@ -218,7 +216,7 @@ def shade(
     return (ambient + DIFFUSE * lit) * color + wp.vec3(SHINE * gloss * lit)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def raytrace_fwd(
     first: int,
     kinds: wp.array[int],

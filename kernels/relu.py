@@ -9,7 +9,6 @@ sums to be added up afterwards: neither atomics nor their order, so the same num
 import warp as wp
 
 from .lanes import native
-from .lean import lean_kernel
 
 PIECE = 8
 """Columns that a thread takes: 16 bytes."""
@@ -42,7 +41,7 @@ _MASK = native(
 def mask_piece(gradients: wp.array2d[wp.float16], features: wp.array2d[wp.float16], row: int, column: int) -> Piece: ...
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def relu_bwd(
     first: int,
     features: wp.array2d[wp.float16],

@@ -19,7 +19,6 @@ import warp as wp
 
 from .constants import ALPHA_MIN, CULLED_DEPTH, LOG2_E, NEVER_DRAWN
 from .lanes import native
-from .lean import lean_kernel
 
 GEOMETRY_PARTS = wp.constant(2)
 """vec4 values before the features."""
@@ -60,7 +59,7 @@ def gradient_stride(num_channels: int) -> int:
     return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def pack(
     first: int,
     means2d: wp.array[wp.vec2],
@@ -109,7 +108,7 @@ def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
     """
     num_channels = num_features + int(with_depth)
 
-    @lean_kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def pack_features(
         first: int,
         features: wp.array2d[float],
@@ -145,7 +144,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
     """
     num_channels = num_features + int(with_depth)
 
-    @lean_kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def unpack(
         first: int,
         conics: wp.array[wp.vec3],

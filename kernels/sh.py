@@ -10,8 +10,6 @@ import math
 
 import warp as wp
 
-from .lean import lean_kernel
-
 C0 = wp.constant(0.5 * math.sqrt(1.0 / math.pi))
 C1 = wp.constant(0.5 * math.sqrt(3.0 / math.pi))
 C2_XY = wp.constant(0.5 * math.sqrt(15.0 / math.pi))
@@ -99,7 +97,7 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
     return wp.vec3(0.0)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def sh_fwd(
     first: int,
     means: wp.array[wp.vec3],
@@ -124,7 +122,7 @@ def sh_fwd(
     colors[i] = color
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def sh_bwd(
     first: int,
     means: wp.array[wp.vec3],

@@ -27,7 +27,6 @@ import math
 import warp as wp
 
 from .absolute import slope_of_abs
-from .lean import lean_kernel
 
 WINDOW = 11
 RADIUS = 5
@@ -81,7 +80,7 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
     """Forward kernel, one thread for each strip, column and channel."""
     pixel = sample_masked if with_mask else sample
 
-    @lean_kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def ssim_fwd(
         first: int,
         image: wp.array3d[float],
@@ -160,7 +159,7 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
     """Backward kernel, launched like the forward one."""
     pixel = sample_masked if with_mask else sample
 
-    @lean_kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def ssim_bwd(
         first: int,
         image: wp.array3d[float],

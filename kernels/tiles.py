@@ -18,7 +18,6 @@ import warp as wp
 from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
 from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
-from .lean import lean_kernel
 from .rows import row_load
 
 SLACK = wp.constant(0.01)
@@ -78,7 +77,7 @@ def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, 
     return wp.vec2i(wp.max(low, 0), wp.min(high, tiles_x - 1) + 1)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def count_tiles(
     first: int,
     rows: wp.array2d[wp.vec4],
@@ -101,7 +100,7 @@ def count_tiles(
     num_tiles_of_rank[rank] = wp.int64(count)
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def emit_isects(
     first: int,
     rows: wp.array2d[wp.vec4],
@@ -189,7 +188,7 @@ def emit_isects(
             gaussian_from_isect[k] = big_gaussian
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def tile_ranges(
     first: int,
     end_of_rank: wp.array[wp.int64],
@@ -227,7 +226,7 @@ def tile_ranges(
             ranges[tile + 1, 0] = thread
 
 
-@lean_kernel
+@wp.kernel(enable_backward=False)
 def split_tiles(
     first: int,
     ranges: wp.array2d[int],

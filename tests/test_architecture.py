@@ -103,7 +103,7 @@ def defines_kernels(path: Path) -> bool:
         if isinstance(node, ast.FunctionDef)
         for decorator in node.decorator_list
     ]
-    return any(name.startswith(("wp.kernel", "lean_kernel")) for name in decorators)
+    return any(name.startswith("wp.kernel") for name in decorators)
 
 
 def test_every_file_of_kernels_has_an_op_of_the_same_name():
