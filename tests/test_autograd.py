@@ -7,7 +7,10 @@ import pytest
 import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
+from warpgs.config import RenderSettings
 from warpgs.ops import tape
+from warpgs.ops.projection import project
+from warpgs.ops.sh import spherical_harmonics
 from warpgs.render import render
 
 CAMERA = make_camera()
@@ -41,6 +44,46 @@ def test_a_parameter_changed_in_place_before_going_back_is_an_error(name):
         getattr(splats, name).add_(0.01)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         loss.backward()
+
+
+def render_layers(splats, background):
+    rendering = render(splats, CAMERA, background, RenderSettings(depth=True, branches=True))
+    return {"radii": rendering.radii, **rendering.dynamic._asdict()}
+
+
+@pytest.mark.parametrize("name", ["radii", "depth", "alpha"])
+def test_an_output_that_the_way_back_reads_may_not_be_changed_before(name):
+    splats, background = as_leaves(make_splats()), torch.zeros(3, requires_grad=True)
+    layers = render_layers(splats, background)
+    loss = layers["image"].sum() + layers["depth"].sum()
+    with torch.no_grad():
+        layers[name].mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+@pytest.mark.parametrize("name", ["image", "alpha"])
+def test_other_outputs_may_be_changed_and_gradients_know(name):
+    found = []
+    for multiply in (torch.mul, torch.Tensor.mul_):
+        splats = as_leaves(make_splats())
+        multiply(render_layers(splats, torch.zeros(3))[name], 2).square().sum().backward()
+        found.append(splats.means.grad)
+    assert torch.equal(*found)
+
+
+def test_so_it_is_with_outputs_of_ops():
+    splats = as_leaves(make_splats())
+    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
+    for change in ("conics", "radii"):
+        projected = project(*geometry, CAMERA.viewmat, CAMERA.K, CAMERA.size)
+        with torch.no_grad():
+            getattr(projected, change).mul_(2)
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            projected.means2d.sum().backward()
+    colors = spherical_harmonics(splats.means, splats.sh, CAMERA.viewmat)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        colors.clamp_(max=0.5).sum().backward()
 
 
 def test_gradients_go_on_to_what_the_parameters_came_from():

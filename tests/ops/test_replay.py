@@ -141,6 +141,10 @@ def test_every_image_alone_can_be_gone_back_from(recordings):
 def test_mistakes_are_noticed_as_ever(num_before, recordings):
     for _ in range(num_before):
         everything(draw())
+    _, result, images = draw()
+    result.radii.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        images[0].sum().backward()
     changed = draw()
     with torch.no_grad():
         changed[0].means.add_(1.0)

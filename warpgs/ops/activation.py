@@ -133,7 +133,7 @@ def _record_branch(run: Run, raw: Sequence[Tensor], changes: Changes, out: Activ
             if tensor is not None and value is not None:
                 run.add_adjoint(tensor, value)
 
-    run.on_backward(backward)
+    run.on_backward(backward, reads=(out.scales, out.opacities))
 
 
 def join_sh(static: Raw, dynamic: Raw, residuals: Float[Tensor, "N R 3"] | None = None) -> Float[Tensor, "M bases 3"]:

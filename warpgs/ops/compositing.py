@@ -144,6 +144,8 @@ def record_composite(
         None if weights is None else PerShard(weights),
     )
 
+    wanted_background = None if background is None or not run.wants(background) else background
+
     def backward(run: Run) -> None:
         v_layers = [[run.adjoint(t) for t in tensors] for tensors in layers]
         arrived = sum({1 << m for values in v_layers for m, v in enumerate(values) if v is not None})
@@ -170,15 +172,15 @@ def record_composite(
             PerShard(gradients),
         )
         run.add_adjoint(rows.packed, gradients)
-        if background is not None and run.wants(background):
+        if wanted_background is not None:
             seen = (1.0 - alpha).view(images, 1, -1)
             v_behind = torch.zeros(images, num_features, device=run.device)
             for m, v_image in enumerate(v_layers[0]):
                 if v_image is not None:
                     v_behind[m] = (seen[m] @ v_image.view(-1, num_features))[0]
-            run.add_adjoint(background, v_behind.sum(0) if background.ndim == 1 else v_behind)
+            run.add_adjoint(wanted_background, v_behind.sum(0) if stride == 0 else v_behind)
 
-    run.on_backward(backward)
+    run.on_backward(backward, reads=(*layers[2], *(() if wanted_background is None else layers[1])))
     return Composite(
         *layers,
         norms=rows.norms,

@@ -70,7 +70,7 @@ def record_projection(
         for tensor, gradient in zip(inputs, gradients, strict=True):
             run.add_adjoint(tensor, gradient)
 
-    run.on_backward(backward)
+    run.on_backward(backward, reads=(splats.conics, splats.radii))
     return splats
 
 

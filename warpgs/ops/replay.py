@@ -21,7 +21,7 @@ from torch import Tensor
 from . import profiling
 from .graph import record
 from .streams import PRIORITY
-from .tape import Op, Run, differentiable
+from .tape import Op, Run, differentiable, indices
 
 CPU = torch.device("cpu")
 
@@ -104,6 +104,7 @@ class Recording:
 
     Attributes:
         filled: Indices of the outputs that the way back writes to.
+        read: Indices of the outputs that it reads.
     """
 
     def __init__(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> None:
@@ -154,7 +155,7 @@ class Recording:
         with torch.no_grad():
             outputs = op(self._run, *inputs)
         self._outputs = _Buffers(outputs)
-        self.filled = [k for k, o in enumerate(outputs) if any(o is t for t in self._run.filled)]
+        self.filled, self.read = (indices(some, outputs) for some in (self._run.filled, self._run.read))
 
     def go_back(self, cotangents: Sequence[Tensor | None]) -> list[Tensor | None]:
         """The way back itself."""
@@ -252,9 +253,9 @@ class _Replayed(torch.autograd.Function):
     def forward(ctx: Any, lease: _Lease, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.lease = lease
-        # The recording has copies; but where a plain call could not be gone back from, this one cannot either.
-        ctx.save_for_backward(*tensors)
         outputs = lease.recording.outputs()
+        # The recording has copies; but where a plain call could not be gone back from, this one cannot either.
+        ctx.save_for_backward(*tensors, *[outputs[k] for k in lease.recording.read])
         ctx.filled = [outputs[k].detach() for k in lease.recording.filled]  # without their graph, which holds this
         ctx.mark_non_differentiable(*[o for o in outputs if not o.is_floating_point()])
         return tuple(outputs)

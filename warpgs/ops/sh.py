@@ -45,7 +45,7 @@ def record_sh(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tenso
         run.add_adjoint(means, v_means)
         run.add_adjoint(sh, v_sh)
 
-    run.on_backward(backward)
+    run.on_backward(backward, reads=(colors,))
     return colors
 
 

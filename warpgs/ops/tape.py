@@ -62,6 +62,7 @@ class Run:
         needs_grad: Whether anything will ask for gradients; if not, ops keep nothing for the way back.
         num_shards: Cores that a CPU launch is spread over (``torch.get_num_threads()``); 1 on CUDA.
         filled: Outputs of the op that the way back writes to.
+        read: What the way back reads and nobody may change meanwhile, if it is an output of the op.
         conditions: What has to hold for the launches to do the same job again, for other values of the tensors.
     """
 
@@ -74,6 +75,7 @@ class Run:
         self._warp_device = wp.device_from_torch(device)
         self.stream = self._current_stream()
         self.filled: list[Tensor] = []
+        self.read: list[Tensor] = []
         self.conditions: list[Callable[[], bool]] = []
         self._tape = wp.Tape()
         self._adjoints: dict[int, Tensor | None] = {}
@@ -91,13 +93,15 @@ class Run:
 
     # Going back -------------------------------------------------------------------------------------------------------
 
-    def on_backward(self, function: Callable[["Run"], None]) -> None:
+    def on_backward(self, function: Callable[["Run"], None], reads: Sequence[Tensor] = ()) -> None:
         """Records how to go back over what was just launched; called with the run, in reverse order.
 
         The function takes the run as its argument and must not hold it: the run holds the function, and in a cycle
-        the memory of a whole render would wait for Python's garbage collector.
+        the memory of a whole render would wait for Python's garbage collector. ``reads`` are those tensors it reads
+        that may be outputs of the op.
         """
         if self.needs_grad:
+            self.read += reads
             this = weakref.proxy(self)
             self._tape.record_func(lambda: function(this), [])
 
@@ -211,6 +215,11 @@ def _int_array(pointer: int, size: int, device: str) -> wp.array:
     return wp.array(ptr=pointer, dtype=wp.int32, shape=(size,), device=device)
 
 
+def indices(some: Sequence[Tensor], tensors: Sequence[Tensor]) -> list[int]:
+    """Where those that are among some are in a sequence of tensors."""
+    return [k for k, tensor in enumerate(tensors) if any(tensor is s for s in some)]
+
+
 class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
@@ -219,10 +228,10 @@ class _Differentiable(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.raw_inputs = tensors
         ctx.raw_outputs = op(ctx.run, *tensors)
-        # Saving the inputs makes torch notice when they are changed in place before the way back. The outputs are
-        # handed out as aliases, because the run keeps the originals and would otherwise keep its own graph alive.
-        ctx.save_for_backward(*tensors)
+        # The outputs are handed out as aliases, because the run keeps the originals and would otherwise keep its own
+        # graph alive. Saving what the way back reads makes torch notice when that is changed in place before.
         outputs = tuple(o.detach() for o in ctx.raw_outputs)
+        ctx.save_for_backward(*tensors, *(outputs[k] for k in indices(ctx.run.read, ctx.raw_outputs)))
         ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
         return outputs
 
