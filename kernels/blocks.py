@@ -37,14 +37,20 @@ def module_options(pixels_per_lane: int) -> dict[str, object]:
 
 
 @wp.func
+def blocks_of_tile(block_width: int, block_height: int) -> int:
+    """How many blocks a tile is cut into."""
+    return (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
+
+
+@wp.func
 def block_corner(block: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
     """Tile index, left and top [px] of an image's block; the blocks of a tile follow each other."""
+    tile = block / blocks_of_tile(block_width, block_height)
+    block_of_tile = block % blocks_of_tile(block_width, block_height)
     blocks_x = TILE_SIZE / block_width
-    blocks = blocks_x * (TILE_SIZE / block_height)
-    tile = block / blocks
     tiles_x = (width + TILE_SIZE - 1) / TILE_SIZE
-    left = (tile % tiles_x) * TILE_SIZE + (block % blocks % blocks_x) * block_width
-    top = (tile / tiles_x) * TILE_SIZE + (block % blocks / blocks_x) * block_height
+    left = (tile % tiles_x) * TILE_SIZE + (block_of_tile % blocks_x) * block_width
+    top = (tile / tiles_x) * TILE_SIZE + (block_of_tile / blocks_x) * block_height
     return wp.vec3i(tile, left, top)
 
 

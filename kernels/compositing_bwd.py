@@ -14,8 +14,17 @@ import functools
 
 import warp as wp
 
-from .blocks import block_box, block_corner, is_joint, module_options, stage_survivors, state_types, tile_list
-from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TILE_SIZE
+from .blocks import (
+    block_box,
+    block_corner,
+    blocks_of_tile,
+    is_joint,
+    module_options,
+    stage_survivors,
+    state_types,
+    tile_list,
+)
+from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, SMALLEST_ALPHA
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -39,13 +48,19 @@ from .tiles import DYNAMIC
 @wp.func_native(
     """
     const float* values = image == 0 ? joint.data : image == 1 ? of_static.data : of_dynamic.data;
-    return values ? values[i] : 0.0f;
+    return values ? values[(size_t)pixel * channels + channel] : 0.0f;
     """
 )
 def read_of(
-    image: int, joint: wp.array[float], of_static: wp.array[float], of_dynamic: wp.array[float], i: int
+    image: int,
+    joint: wp.array[float],
+    of_static: wp.array[float],
+    of_dynamic: wp.array[float],
+    pixel: int,
+    channels: int,
+    channel: int,
 ) -> float:
-    """Element i of what arrived at an image."""
+    """A channel of what arrived at a pixel of an image; zero where the image's array is not there."""
     ...
 
 
@@ -53,19 +68,19 @@ def read_of(
 def make_composite_bwd(
     num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absolute: bool
 ) -> wp.Kernel:
-    """Reverse walk, launched like the forward kernel.
+    """Reverse walk, with as many threads as the forward kernel.
 
     Args:
         num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
         absolute: Whether the absolute-value variant of the means' gradient is gathered too.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero. Cotangents arrive image by image, and
-    an array of length 0 is zero everywhere; bit m of ``arrived`` says whether there are any of image m.
+    an array that is not there is zero everywhere; bit m of ``arrived`` says whether there are any of image m.
 
-    The walk knows depth as one more channel, D = Σ_i alpha_i T_i depth_i. What was made of it is, with A = max(alpha,
-    SMALLEST_ALPHA),
+    The walk knows depth as one more channel, D = Σ_i alpha_i T_i depth_i. What was made of it is, wherever something
+    was drawn (elsewhere nobody asks),
 
-        depth = D / A,      v_D = v_depth / A,      v_alpha += -v_depth D / A²  where alpha is not below SMALLEST_ALPHA.
+        depth = D / alpha,      v_D = v_depth / alpha,      v_alpha += -v_depth D / alpha².
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
@@ -73,7 +88,7 @@ def make_composite_bwd(
     scalars, integers, colors, features_vector = state_types(C, P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
-    # Without the loop that Warp puts around an index this takes 4 % less time; other kernels take as much or more.
+    # Without the loop that Warp would put around an index; which kernels gain from that is in docs/performance.md.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
@@ -107,10 +122,10 @@ def make_composite_bwd(
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
         # The images of a tile follow each other, as much of what they read and add to is the same.
-        blocks_of_tile = (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
         group = thread / lane_count()
-        walked = group / blocks_of_tile % wp.static(images)  # the image
-        block = group / (blocks_of_tile * wp.static(images)) * blocks_of_tile + group % blocks_of_tile
+        blocks = blocks_of_tile(block_width, block_height)
+        walked = group / blocks % wp.static(images)  # the image
+        block = group / (blocks * wp.static(images)) * blocks + group % blocks
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
@@ -128,7 +143,8 @@ def make_composite_bwd(
                             return
                     elif walked == m:
                         source = 0
-        if (arrived & gone_back) == 0:
+        gone_back = gone_back & arrived
+        if gone_back == 0:
             return
         isects = tile_list(source, corner[0], tile_ranges, branch_lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
@@ -153,26 +169,20 @@ def make_composite_bwd(
                     n[k] = last[source * height * width + pixel]
                     n_max = wp.max(n_max, n[k])
                     for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
-                        if (arrived & gone_back & (1 << m)) != 0:
-                            behind = -read_of(m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel)
+                        if (gone_back & (1 << m)) != 0:
+                            behind = -read_of(m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel, 1, 0)
                             for c in range(wp.static(num_features)):
                                 v = read_of(
-                                    m,
-                                    v_image_joint,
-                                    v_image_static,
-                                    v_image_dynamic,
-                                    pixel * wp.static(num_features) + c,
+                                    m, v_image_joint, v_image_static, v_image_dynamic, pixel, wp.static(num_features), c
                                 )
                                 v_color[k * wp.static(C) + c] += v
                                 if background.shape[0] > 0:
                                     behind += background[m * background_stride + c] * v
                             if wp.static(with_depth):
-                                a = 1.0 - T[k]
-                                v_depth = read_of(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel)
-                                v_drawn = v_depth / wp.max(a, SMALLEST_ALPHA)
+                                v_depth = read_of(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
+                                v_drawn = v_depth / wp.max(1.0 - T[k], SMALLEST_ALPHA)
                                 v_color[k * wp.static(C) + wp.static(num_features)] += v_drawn
-                                if a >= SMALLEST_ALPHA:
-                                    behind += v_drawn * depth[m * height * width + pixel]
+                                behind += v_drawn * depth[m * height * width + pixel]
                             R[k] += T[k] * behind
         n_max = lane_max(n_max)  # from here on the lane group's
 

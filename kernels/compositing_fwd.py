@@ -26,13 +26,14 @@ from .blocks import (
     Counter,
     block_box,
     block_corner,
+    blocks_of_tile,
     is_joint,
     module_options,
     stage_survivors,
     state_types,
     tile_list,
 )
-from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TILE_SIZE, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -103,17 +104,20 @@ def make_composite_fwd(
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        num_blocks = tile_ranges.shape[0] * (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
+        num_blocks = tile_ranges.shape[0] * blocks_of_tile(block_width, block_height)
         walked = thread / lane_count() / num_blocks  # the image
         block = thread / lane_count() % num_blocks
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        if wp.static(images > 1):
-            # Of a tile without Gaussians of the other branch that is known beforehand.
-            if walked > 0 and (is_joint(walked, looked[block]) or branch_lengths[corner[0]][2 - walked] == 0):
-                return  # the joint image's lane group writes this one
         isects = tile_list(walked, corner[0], tile_ranges, branch_lengths, half)
+        if wp.static(images > 1):
+            if walked > 0:
+                # In a tile without Gaussians of the other branch it is known beforehand. Lanes may read ``looked`` at
+                # different moments, and so they vote.
+                all_isects = tile_list(0, corner[0], tile_ranges, branch_lengths, half)
+                if lane_any(int(isects[2] == all_isects[2] or is_joint(walked, looked[block]))) != 0:
+                    return  # the joint image's lane group writes this one
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()

@@ -32,6 +32,9 @@ DYNAMIC = wp.constant(1 << 30)
 """Bit of an intersection whose Gaussian is dynamic, where there are branches; the others are the Gaussian's index. To
 look the branch up for every intersection would be to read all over memory."""
 
+MOST_WITH_BRANCHES = 1 << 29
+"""Gaussians that there must be fewer of with branches: a place in a list shares an int with two bits."""
+
 
 LOOKS = wp.constant(4)
 """Intersections that a lane looks at in one go when tiles are split: they are on their way together."""

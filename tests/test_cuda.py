@@ -3,7 +3,6 @@
 import dataclasses
 import gc
 import weakref
-from collections import OrderedDict
 
 import pytest
 import torch
@@ -91,6 +90,21 @@ def test_losses_and_their_gradients_are_those_of_the_cpu():
         assert relative_error(actual, expected) < 1e-5
 
 
+@pytest.mark.parametrize("size", [(300, 200), (1100, 900)])
+def test_every_image_is_that_of_its_splats_drawn_alone(size):
+    splats, camera = make_splats(4000).to("cuda"), make_camera(*size).to("cuda")
+    splats.opacities.clamp_(min=0.5)
+    in_front = splats.means @ camera.viewmat[2, :3] < torch.quantile(splats.means @ camera.viewmat[2, :3], 0.3)
+    for dynamic in (in_front, ~in_front, splats.means[:, 0] < 0):
+        branches = dataclasses.replace(splats, is_dynamic=dynamic)
+        rendering = render(branches, camera, settings=RenderSettings(branches=True))
+        for drawn, layer in ((~dynamic, rendering.static), (dynamic, rendering.dynamic)):
+            fields = {n: t[drawn] for n in splats.tensor_names() if (t := getattr(splats, n)) is not None}
+            alone = render(dataclasses.replace(splats, **fields), camera).joint
+            assert relative_error(layer.image, alone.image) < 1e-5
+            assert relative_error(layer.alpha, alone.alpha) < 1e-5
+
+
 def test_an_empty_scene_is_background():
     behind = torch.tensor([0.1, 0.2, 0.3], device="cuda")
     image = render(make_splats(0).to("cuda"), make_camera().to("cuda"), behind).joint.image
@@ -116,7 +130,7 @@ def test_a_render_can_be_captured_and_replayed():
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=["plain", "branches", "depth", "all depths"])
 def test_renders_that_repeat_are_replayed(settings, monkeypatch):
-    monkeypatch.setattr(replay, "_kinds", OrderedDict())
+    monkeypatch.setattr(replay, "_kinds", {})
     for seed in range(2 * PLAIN_CALLS):
         plain = drawn("cuda", dataclasses.replace(settings, replay=False), seed=seed)
         for actual, expected in zip(drawn("cuda", settings, seed=seed), plain, strict=True):

@@ -5,8 +5,10 @@ import torch
 
 from tests.reference.compositing import composite as reference
 from tests.scenes import error, generator, pulled, random_like, relative_error
+from warpgs.ops.commands import command_for
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection
+from warpgs.ops.tape import Run
 
 SIZE = (50, 37)
 INPUTS = ("means2d", "conics", "opacities", "features", "background")
@@ -176,6 +178,42 @@ def test_behind_a_wall_of_one_branch_the_other_has_an_image_of_its_own(wall_is_d
     pulled(expected, cotangents).backward()
     for name, actual, wanted in zip(INPUTS, single, double, strict=False):
         assert relative_error(actual.grad, wanted.grad) < 1e-5, name
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("make", [make_inputs, make_walled_inputs])
+def test_every_image_is_that_of_its_splats_drawn_alone(make, seed, monkeypatch):
+    size = (112, 80)  # with splats that reach into more tiles than one thread writes
+    inputs = make(60, size)
+    inputs[1][::4] = torch.tensor([1e-4, 0.0, 1e-4])
+    inputs[2] *= torch.rand(60, generator=generator(seed))
+    dynamic = torch.rand(60, generator=generator(seed)) < (0.1, 0.5, 0.9, 0.5)[seed]
+    alone = [ours([t if t.shape[0] != 60 else t[drawn] for t in inputs], size) for drawn in (~dynamic, dynamic)]
+    launch = Run._launch
+    for backwards in (False, True):  # as on a GPU, where a branch's image may begin before the joint one ends
+
+        def run_kernel(run, kernel, dim, arguments, block_dim, work, backwards=backwards):
+            if not backwards or kernel.func.__name__ != "composite_fwd":
+                return launch(run, kernel, dim, arguments, block_dim, work)
+            for thread in reversed(range(dim)):
+                command_for(kernel, run.device, 1)(1, thread, arguments, None, 0)
+
+        monkeypatch.setattr(Run, "_launch", run_kernel)
+        result = ours(inputs, size, is_dynamic=dynamic)
+        for k, expected in enumerate([ours(inputs, size), *alone]):
+            assert torch.equal(result.images[k], expected.images[0])
+            assert torch.equal(result.alphas[k], expected.alphas[0])
+
+
+def test_a_splat_that_closes_a_pixel_of_the_joint_image_alone_makes_it_differ():
+    conics, means2d = torch.tensor([[0.01, 0.0, 0.01]]).repeat(4, 1), torch.full((4, 2), 0.5)
+    opacities, depths = torch.tensor([0.99, 0.98, 0.9, 0.4]), torch.arange(1.0, 5.0)
+    inputs = [means2d, conics, opacities, torch.eye(4), torch.zeros(4), depths]
+    dynamic = torch.arange(4) == 2
+    static = ours([t if t is inputs[4] else t[~dynamic] for t in inputs], (1, 1))
+    images = ours(inputs, (1, 1), is_dynamic=dynamic).images
+    assert torch.equal(images[1], static.images[0])
+    assert not torch.equal(images[1], images[0])
 
 
 FEW = make_inputs(8, size=(20, 17))

@@ -34,10 +34,10 @@ def recordings(monkeypatch):
     return made
 
 
-def draw(seed=0, settings=SETTINGS[0]):
+def draw(seed=0, settings=SETTINGS[0], camera=None):
     """A new scene's splats, what is rendered of them, and all images of that."""
     splats = as_leaves(make_splats(seed=seed))
-    result = render(splats, make_camera(), torch.linspace(0.1, 0.8, 3), settings)
+    result = render(splats, camera or make_camera(), torch.linspace(0.1, 0.8, 3), settings)
     layers = [layer for layer in (result.joint, result.static, result.dynamic) if layer is not None]
     return splats, result, [value for layer in layers for value in layer if value is not None]
 
@@ -135,6 +135,31 @@ def test_every_image_alone_can_be_gone_back_from(recordings):
             images[k].sum().backward()
             for name, gradient in gradients(plain).items():
                 assert torch.equal(gradients(splats)[name], gradient)
+
+
+def test_a_recording_has_nothing_of_what_its_inputs_came_from(recordings):
+    for _ in range(replay.PLAIN_CALLS + 2):
+        everything(draw())
+    (kind,) = replay._kinds.values()
+    assert not any(t.requires_grad for t in kind.idle[0]._inputs._own_words)
+
+
+def sizes_drawn(sizes):
+    for size in sizes:
+        everything(draw(camera=make_camera(*size)))
+
+
+def test_kinds_and_recordings_that_are_called_are_kept(recordings):
+    often = (40, 30)
+    sizes_drawn([often] * (replay.PLAIN_CALLS + 2))
+    others = [(20 + k, 10) for k in range(2 * replay.MOST_KINDS)]
+    for other in others:
+        sizes_drawn([other, often])
+    made = len(recordings)
+    for other in others[: replay.MOST_RECORDINGS + 1]:
+        sizes_drawn([*[other] * (replay.PLAIN_CALLS + 2), often])
+    sizes_drawn([often])
+    assert len(recordings) == made + 2 * (replay.MOST_RECORDINGS + 1)
 
 
 @pytest.mark.parametrize("num_before", [0, replay.PLAIN_CALLS])

@@ -34,6 +34,9 @@ SMALL = 1 << 18
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
+MOST_PIXELS = 1 << 31
+"""Pixels that there must be fewer of in all images, because kernels count them with ints."""
+
 
 class Composite(NamedTuple):
     """What compositing makes: one entry per image (joint; or joint, static, dynamic), and statistics if asked for.
@@ -73,11 +76,13 @@ def is_small(size: tuple[int, int]) -> bool:
     return size[0] * size[1] <= SMALL
 
 
-def _pixels(run: Run, size: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows of pixels that a lane composites."""
+def _cut(run: Run, size: tuple[int, int], num_tiles: int) -> tuple[tuple[int, int], int, int]:
+    """How an image is cut up: columns and rows of pixels of a lane, number of blocks, lanes of the group of each."""
     if not run.is_cuda:
-        return CPU_PIXELS
-    return CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
+        return CPU_PIXELS, num_tiles, 1
+    columns, rows = CUDA_PIXELS_OF_SMALL if is_small(size) else CUDA_PIXELS
+    blocks_of_tile = (TILE_SIZE // (WARP_COLUMNS * columns)) * (TILE_SIZE // (WARP_ROWS * rows))
+    return (columns, rows), num_tiles * blocks_of_tile, WARP_SIZE
 
 
 def record_composite(
@@ -93,11 +98,16 @@ def record_composite(
 
     ``background`` is [features], or [images, features] with another one for each image; none is black. There is none
     behind depth.
+
+    Raises:
+        ValueError: If all images together have too many pixels to be counted.
     """
     width, height = size
     C, num_features = rows.num_channels, rows.num_features
     N = rows.packed.shape[0]
     images = 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
+    if images * height * width >= MOST_PIXELS:
+        raise ValueError(f"{images} images of {width} x {height} pixels are too large to be drawn at once")
     image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None
     layers = (tuple(image), tuple(alpha), () if depth is None else tuple(depth))
@@ -107,9 +117,7 @@ def record_composite(
     contributed = run.zeros(N, dtype=torch.uint8) if statistics else None
     weights = run.zeros(run.num_shards, N) if statistics else None
 
-    pixels = _pixels(run, size)
-    lanes, across, down = (WARP_SIZE, WARP_COLUMNS, WARP_ROWS) if run.is_cuda else (1, 1, 1)
-    blocks = len(tiles.ranges) * (TILE_SIZE // (across * pixels[0])) * (TILE_SIZE // (down * pixels[1]))
+    pixels, blocks, lanes = _cut(run, size, len(tiles.ranges))
     looked = None if images == 1 else run.zeros(blocks, dtype=torch.int32)
 
     def launch(run: Run, make_kernel: Callable[..., Any], flag: bool, *arguments: Any) -> None:

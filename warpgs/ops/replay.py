@@ -10,7 +10,6 @@ thread records and replays; other threads call plainly.
 """
 
 import atexit
-import itertools
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -193,11 +192,10 @@ class _Kind:
         bytes: Of inputs and outputs.
         idle: Recordings that are not in use.
         recordings: How many there are.
-        last_call: Number of the last of them, among all calls.
     """
 
     def __init__(self) -> None:
-        self.calls = self.bytes = self.recordings = self.last_call = 0
+        self.calls = self.bytes = self.recordings = 0
         self.idle: list[Recording] = []
 
     def lease(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> _Lease | None:
@@ -219,20 +217,16 @@ class _Kind:
 
 
 _kinds: dict[Hashable, _Kind] = {}
-"""By key."""
-
-_calls = itertools.count()
+"""By key, the least recently called first."""
 
 atexit.register(_kinds.clear)  # graphs go before CUDA does
 
 
 def _kind(key: Hashable) -> _Kind:
-    kind = _kinds.get(key)
-    if kind is None:
-        if len(_kinds) == MOST_KINDS:
-            del _kinds[min(_kinds, key=lambda key: _kinds[key].last_call)]
-        kind = _kinds[key] = _Kind()
-    kind.last_call = next(_calls)
+    kind = _kinds.pop(key, None) or _Kind()
+    if len(_kinds) == MOST_KINDS:
+        del _kinds[next(iter(_kinds))]
+    _kinds[key] = kind
     return kind
 
 
@@ -240,12 +234,12 @@ def _make_room() -> bool:
     """Whether another recording may be made; drops one of the least recent kind that has one to spare."""
     if sum(kind.recordings for kind in _kinds.values()) < MOST_RECORDINGS:
         return True
-    to_spare = [kind for kind in _kinds.values() if kind.idle]
-    if to_spare:
-        kind = min(to_spare, key=lambda kind: kind.last_call)
-        kind.idle.pop()
-        kind.recordings -= 1
-    return bool(to_spare)
+    for kind in _kinds.values():
+        if kind.idle:
+            kind.idle.pop()
+            kind.recordings -= 1
+            return True
+    return False
 
 
 class _Replayed(torch.autograd.Function):
@@ -268,6 +262,7 @@ class _Replayed(torch.autograd.Function):
 
 
 def _stream(device: torch.device) -> int:
+    """A number for torch's current stream; to ask so is quicker than to have a ``torch.cuda.Stream`` made."""
     return torch.accelerator.current_stream(device.index).stream_id
 
 

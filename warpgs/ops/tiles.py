@@ -102,12 +102,17 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int], is_dynamic: 
     """Bins splats into the tiles of an image of ``size`` (width, height), with ``is_dynamic`` [N] uint8 by branch, too.
 
     Waits for the device only on the first frame of a size; later frames provide for what earlier ones needed.
+
+    Raises:
+        ValueError: If there are too many splats with branches.
     """
     rows, gaussian_from_rank = splat_rows.packed, splat_rows.gaussian_from_rank
     N = rows.shape[0]
     tiles_x, tiles_y = num_tiles(*size)
     total = tiles_x * tiles_y
     int32 = torch.int32
+    if is_dynamic is not None and N >= kernels.MOST_WITH_BRANCHES:
+        raise ValueError(f"with branches there must be fewer than {kernels.MOST_WITH_BRANCHES} Gaussians, got {N}")
     if N == 0 or total == 0:
         nothing = run.zeros(total, 2, dtype=int32)
         demand = torch.zeros(1, dtype=torch.int64)
