@@ -155,6 +155,7 @@ def test_kinds_and_recordings_that_are_called_are_kept(recordings):
     others = [(20 + k, 10) for k in range(2 * replay.MOST_KINDS)]
     for other in others:
         sizes_drawn([other, often])
+    assert [kind.recordings for kind in replay._kinds.values()] == [0] * (replay.MOST_KINDS - 1) + [1]
     made = len(recordings)
     for other in others[: replay.MOST_RECORDINGS + 1]:
         sizes_drawn([*[other] * (replay.PLAIN_CALLS + 2), often])
