@@ -33,6 +33,12 @@ def is_rigid(path):
 # Between cameras ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("target", "up"), [((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), ((1.0, 2.0, 5.0), (0.0, 0.0, -2.0))])
+def test_a_camera_that_looks_nowhere_or_along_up_is_refused(target, up):
+    with pytest.raises(ValueError, match="there must be a way to go, and not along up"):
+        Camera.looking_at(torch.tensor([1.0, 2.0, 3.0]), torch.tensor(target), torch.tensor(up), 9.0, (4, 4))
+
+
 @pytest.mark.parametrize("smooth", [False, True])
 def test_a_path_goes_through_its_cameras(smooth):
     cameras = [camera(0.0, 0.2), camera(0.5, 0.4, focal=80.0), camera(-0.3, 0.9)]

@@ -255,6 +255,19 @@ def test_splats_of_one_branch_leave_the_other_image_background(dynamic):
     assert torch.equal(other.image, background().expand(HEIGHT, WIDTH, 3))
 
 
+def test_statistics_keep_nothing_of_the_way_back():
+    rendering = render(as_leaves(make_splats()), CAMERA, background(), EVERYTHING)
+    assert rendering.joint.image.requires_grad
+    assert not rendering.gradient_norms.requires_grad
+    assert not rendering.weights.requires_grad
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_near_plane_is_in_front(near):
+    with pytest.raises(ValueError, match="near must be positive and finite"):
+        RenderSettings(near=near)
+
+
 def test_branches_need_to_know_the_branch():
     splats = dataclasses.replace(make_splats(), is_dynamic=None)
     with pytest.raises(ValueError, match="is_dynamic"):

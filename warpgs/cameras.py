@@ -80,7 +80,16 @@ class Camera:
         """A camera at ``position`` that sees ``target`` in the middle of an image of ``size`` (width, height).
 
         ``up`` points up in the world; ``focal`` is the focal length [px].
+
+        Raises:
+            ValueError: If the camera would look nowhere, or along ``up``.
         """
+        sideways = torch.linalg.cross(target - position, up).norm()
+        if not sideways > 1e-6 * (target - position).norm() * up.norm():
+            raise ValueError(
+                f"a camera at {position.tolist()} cannot look at {target.tolist()} with {up.tolist()} up: "
+                "there must be a way to go, and not along up"
+            )
         forward = torch.nn.functional.normalize(target - position, dim=0)
         right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])

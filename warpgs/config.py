@@ -1,6 +1,7 @@
 """Every default, in one place."""
 
 import dataclasses
+import math
 import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +32,10 @@ class RenderSettings:
     antialias: bool = False
     near: float = 0.01
     replay: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.near < math.inf:
+            raise ValueError(f"near must be positive and finite, got {self.near}")
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class Rendering:
         gradient_norms: [N, 2] after the backward pass: length of the screen-space gradient of each mean, plain and (if
             asked for) with absolute values per pixel, in normalised device coordinates as 3DGS densifies by.
         contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless asked for.
-        weights: [N] sum of its blend weights over the joint image; None unless asked for.
+        weights: [N] sum of its blend weights over the joint image, without a gradient; None unless asked for.
     """
 
     joint: Layer
@@ -70,8 +70,8 @@ def render(
 ) -> Rendering:
     """Renders splats through a camera; differentiable in every splat parameter and in the background.
 
-    Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have a parameter that is
-    not finite (or a zero quaternion) are culled: they leave the image unchanged and get zero gradients.
+    Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have an opacity above 1, a
+    parameter that is not finite or a zero quaternion are culled: they leave the image unchanged and get zero gradients.
 
     Args:
         splats: N Gaussians, N may be 0.

@@ -46,9 +46,9 @@ class Composite(NamedTuple):
         alphas: [H, W] each, the opacity that the splats leave, in [0, 1 - 1e-4).
         depths: [H, W] each, mean depth of what was drawn, weighted by its contribution [scene units], 0 where nothing
             was; none unless the rows have depth.
-        norms: [N, 2] screen-space gradient norms, filled on the way back; see ``Rows``.
+        norms: [N, 2] screen-space gradient norms, filled on the way back; see ``Rows``. No gradient flows from them.
         contributed: [N] whether the Gaussian changed a pixel of the joint image.
-        weights: [N] sum over pixels of the joint image of alpha times transmittance.
+        weights: [N] sum over pixels of the joint image of alpha times transmittance; no gradient flows from them.
     """
 
     images: tuple[Float[Tensor, "H W C"], ...]
@@ -68,6 +68,8 @@ class Composite(NamedTuple):
         n, m = num_images, num_images * int(with_depth)
         norms, *statistics = tensors[2 * n + m :]
         contributed, weights = statistics or (None, None)
+        # Nobody can go back from these; with autograd's node they would keep the memory of the way back.
+        norms, weights = norms.detach(), None if weights is None else weights.detach()
         return Composite(tensors[:n], tensors[n : 2 * n], tensors[2 * n : 2 * n + m], norms, contributed, weights)
 
 
