@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib.util
-import json
 import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -19,6 +18,7 @@ from .bench_training import bench_fps, bench_steps
 from .bench_workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
 from .cameras import Camera
 from .config import RenderSettings
+from .evaluate import write_json
 from .ops.graph import capture
 from .ops.profiling import KernelTime, profile
 from .ops.projection import record_projection
@@ -101,7 +101,7 @@ class Bench:
         if self.fps is not None:
             report["fps"] = bench_fps(self.fps, self.device)
         if self.json is not None:
-            self.json.write_text(json.dumps(report, indent=1) + "\n")
+            write(self.json, report)
 
     def check(self) -> None:
         """Raises ``ValueError`` or ``ImportError`` if this cannot be measured here, before time is spent on it."""
@@ -135,9 +135,15 @@ def bench(options: Bench, scenes: Iterable[Scene]) -> None:
         trace += trace_events(scene.name, kernels, len(results))
     if options.json is not None:
         report = {"machine": head, "repeats": options.repeats, "results": results}
-        options.json.write_text(json.dumps(report, indent=1) + "\n")
+        write(options.json, report)
     if options.profile is not None:
-        options.profile.write_text(json.dumps({"traceEvents": trace}) + "\n")
+        write(options.profile, {"traceEvents": trace})
+
+
+def write(path: Path, values: dict[str, Any]) -> None:
+    """Writes figures or a trace, and says so."""
+    write_json(path, values)
+    print(f"wrote {path}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -186,7 +186,7 @@ class TrainConfig:
     factor: int | None = None
     """Downscaling of the pictures (the folder rgb/<factor>x); the dataset's usual one if left out."""
     out: Path | None = None
-    """Run folder; runs/<capture>-<preset> if left out."""
+    """Run folder; runs/<capture>-<preset> if left out, with -2, -3 … behind it where there is one already."""
     resume: Path | None = None
     """Run folder to go on with, from its newest checkpoint."""
     preset: Literal["paper", "fast", "quick"] = "paper"

@@ -135,8 +135,8 @@ def _export_files(options: Export, moments: Moments, folder: Path) -> str:
             file = name + suffix if options.frames is None else _numbered(name, suffix, k)
             size += write(folder / file, cloud.select(rows))
             num_files, largest = num_files + 1, max(largest, int(rows.sum()))
-    files = "1 file" if num_files == 1 else f"{num_files} files"
-    return f"{files} of up to {largest:,} Gaussians in {folder}, {size / 1e6:.1f} MB"
+    files = "1 file of" if num_files == 1 else f"{num_files} files of up to"
+    return f"{files} {largest:,} Gaussians in {folder}, {size / 1e6:.1f} MB"
 
 
 def _numbered(name: str, suffix: str, number: int) -> str:
