@@ -82,7 +82,7 @@ def test_harmonics_of_no_degree_are_refused(bases):
         changed("sh", torch.ones(60, bases, 3))
 
 
-@pytest.mark.parametrize("degree", [-1, 4])
+@pytest.mark.parametrize("degree", [-1, 4, 1.5])
 def test_a_degree_that_the_harmonics_do_not_hold_is_refused(degree):
     with pytest.raises(ValueError, match="sh_degree"):
         changed("sh_degree", degree)

@@ -25,8 +25,8 @@ def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) ->
         raise ValueError(f"sh must have shape [N, bases, 3] with 1, 4, 9 or 16 bases, got {list(sh.shape)}")
     if degree is None:
         return held
-    if not 0 <= degree <= held:
-        raise ValueError(f"sh_degree must be between 0 and the {held} that sh holds, got {degree}")
+    if not isinstance(degree, int) or not 0 <= degree <= held:
+        raise ValueError(f"sh_degree must be an int between 0 and the {held} that sh holds, got {degree!r}")
     return degree
 
 
