@@ -213,8 +213,9 @@ def make_composite_fwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     t = wp.abs(T[k])
-                    transmittance[(walked * height + y) * width + x] = t
-                    last[(walked * height + y) * width + x] = n[k] / wp.static(branch_bits + 1)
+                    own_pixel = (walked * height + y) * width + x
+                    transmittance[own_pixel] = t
+                    last[own_pixel] = n[k] / wp.static(branch_bits + 1)
                     for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
                         if m == walked or is_joint(m, finished):
                             p = (m * height + y) * width + x

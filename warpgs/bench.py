@@ -6,6 +6,7 @@ import statistics
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -184,14 +185,12 @@ def measure(options: Bench, scene: Scene) -> tuple[Measurements, list[KernelTime
 
 def time_passes(workloads: dict[str, Workload], graphed: list[str], options: Bench) -> dict[tuple[str, str], float]:
     """Median times [ms] by workload and figure; each figure has a loop of its own."""
-    figures: dict[str, dict[str, Callable[[], object]]] = {
-        "forward_ms": {name: workload.forward for name, workload in workloads.items()},
-        "forward_backward_ms": {name: workload.forward_backward for name, workload in workloads.items()},
-    }
+    passes = {"forward_ms": Workload.forward, "forward_backward_ms": Workload.forward_backward}
     if options.device == "cuda":
-        figures["one_thread_forward_backward_ms"] = {
-            name: workload.forward_backward_on_one_thread for name, workload in workloads.items()
-        }
+        passes["one_thread_forward_backward_ms"] = Workload.forward_backward_on_one_thread
+    figures: dict[str, dict[str, Callable[[], object]]] = {
+        figure: {name: partial(go, workload) for name, workload in workloads.items()} for figure, go in passes.items()
+    }
     figures["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphed}
     return {(n, figure): ms for figure, steps in figures.items() for n, ms in time_in_turn(steps, options).items()}
 

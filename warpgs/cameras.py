@@ -84,14 +84,14 @@ class Camera:
         Raises:
             ValueError: If the camera would look nowhere, or along ``up``.
         """
-        sideways = torch.linalg.cross(target - position, up).norm()
-        if not sideways > 1e-6 * (target - position).norm() * up.norm():
+        forward = torch.nn.functional.normalize(target - position, dim=0)
+        sideways = torch.linalg.cross(forward, up)
+        if not sideways.norm() > 1e-6 * up.norm():
             raise ValueError(
                 f"a camera at {position.tolist()} cannot look at {target.tolist()} with {up.tolist()} up: "
                 "there must be a way to go, and not along up"
             )
-        forward = torch.nn.functional.normalize(target - position, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+        right = torch.nn.functional.normalize(sideways, dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
         viewmat = torch.eye(4, device=position.device)
         viewmat[:3, :3] = rotation

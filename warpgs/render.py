@@ -92,9 +92,7 @@ def render(
     if background is not None:
         is_one_each = settings.branches and isinstance(background, Tensor) and background.ndim == 2
         check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_one_each else (C,), {})
-    device = splats.means.device
-    if camera.viewmat.device != device or (background is not None and background.device != device):
-        check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
+    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
     branch = None
     if settings.branches:
         if splats.is_dynamic is None:
@@ -118,7 +116,7 @@ def render(
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
     composite = Composite.from_flat(outputs[1:], num_images, settings.depth)
     depths = composite.depths or (None,) * num_images
-    layers = list(map(Layer, composite.images, composite.alphas, depths))
+    layers = [Layer(*parts) for parts in zip(composite.images, composite.alphas, depths, strict=True)]
     return Rendering(
         joint=layers[0],
         static=layers[1] if settings.branches else None,

@@ -184,7 +184,7 @@ def record_composite(
         run.add_adjoint(rows.packed, gradients)
         if wanted_background is not None:
             seen = (1.0 - alpha).view(images, 1, -1)
-            v_behind = torch.zeros(images, num_features, device=run.device)
+            v_behind = run.zeros(images, num_features)
             for m, v_image in enumerate(v_layers[0]):
                 if v_image is not None:
                     v_behind[m] = (seen[m] @ v_image.view(-1, num_features))[0]
