@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import tyro
 
-from warpgs import runs
 from warpgs.config import PRESETS, TrainConfig, scaled
 from warpgs.data.capture import Capture
+from warpgs.data.check import quick_findings
 from warpgs.errors import is_out_of_memory, one_line, out_of_memory
-from warpgs.interrupt import Interrupt
-from warpgs.logbook import Logbook
-from warpgs.prepare.check import quick_findings
-from warpgs.trainer import Trainer
+from warpgs.runs import run as runs
+from warpgs.training.interrupt import Interrupt
+from warpgs.training.logger import Logbook
+from warpgs.training.trainer import Trainer
 
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 

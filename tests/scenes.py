@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.scene.splats import Splats
+from warpgs.model.splats import Splats
 
 WIDTH, HEIGHT = 50, 37
 GEOMETRY = ("means", "quats", "scales", "opacities")

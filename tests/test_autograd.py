@@ -8,10 +8,10 @@ import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs.config import RenderSettings
-from warpgs.ops import tape
 from warpgs.ops.projection import project
 from warpgs.ops.sh import spherical_harmonics
 from warpgs.render import render
+from warpgs.runtime import tape
 
 CAMERA = make_camera()
 

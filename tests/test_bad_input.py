@@ -8,9 +8,9 @@ import torch
 from tests.scenes import GEOMETRY, as_leaves, chosen, float_tensors, gradients, make_camera, make_splats
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
+from warpgs.model.splats import Splats
 from warpgs.ops.ssim import ssim
 from warpgs.render import render
-from warpgs.scene.splats import Splats
 
 pytestmark = pytest.mark.usefixtures("contracts_off")
 CAMERA = make_camera()

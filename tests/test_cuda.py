@@ -8,23 +8,14 @@ import pytest
 import torch
 
 from tests.reference.depth_error import random_inputs
-from tests.scenes import (
-    as_leaves,
-    generator,
-    gradients,
-    make_camera,
-    make_splats,
-    pulled,
-    random_like,
-    relative_error,
-)
+from tests.scenes import as_leaves, generator, gradients, make_camera, make_splats, pulled, random_like, relative_error
 from warpgs.config import RenderSettings
-from warpgs.ops import replay
 from warpgs.ops.depth_error import depth_error
-from warpgs.ops.replay import PLAIN_CALLS
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import forget_budgets
 from warpgs.render import render
+from warpgs.runtime import replay
+from warpgs.runtime.replay import PLAIN_CALLS
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 SETTINGS = [

@@ -10,13 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from warpgs import checkpoint, runs
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
-from warpgs.data.nerfies import load_capture
+from warpgs.data.loaders.nerfies import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
-from warpgs.interrupt import Interrupt
-from warpgs.logbook import Logbook
-from warpgs.trainer import Trainer
+from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
+from warpgs.training.interrupt import Interrupt
+from warpgs.training.logger import Logbook
+from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from .ops.contracts import check_image_size, check_same_device, check_tensor
+from .runtime.checks import check_image_size, check_same_device, check_tensor
 
 
 @dataclass(frozen=True)

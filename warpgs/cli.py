@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from . import runs
-from .bench import Bench
+from .bench.command import Bench
 from .errors import is_out_of_memory, one_line, out_of_memory
 from .export.command import Export
-from .film import Render
-from .prepare.commands import Check, Prepare
+from .prepare.command import Check, Prepare
 from .report.command import Report
+from .runs import run as runs
+from .video.command import Render
 from .viewer.command import View
 
 

@@ -10,16 +10,16 @@ from torch import Tensor
 
 from .cameras import Camera
 from .config import RenderSettings
+from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
-from .ops.contracts import check_same_device, check_tensor
 from .ops.projection import record_projection
-from .ops.replay import repeated
 from .ops.rows import Rows
 from .ops.sh import record_sh
-from .ops.streams import join
-from .ops.tape import Run, differentiable
 from .ops.tiles import record_tiles
-from .scene.splats import Splats
+from .runtime.checks import check_same_device, check_tensor
+from .runtime.replay import repeated
+from .runtime.streams import join
+from .runtime.tape import Run, differentiable
 
 DEFAULTS = RenderSettings()
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.data.captures import SIZE, moving_block, picture, write_array, write_png
 from warpgs.data import images
-from warpgs.data.files import read_array
+from warpgs.data.reading import read_array
 
 
 @pytest.fixture

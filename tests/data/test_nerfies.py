@@ -13,7 +13,7 @@ import torch
 from tests.data import captures
 from tests.data.captures import CENTER, SCALE, SIZE, edit_json, picture, write_array, write_capture, write_json
 from warpgs.config import MaskPerturbation
-from warpgs.data.nerfies import load_capture, recognise
+from warpgs.data.loaders.nerfies import load_capture, recognise
 
 KINDS = pytest.mark.parametrize("kind", ["nerfds", "hypernerf", "iphone"])
 

@@ -7,10 +7,10 @@ from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.export.cloud import Cloud
 from warpgs.export.moments import Moments
+from warpgs.model.gaussians import Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.model.splats import Splats
 from warpgs.render import render
-from warpgs.scene.gaussians import Gaussians
-from warpgs.scene.splats import Splats
-from warpgs.scene.split import SplitScene
 
 FACTS = {"moving": True, "relit": True, "sh_degree": 1, "iteration": 32}
 

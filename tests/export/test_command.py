@@ -10,16 +10,18 @@ import pytest
 from tests import tiny
 from tests.export import scenes
 from tests.export.pages import read_page
-from warpgs import checkpoint, paths, runs
 from warpgs.cli import main
-from warpgs.data.nerfies import load_capture
+from warpgs.data.loaders.nerfies import load_capture
 from warpgs.export import command as command_module
 from warpgs.export import opening, page
 from warpgs.export.command import Export, export_run
 from warpgs.export.compressed import read_compressed
 from warpgs.export.moments import Moments
 from warpgs.export.standard import read_standard
-from warpgs.playback import Player
+from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
+from warpgs.runs.trained import Player
+from warpgs.video import camera_paths as paths
 
 pytestmark = pytest.mark.usefixtures("quickly")
 quickly = tiny.quickly

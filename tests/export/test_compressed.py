@@ -8,7 +8,7 @@ import pytest
 from tests.export import scenes
 from warpgs.export.compressed import read_compressed, write_compressed
 from warpgs.export.ply import read_ply, write_ply
-from warpgs.scene.gaussians import SH_C0
+from warpgs.model.gaussians import SH_C0
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import torch
 
 from tests.export import scenes
 from warpgs.export.cloud import Cloud
-from warpgs.playback import Player
-from warpgs.scene.splats import Splats
+from warpgs.model.splats import Splats
+from warpgs.runs.trained import Player
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from tests.export.pages import read_page
 from warpgs.export import page
 from warpgs.export.baking import bake, baked_bytes
 from warpgs.export.page import Start, write_page
-from warpgs.paths import evenly
-from warpgs.scene.gaussians import SH_C0
+from warpgs.model.gaussians import SH_C0
+from warpgs.video.camera_paths import evenly
 
 KEYS = 9
 

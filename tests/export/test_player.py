@@ -8,11 +8,11 @@ import torch
 from tests.export import scenes
 from tests.export.browser import Browser, executable
 from tests.export.test_page import start
-from warpgs import pictures
+from warpgs import visualize as pictures
 from warpgs.cameras import Camera
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
-from warpgs.paths import evenly
+from warpgs.video.camera_paths import evenly
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium here")
 

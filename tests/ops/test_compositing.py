@@ -5,10 +5,10 @@ import torch
 
 from tests.reference.compositing import composite as reference
 from tests.scenes import error, generator, pulled, random_like, relative_error
-from warpgs.ops.commands import command_for
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection
-from warpgs.ops.tape import Run
+from warpgs.runtime.launch import command_for
+from warpgs.runtime.tape import Run
 
 SIZE = (50, 37)
 INPUTS = ("means2d", "conics", "opacities", "features", "background")

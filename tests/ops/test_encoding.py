@@ -9,7 +9,7 @@ from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
 from warpgs.kernels.encoding import CUDA_LANES_LOG2, make_encode
 from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
-from warpgs.ops.tape import Run
+from warpgs.runtime.tape import Run
 
 TIME = torch.tensor([0.3])
 BOX = (torch.zeros(3), torch.ones(3))

@@ -9,8 +9,8 @@ from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
 from warpgs.ops.rows import Rows
-from warpgs.ops.tape import Run
 from warpgs.render import render
+from warpgs.runtime.tape import Run
 
 NUM = 120
 ALPHA_MIN = 1 / 255

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from tests.prepare import filmed
+from warpgs.data.check import check_capture
 from warpgs.data.lens import straighten
-from warpgs.data.nerfies import load_capture
-from warpgs.prepare.check import check_capture
+from warpgs.data.loaders.nerfies import load_capture
 from warpgs.prepare.frames import Selection
 from warpgs.prepare.given_masks import read_moving
 from warpgs.prepare.options import Options
@@ -215,7 +215,7 @@ def test_a_capture_is_kept_where_its_replacement_can_not_begin(options, made, sh
 
 def test_a_replacement_stopped_while_it_removes_is_not_taken_for_finished(made, shots, tmp_path, monkeypatch):
     root = shutil.copytree(made, tmp_path / "made")
-    monkeypatch.setattr("warpgs.prepare.attempt.shutil", SimpleNamespace(rmtree=interrupted))
+    monkeypatch.setattr("warpgs.prepare.journal.shutil", SimpleNamespace(rmtree=interrupted))
     with pytest.raises(KeyboardInterrupt):
         prepare(shots, root, force=True, holdout=8)
     monkeypatch.undo()

@@ -7,7 +7,7 @@ import pytest
 
 from tests.prepare import filmed
 from warpgs.data.lens import Lens
-from warpgs.data.nerfies import load_capture, recognise
+from warpgs.data.loaders.nerfies import load_capture, recognise
 from warpgs.prepare.scene import resized_lens, scene_units, static_points, straight_lens
 from warpgs.prepare.sfm import Cameras
 

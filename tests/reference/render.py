@@ -2,10 +2,9 @@
 
 from torch import Tensor
 
+from tests.reference import compositing, projection, sh
 from warpgs.cameras import Camera
-from warpgs.scene.splats import Splats
-
-from . import compositing, projection, sh
+from warpgs.model.splats import Splats
 
 
 def render(

@@ -16,7 +16,7 @@ sync_api = pytest.importorskip(
 )
 
 from tests.viewer import watched  # noqa: E402
-from warpgs import playback  # noqa: E402
+from warpgs.runs import trained as playback  # noqa: E402
 from warpgs.viewer import source as source_module  # noqa: E402
 from warpgs.viewer.command import training_cameras  # noqa: E402
 from warpgs.viewer.layers import picture  # noqa: E402

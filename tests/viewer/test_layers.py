@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.scene.splats import Splats
+from warpgs.model.splats import Splats
 from warpgs.viewer.layers import LAYERS, picture
 
 BLACK = [0, 0, 0]

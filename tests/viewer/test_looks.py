@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
-from tests.test_paths import capture
+from tests.video.test_camera_paths import capture
 from warpgs.viewer.looks import look_through
 from warpgs.viewer.training_cameras import TrainingCameras
 

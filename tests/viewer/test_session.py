@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[v
 
 import threading
 
-from tests.test_paths import capture
+from tests.video.test_camera_paths import capture
 from warpgs.viewer import path_editor
 from warpgs.viewer.panel import Panel
 from warpgs.viewer.path_editor import PathEditor

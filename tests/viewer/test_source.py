@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from tests.viewer import watched
-from warpgs import checkpoint
+from warpgs.runs import checkpoint
 from warpgs.viewer import source as source_module
 from warpgs.viewer.source import open_source
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 from tests import tiny
-from warpgs import checkpoint
-from warpgs.scene.split import SplitScene
+from warpgs.model.scene import SplitScene
+from warpgs.runs import checkpoint
 
 
 def copy(finished: Path, folder: Path) -> Path:

@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 from warpgs.cameras import Camera
 
-from .files import read_json
 from .images import LARGEST_SIDE
 from .lens import Lens, pinhole_matrix
+from .reading import read_json
 from .units import SceneUnits
 
 MOST_SKEWED = 1e-3

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from .files import read_array, read_bytes
+from .reading import read_array, read_bytes
 
 LARGEST_SIDE = 16_384
 """Pixels; a file that claims more is refused before anything is allocated for it."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .files import read_array
+from .reading import read_array
 from .units import SceneUnits
 
 MOST_POINTS = 50_000_000

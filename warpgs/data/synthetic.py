@@ -20,7 +20,7 @@ from warpgs.cameras import Camera
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
 from warpgs.progress import progress
 
-from .writing import write_array, write_json, write_png
+from .writer import write_array, write_json, write_png
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
 """Scene units are (p − CENTER) · SCALE."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8, UInt32
 
-from warpgs.scene.gaussians import SH_C0
+from warpgs.model.gaussians import SH_C0
 
 from .cloud import OPACITY_MARGIN, Cloud
 from .packing import pack_rotations, quantise, restore, unpack, unpack_rotations

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float32, Integer
 from torch import Tensor
 
-from warpgs.scene.splats import Splats
+from warpgs.model.splats import Splats
 
 SMALLEST_SCALE = 1e-20
 """Keeps logarithms of scales finite; such a Gaussian is far thinner than any pixel."""

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpgs import paths
 from warpgs.files import remove_numbered
 from warpgs.progress import progress
+from warpgs.video import camera_paths as paths
 
 from .baking import bake, baked_bytes
 from .cloud import Cloud

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.scene.gaussians import SH_C0
+from warpgs.model.gaussians import SH_C0
 
 from .cloud import OPACITY_MARGIN, Cloud
 from .packing import pack, pack_rotations, quantise, restore, unpack, unpack_rotations

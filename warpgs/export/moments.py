@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from warpgs import runs
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
-from warpgs.playback import Player
+from warpgs.model.scene import SplitScene
 from warpgs.progress import progress
 from warpgs.render import render
-from warpgs.scene.split import SplitScene
+from warpgs.runs import run as runs
+from warpgs.runs.trained import Player
 
 from .cloud import Cloud
 

@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from warpgs import paths, runs
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
+from warpgs.runs import run as runs
+from warpgs.video import camera_paths as paths
 
 from .cloud import Cloud
 from .moments import Moments

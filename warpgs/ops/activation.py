@@ -12,9 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.kernels import activation as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import Run, differentiable
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run, differentiable
 
 NUM_GEOMETRY = 4
 """Fields of ``Raw`` that are not colours."""

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from warpgs.kernels import adam as kernels
-
-from .tape import Run
+from warpgs.runtime.tape import Run
 
 
 class Adam(torch.optim.Optimizer):

@@ -12,12 +12,12 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
+from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
+from warpgs.runtime.launch import PerShard
+from warpgs.runtime.tape import Run, differentiable
 
-from .commands import PerShard
-from .contracts import check_image_size, check_same_device, check_tensor
 from .projection import Projection
 from .rows import Rows
-from .tape import Run, differentiable
 from .tiles import Tiles, record_tiles
 
 NUM_BRANCH_IMAGES = 3

@@ -4,9 +4,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.kernels import covariance as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import Run, adjoint_launch, differentiable
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run, adjoint_launch, differentiable
 
 
 def covariance(quats: Float[Tensor, "N 4"], scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:

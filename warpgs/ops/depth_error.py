@@ -5,9 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.kernels import depth_error as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import LITTLE_WORK, Run, differentiable
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import LITTLE_WORK, Run, differentiable
 
 
 def depth_error(

@@ -5,9 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.kernels import encoding as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import Run
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run
 
 ALIGNMENT = 8
 """Rows are padded with zeros to multiples of this: tensor cores want rows of 16 bytes."""

@@ -7,9 +7,8 @@ from torch import Tensor, int32
 
 from warpgs.config import RenderSettings
 from warpgs.kernels import projection as kernels
-
-from .contracts import check_image_size, check_same_device, check_tensor
-from .tape import Run, differentiable
+from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
+from warpgs.runtime.tape import Run, differentiable
 
 
 class Projection(NamedTuple):

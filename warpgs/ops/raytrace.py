@@ -7,9 +7,8 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.kernels import raytrace as kernels
-
-from .contracts import check_image_size, check_same_device, check_tensor
-from .tape import Run, differentiable
+from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
+from warpgs.runtime.tape import Run, differentiable
 
 SPHERE, CUBE, TORUS = 0, 1, 2
 """Unit shapes; the torus lies around z and has radii 1 and 0.3."""

@@ -5,9 +5,8 @@ from jaxtyping import Float16, Float32
 from torch import Tensor
 
 from warpgs.kernels import relu as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import Run
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run
 
 MOST_CHUNKS = 4096
 """Sums that the rows are divided among: enough threads to keep memory busy, few enough to be quickly added up."""

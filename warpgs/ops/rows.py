@@ -3,9 +3,9 @@
 from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
+from warpgs.runtime.tape import Run
 
 from .projection import Projection
-from .tape import Run
 
 
 class Rows:

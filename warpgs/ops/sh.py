@@ -5,9 +5,8 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.kernels import sh as kernels
-
-from .contracts import check_same_device, check_tensor
-from .tape import Run, differentiable
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run, differentiable
 
 MAX_DEGREE = 3
 

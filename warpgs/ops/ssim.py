@@ -5,10 +5,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.kernels import ssim as kernels
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import Run, differentiable
 
 from .compositing import is_small
-from .contracts import check_same_device, check_tensor
-from .tape import Run, differentiable
 
 SIMILARITY = (0.0, 0.0, 1.0)
 """Weights of the kernels, base, L1 and similarity, for similarity alone."""

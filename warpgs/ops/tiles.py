@@ -10,9 +10,9 @@ from torch import Tensor
 from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
+from warpgs.runtime.tape import Run, pinned_counter
 
 from .rows import Rows
-from .tape import Run, pinned_counter
 
 HEADROOM = 1.2
 """Buffers hold this many times the most intersections seen lately."""

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.data.writing import write_array
+from warpgs.data.writer import write_array
 
 from .dense import Footage, LocalGeometry, triangulate
 from .parallel import each

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.images import LARGEST_SIDE, decode
-from warpgs.data.writing import write_json, write_png
+from warpgs.data.motion_check import FLATTEST, SMALLEST_SIDE
+from warpgs.data.writer import write_json, write_png
 from warpgs.progress import progress
 
 FEWEST_FRAMES = 5
@@ -23,9 +24,6 @@ MOST_FRAMES = 1000
 
 DEFAULT_FRAMES = 150
 """Taken from a video when neither a rate nor a count is asked for."""
-
-SMALLEST_SIDE, FLATTEST = 16, 16
-"""Shorter side [px], and largest ratio of the sides: optical flow crashes on less."""
 
 FEWEST_DECODED = 0.95
 """Share of the frames that a video promises, under which its being cut off is told."""

@@ -16,15 +16,15 @@ import numpy as np
 
 from warpgs.data.images import decode, read_mask
 from warpgs.data.lens import straighten
-from warpgs.data.writing import write_png
+from warpgs.data.writer import write_png
 
 from . import contact_sheet, depth_anything, sam2
-from .attempt import REPORT, Attempt
 from .contact_sheet import sheet, spread
 from .dense import Footage
 from .depth import static_depth, write_depth
 from .frames import SourceFrame, list_frames, take_frames
 from .given_masks import find_masks, read_moving
+from .journal import REPORT, Attempt
 from .motion_masks import find_moving, lift
 from .networks import DEPTH_ANYTHING, SAM2, find_weights
 from .options import Options

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from warpgs.data.images import decode
 from warpgs.data.lens import Lens, pinhole_matrix, straighten
-from warpgs.data.writing import write_array, write_json, write_png
+from warpgs.data.writer import write_array, write_json, write_png
 
 from .frames import SourceFrame
 from .sfm import Cameras

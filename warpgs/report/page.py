@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from warpgs.pictures import ERROR_RANGE
+from warpgs.visualize import ERROR_RANGE
 
 from .charts import Series, chart, color_of
 from .figures import HIGHER, LOWER, NAMES, config_rows, summary_rows

@@ -12,9 +12,9 @@ from typing import Any
 
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
-from warpgs import runs
 from warpgs.config import TrainConfig
 from warpgs.files import read_bounded
+from warpgs.runs import run as runs
 
 Curve = list[tuple[float, float]]
 """(iteration, value), in order."""

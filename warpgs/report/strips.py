@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from warpgs import pictures, runs
-from warpgs.playback import Player
+from warpgs import visualize as pictures
 from warpgs.progress import progress
+from warpgs.runs import run as runs
+from warpgs.runs.trained import Player
 
 from .record import Record
 

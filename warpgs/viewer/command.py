@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpgs import runs
 from warpgs.errors import one_line
+from warpgs.runs import run as runs
 
 from .source import Source, open_source
 from .training_cameras import TrainingCameras

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
-from warpgs.pictures import to_bytes
+from warpgs.model.splats import Splats
 from warpgs.render import render
-from warpgs.scene.splats import Splats
+from warpgs.visualize import to_bytes
 
 LayerName = Literal["joint", "static", "dynamic", "depth", "alpha", "dynamic mask"]
 LAYERS: tuple[LayerName, ...] = get_args(LayerName)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import viser
 
-from warpgs.paths import UP, Ball, guessed
+from warpgs.video.camera_paths import UP, Ball, guessed
 
 from .pose import pose_of
 from .source import Source

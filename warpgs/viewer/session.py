@@ -11,9 +11,9 @@ import viser
 from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
-from warpgs.pictures import to_bytes
-from warpgs.playback import Player
-from warpgs.scene.splats import Splats
+from warpgs.model.splats import Splats
+from warpgs.runs.trained import Player
+from warpgs.visualize import to_bytes
 
 from .clock import Clock
 from .frustums import BLUE, add_frustum

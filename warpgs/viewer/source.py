@@ -8,10 +8,11 @@ from typing import Literal
 
 import torch
 
-from warpgs import checkpoint, runs
 from warpgs.config import TrainConfig
 from warpgs.errors import one_line
-from warpgs.playback import Player
+from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
+from warpgs.runs.trained import Player
 
 LOOK_EVERY = 2.0
 """Seconds between looks for a newer checkpoint, while somebody watches."""

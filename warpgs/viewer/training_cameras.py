@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.capture import Capture
-from warpgs.paths import focus, upward
+from warpgs.video.camera_paths import focus, upward
 
 from .pose import Pose, pose_of
 

@@ -1,0 +1,167 @@
+import dataclasses
+import functools
+import json
+
+import pytest
+import torch
+
+from tests import tiny
+from warpgs.bench.command import STAGES, Bench, bench, time_in_turn
+from warpgs.bench.scenes import SCENES, Scene, random_splats
+from warpgs.bench.training import measure_steps, random_scene
+from warpgs.cli import main
+from warpgs.runs import run as runs
+
+TINY = Scene("tiny", 48, 32, 100, 3.0)
+OPTIONS = Bench(device="cpu", repeats=2)
+
+
+def report(tmp_path, **options):
+    path = tmp_path / "report.json"
+    bench(dataclasses.replace(OPTIONS, json=path, **options), [TINY])
+    return json.loads(path.read_text())
+
+
+def error_line(capsys, *arguments):
+    """The only line that a failing command leaves."""
+    assert main(["bench", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    return line
+
+
+def test_the_report_names_the_machine_and_the_versions(tmp_path):
+    machine = report(tmp_path)["machine"]
+    assert set(machine) == {"cpu", "threads", "torch", "warp", "date", "commit"}
+    assert machine["torch"] == torch.__version__
+
+
+def test_the_report_has_times_of_all_stages_and_of_the_whole(tmp_path):
+    (result,) = report(tmp_path)["results"]
+    assert set(result["one_image"]) == {"forward_ms", "forward_backward_ms", "stages_ms"}
+    assert set(result["one_image"]["stages_ms"]) == set(STAGES)
+    assert all(isinstance(ms, float) and ms > 0 for ms in result["one_image"]["stages_ms"].values())
+
+
+def test_what_is_compared_takes_turns():
+    calls = []
+    times = time_in_turn({name: functools.partial(calls.append, name) for name in "ab"}, OPTIONS)
+    assert calls == [*"ab", *"ab", *"ab"]  # the first warms up
+    assert set(times) == {"a", "b"}
+
+
+def test_the_report_counts_gaussians_and_intersections(tmp_path):
+    (result,) = report(tmp_path)["results"]
+    assert result["num_gaussians"] == TINY.num_gaussians
+    assert result["intersections"] > 0
+
+
+@pytest.mark.parametrize("branches", ["random", "disc"])
+def test_branches_are_measured_against_one_image(tmp_path, branches):
+    (result,) = report(tmp_path, branches=branches)["results"]
+    assert set(result["three_images"]) == set(result["one_image"])
+    assert set(result["ratios_to_one_image"]["three_images"]) == {"forward", "forward_backward"}
+
+
+def test_depth_can_be_measured_with_branches(tmp_path):
+    (result,) = report(tmp_path, branches="random", depth=True)["results"]
+    assert set(result["three_images"]["stages_ms"]) == set(STAGES)
+
+
+def test_the_profile_is_a_trace_of_the_kernels_both_ways(tmp_path):
+    path = tmp_path / "trace.json"
+    bench(dataclasses.replace(OPTIONS, profile=path), [TINY])
+    events = json.loads(path.read_text())["traceEvents"]
+    kernels = [event for event in events if event["ph"] == "X"]
+    assert {"project_fwd", "sort_pairs", "composite_fwd", "composite_bwd", "project_bwd"} <= {
+        k["name"] for k in kernels
+    }
+    assert all(k["dur"] > 0 and k["ts"] >= 0 for k in kernels)
+
+
+def test_the_output_is_plain_text_when_it_is_no_terminal(capsys):
+    bench(OPTIONS, [TINY])
+    output = capsys.readouterr().out
+    assert "tiny: 48x32, 100 Gaussians" in output
+    assert output.isascii()
+
+
+@pytest.mark.parametrize("option", [("--against", "gsplat"), ("--graph",)])
+def test_what_needs_cuda_is_refused_on_cpu_with_one_line(capsys, option):
+    assert " ".join(option) + " needs --device cuda" in error_line(capsys, "--device", "cpu", *option)
+
+
+def test_no_repeats_are_refused_with_one_line(capsys):
+    assert "--repeats must be at least 1" in error_line(capsys, "--device", "cpu", "--repeats", "0")
+
+
+def test_a_missing_folder_is_refused_before_anything_is_measured(capsys, tmp_path):
+    path = tmp_path / "missing" / "report.json"
+    assert "no such folder" in error_line(capsys, "--device", "cpu", "--json", str(path))
+
+
+def test_a_folder_as_a_file_is_refused_before_anything_is_measured(capsys, tmp_path):
+    assert "it is a folder" in error_line(capsys, "--device", "cpu", "--profile", str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "arguments", [["bench", "--no-such-option"], ["bench", "--scenes", "huge"], ["no-such-command"]]
+)
+def test_unknown_options_end_with_exit_code_2(arguments):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+
+
+def test_the_command_measures_the_scenes_that_were_asked_for(monkeypatch, capsys):
+    monkeypatch.setitem(SCENES, "wide", TINY)
+    assert main(["bench", "--device", "cpu", "--repeats", "1", "--scenes", "wide"]) == 0
+    assert "tiny: " in capsys.readouterr().out
+
+
+def test_a_seed_stands_for_one_scene():
+    first, second = (random_splats(10, 48, 32, 3.0, seed=5)[0] for _ in range(2))
+    assert all(torch.equal(getattr(first, n), getattr(second, n)) for n in ("means", "quats", "scales", "colors"))
+
+
+def test_the_disc_holds_a_fifth_of_the_gaussians():
+    splats, _ = Scene("many", 48, 32, 100_000, 3.0).make("disc", "cpu")
+    assert splats.is_dynamic.float().mean().item() == pytest.approx(0.2, abs=0.01)
+
+
+# Training -----------------------------------------------------------------------------------------------------------
+
+
+def test_steps_of_both_stages_are_timed():
+    figures = measure_steps(300, (48, 32), "cpu", repeats=1)
+    assert (figures["gaussians"], figures["width"], figures["height"]) == (300, 48, 32)
+    assert figures["stage1_ms"] > 0
+    assert figures["stage2_ms"] > 0
+
+
+def test_the_scene_to_time_steps_of_has_both_branches_and_the_papers_networks():
+    splats, camera = random_splats(1000, 64, 48, 3.0, 0)
+    scene = random_scene(splats, camera)
+    assert 100 < len(scene.dynamic) < 300
+    assert len(scene.static) + len(scene.dynamic) == 1000
+    assert len(scene.deformation.trunk.sizes) == 9
+    again = scene.splats(torch.zeros(1))
+    assert torch.allclose(again.scales.sort(0).values, splats.scales.sort(0).values, rtol=1e-5)
+
+
+def test_frames_a_second_of_a_run_are_written(tmp_path, capsys):
+    data, run = tiny.write(tmp_path), tmp_path / "run"
+    trainer = tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, data=data))
+    runs.create(run, trainer.config)
+    trainer.save()
+    assert main(["bench", "--device", "cpu", "--fps", str(run), "--json", str(tmp_path / "out.json")]) == 0
+    figures = json.loads((tmp_path / "out.json").read_text())["fps"]
+    assert figures["frames_per_second"] > 0
+    assert figures["static"] == len(trainer.scene.static)
+    assert "frames a second" in capsys.readouterr().out
+
+
+def test_frames_a_second_of_what_is_no_run_are_refused(tmp_path, capsys):
+    assert main(["bench", "--device", "cpu", "--fps", str(tmp_path)]) == 2
+    assert "is no run folder" in capsys.readouterr().err

@@ -1,0 +1,190 @@
+"""What the check finds in captures that are fit and in captures that are not."""
+
+import json
+import shutil
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data import captures
+from tests.data.captures import edit_json, write_array
+from tests.prepare import filmed
+from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.motion_check import motion_between
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    root = filmed.write_capture(tmp_path_factory.mktemp("check") / "film")
+    shutil.rmtree(root / "frames")
+    return root
+
+
+@pytest.fixture
+def root(film, tmp_path):
+    return shutil.copytree(film, tmp_path / "film")
+
+
+def texts(report, level):
+    return " | ".join(f.text for f in report.findings if f.level == level)
+
+
+def test_a_good_capture_is_fit_without_warnings(root):
+    report = check_capture(root)
+    assert report.is_fit
+    assert texts(report, "warning") == texts(report, "error") == ""
+    assert "16 frames to train on, 0 to evaluate, 256×192" in texts(report, "note")
+    assert str(report).endswith("fit to train on")
+
+
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        ("nerfds", "6 of 6 frames have masks, 0"),
+        ("hypernerf", "0 of 6 frames have masks, 0"),
+        ("iphone", "0 of 6 frames have masks, 4"),
+    ],
+)
+def test_every_layout_is_read_whole(tmp_path, kind, files):
+    report = check_capture(captures.write_capture(tmp_path / "toy", kind))
+    notes = texts(report, "note")
+    assert f"read as {kind} | 4 frames to train on, 2 to evaluate" in notes
+    assert f"{files} have depth" in notes
+
+
+def test_masks_that_are_turned_around_are_an_error(root):
+    for path in (root / "resized_mask/1x").iterdir():
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    report = check_capture(root)
+    assert not report.is_fit
+    assert "turned around" in texts(report, "error")
+
+
+def test_masks_where_everything_moves_are_an_error(root):
+    for path in (root / "resized_mask/1x").iterdir():
+        cv2.imwrite(str(path), np.zeros((192, 256), np.uint8))
+    assert "everything moves" in texts(check_capture(root), "error")
+
+
+def test_a_capture_without_masks_is_warned_of(root):
+    shutil.rmtree(root / "resized_mask")
+    assert "no masks" in texts(check_capture(root, "nerfds"), "warning")
+
+
+def test_every_file_problem_is_named(root):
+    for name in ("shot003", "shot007"):
+        path = root / f"rgb/1x/{name}.png"
+        path.write_bytes(path.read_bytes()[:900])
+    report = check_capture(root)
+    assert not report.is_fit
+    assert "shot003.png" in texts(report, "error")
+    assert "shot007.png" in texts(report, "error")
+
+
+def test_what_is_no_capture_is_not_fit(tmp_path):
+    report = check_capture(tmp_path)
+    assert not report.is_fit
+    assert "dataset.json is missing" in texts(report, "error")
+
+
+def test_cameras_of_other_pictures_are_warned_of(root):
+    names = sorted(p.name for p in (root / "camera").iterdir())
+    shuffled = np.random.default_rng(0).permutation(len(names))
+    facts = [(root / "camera" / name).read_text() for name in names]
+    for name, k in zip(names, shuffled, strict=True):
+        (root / "camera" / name).write_text(facts[k])
+    assert "cameras may not belong" in texts(check_capture(root), "warning")
+
+
+def test_cameras_that_look_away_are_an_error(root):
+    for path in (root / "camera").iterdir():
+        rotation = np.array(json.loads(path.read_text())["orientation"])
+        edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
+    assert "do not see the points" in texts(check_capture(root), "error")
+
+
+def test_points_at_the_cameras_are_warned_of(root):
+    centers = [json.loads(p.read_text())["position"] for p in (root / "camera").iterdir()]
+    points = np.load(root / "points.npy")
+    write_array(root / "points.npy", np.vstack([points, centers, centers]))
+    assert "no surfaces" in texts(check_capture(root), "warning")
+
+
+def write_depth(root, of_depth):
+    for k, view in enumerate(filmed.poses(16)):
+        write_array(root / f"depth/1x/shot{k:03d}.npy", of_depth(filmed.depth(view)).astype(np.float32))
+
+
+def test_inverse_depth_of_any_scale_is_fit(root):
+    write_depth(root, lambda depth: 30.0 / depth + 2.0)
+    report = check_capture(root)
+    assert texts(report, "warning") == ""
+    assert "off at the points" in texts(report, "note")
+
+
+def test_depth_that_grows_with_distance_is_warned_of(root):
+    write_depth(root, lambda depth: depth)
+    assert "the depth of 12 of 12 frames can't be aligned" in texts(check_capture(root), "warning")
+
+
+def test_depth_is_not_held_against_points_that_are_not_there(root):
+    write_depth(root, lambda depth: 1.0 / depth)
+    (root / "points.npy").unlink()
+    report = check_capture(root)
+    assert "there are no sparse points" in texts(report, "warning")
+    assert "aligned" not in str(report)
+
+
+def test_one_time_for_all_frames_is_an_error(root):
+    names = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
+    assert "one time" in texts(check_capture(root), "error")
+    assert "one time" in " ".join(f.text for f in quick_findings(load_capture(root)) if f.level == "error")
+
+
+def test_one_time_does_where_all_is_learnt_as_static(root):
+    names = json.loads((root / "metadata.json").read_text())
+    (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
+    findings = quick_findings(load_capture(root), all_static=True)
+    assert ["one time" in f.text for f in findings if f.topic == "time"] == [True]
+    assert {f.level for f in findings} == {"warning"}
+
+
+def test_flat_pictures_are_checked_without_optical_flow(film):
+    """It crashes on pictures that are less than 16 pixels high."""
+    capture = load_capture(film)
+    frames = [capture.frame(name) for name in capture.train[:2]]
+    assert motion_between(*frames) is not None
+    flat = [replace(f, image=f.image[90:102], static_mask=f.static_mask[90:102]) for f in frames]
+    assert motion_between(*flat) is None
+
+
+def test_the_report_is_plain_json(root):
+    plain = json.loads(json.dumps(check_capture(root).plain()))
+    assert plain["fit"] is True
+    assert {f["level"] for f in plain["findings"]} == {"note"}
+
+
+def test_the_quick_check_is_quick_and_silent_about_a_good_capture(root):
+    capture = load_capture(root)
+    start = time.process_time()
+    assert quick_findings(capture) == []
+    assert time.process_time() - start < 1.0
+
+
+def test_the_quick_check_leaves_damaged_frames_to_be_told_as_such(root):
+    path = root / "rgb/1x/shot000.png"
+    path.write_bytes(path.read_bytes()[:900])
+    with pytest.raises(ValueError, match=r"shot000\.png"):
+        quick_findings(load_capture(root))
+
+
+def test_the_quick_check_finds_cameras_that_look_away(root):
+    for path in (root / "camera").iterdir():
+        rotation = np.array(json.loads(path.read_text())["orientation"])
+        edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
+    assert [f.level for f in quick_findings(load_capture(root))] == ["error"]

@@ -1,0 +1,232 @@
+"""Alignment of monocular depth to a scene: a scale and an offset of inverse depth."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import linprog
+
+from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera, relative_error
+from warpgs.data.depth_alignment import align_to_points, align_to_rendering, fit_scale_offset, metric_depth
+
+CAMERA = make_camera()
+SCALE, OFFSET = 1.7, 0.2
+ALIGNMENT = torch.tensor([SCALE, OFFSET])
+EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+ENOUGH = 16
+"""Samples with which a frame is aligned."""
+
+
+def samples(num=200, noise=0.0):
+    g = generator()
+    values = torch.rand(num, generator=g)
+    return values, SCALE * values + OFFSET + noise * torch.randn(num, generator=g)
+
+
+def spoiled(targets, share, by):
+    targets = targets.clone()
+    targets[: round(share * len(targets))] += by
+    return targets
+
+
+def least_absolute_deviations(values, targets):
+    """(a, b) of least Σ |a · values + b − targets|, by linear programming."""
+    x, y, num = values.double().numpy(), targets.double().numpy(), len(values)
+    line = np.stack([x, np.ones(num)], 1)
+    bounds = np.block([[line, -np.eye(num)], [-line, -np.eye(num)]])  # ±(a x + b − y) ≤ slack
+    cost = np.concatenate([np.zeros(2), np.ones(num)])
+    solved = linprog(cost, bounds, np.concatenate([y, -y]), bounds=[(None, None)] * 2 + [(0, None)] * num)
+    return torch.from_numpy(solved.x[:2])
+
+
+def total_error(alignment, values, targets):
+    a, b = alignment.double()
+    return (a * values.double() + b - targets.double()).abs().sum().item()
+
+
+# The fit -------------------------------------------------------------------------------------------------------------
+
+
+def test_exact_samples_give_their_scale_and_offset():
+    assert error(fit_scale_offset(*samples()), ALIGNMENT) < 1e-6
+
+
+@pytest.mark.parametrize(("share", "by"), [(0.1, 1000.0), (0.2, 5.0), (0.2, -5.0), (0.3, 1.0), (0.3, -1.0)])
+def test_outliers_do_not_count(share, by):
+    values, targets = samples()
+    assert error(fit_scale_offset(values, spoiled(targets, share, by)), ALIGNMENT) < 1e-3
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_noisy_samples_are_fitted_with_the_least_absolute_error(share):
+    values, targets = samples(noise=0.05)
+    targets = spoiled(targets, share, 3.0)
+    best = total_error(least_absolute_deviations(values, targets), values, targets)
+    assert total_error(fit_scale_offset(values, targets), values, targets) < 1.001 * best
+
+
+def test_the_fit_follows_the_units_of_both_sides():
+    values, targets = samples(noise=0.05)
+    a, b = fit_scale_offset(values, targets)
+    scaled = fit_scale_offset(100.0 * values, 0.01 * targets)
+    assert relative_error(scaled, torch.stack([1e-4 * a, 0.01 * b])) < 1e-4
+
+
+@pytest.mark.parametrize("far", [1e4, -1e4])
+def test_an_offset_far_from_zero_is_found_all_the_same(far):
+    values, _ = samples()
+    targets = SCALE * values + OFFSET
+    found = fit_scale_offset(values.double() + far, targets.double())
+    assert relative_error(found, torch.tensor([SCALE, OFFSET - SCALE * far]).double()) < 1e-6
+
+
+def test_few_samples_are_enough_but_fewer_are_not():
+    values, targets = samples(ENOUGH)
+    assert error(fit_scale_offset(values, targets), ALIGNMENT) < 1e-6
+    assert fit_scale_offset(values[1:], targets[1:]).isnan().all()
+
+
+def test_no_samples_align_nothing():
+    assert fit_scale_offset(torch.zeros(0), torch.zeros(0)).isnan().all()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_samples_of_one_value_align_nothing(value):
+    _, targets = samples()
+    assert fit_scale_offset(torch.full_like(targets, value), targets).isnan().all()
+
+
+def test_samples_that_turn_depth_around_align_nothing():
+    values, targets = samples()
+    assert fit_scale_offset(values, -targets).isnan().all()
+
+
+@pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
+def test_a_sample_that_is_not_finite_gives_no_wrong_alignment(unknown):
+    values, targets = samples()
+    targets[3] = unknown
+    assert fit_scale_offset(values, targets).isnan().all()
+
+
+# Against points ------------------------------------------------------------------------------------------------------
+
+
+def random_inverse_depth():
+    return 0.2 + torch.rand(HEIGHT, WIDTH, generator=generator())
+
+
+def points_behind(inverse_depth, rows, columns):
+    """Points at the depths that ``ALIGNMENT`` gives to some pixels."""
+    row, column = torch.cartesian_prod(torch.tensor(rows), torch.tensor(columns)).T
+    return CAMERA.unproject(row, column, 1.0 / (SCALE * inverse_depth[row, column] + OFFSET))
+
+
+def test_points_align_the_inverse_depth_of_the_pixels_they_fall_on():
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+
+
+def test_points_seen_through_other_surfaces_do_not_count():
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+    hidden = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 45, 5))
+    found = align_to_points(inverse_depth, EVERYWHERE, CAMERA, torch.cat([points, hidden]))
+    assert error(found, ALIGNMENT) < 1e-3
+
+
+def test_points_do_not_count_where_something_moves():
+    inverse_depth = random_inverse_depth()
+    static = EVERYWHERE.clone()
+    static[:, :25] = False
+    true = points_behind(inverse_depth, range(2, 30, 3), range(26, 45, 3))
+    wrong = points_behind(3.0 * inverse_depth, range(30), range(25))
+    assert error(align_to_points(inverse_depth, static, CAMERA, torch.cat([true, wrong])), ALIGNMENT) < 1e-4
+
+
+def test_points_behind_the_camera_or_beside_the_image_do_not_count():
+    inverse_depth = random_inverse_depth()
+    true = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+    behind = points_behind(-inverse_depth, range(20), range(20))
+    beside = CAMERA.unproject(torch.arange(100), torch.full((100,), WIDTH + 3), torch.ones(100))
+    points = torch.cat([behind, true, beside])
+    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+
+
+def test_pixels_without_depth_do_not_count():
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+    inverse_depth[:15] = torch.nan
+    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+
+
+@pytest.mark.parametrize("num", [0, ENOUGH - 1])
+def test_a_frame_that_sees_too_few_points_is_not_aligned(num):
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(20), range(20))[:num]
+    assert align_to_points(inverse_depth, EVERYWHERE, CAMERA, points).isnan().all()
+
+
+def test_a_frame_without_depth_is_not_aligned():
+    points = points_behind(random_inverse_depth(), range(20), range(20))
+    nothing = torch.full((HEIGHT, WIDTH), torch.nan)
+    assert align_to_points(nothing, EVERYWHERE, CAMERA, points).isnan().all()
+
+
+# Against a rendering -------------------------------------------------------------------------------------------------
+
+OPAQUE = torch.full((HEIGHT, WIDTH), 0.99)
+
+
+def rendered_depth(inverse_depth):
+    return 1.0 / (SCALE * inverse_depth + OFFSET)
+
+
+def test_a_rendering_aligns_the_inverse_depth_it_shows():
+    inverse_depth = random_inverse_depth()
+    depth = rendered_depth(inverse_depth)
+    assert error(align_to_rendering(inverse_depth, EVERYWHERE, depth, OPAQUE), ALIGNMENT) < 1e-5
+
+
+@pytest.mark.parametrize("left_out", ["moving", "transparent", "unknown", "empty"])
+def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(left_out):
+    inverse_depth, static, alpha = random_inverse_depth(), EVERYWHERE.clone(), OPAQUE.clone()
+    depth = rendered_depth(inverse_depth)
+    spoiled_rows = slice(0, 22)  # most of the picture: more than a robust fit bears
+    depth[spoiled_rows] = 1.0 / (9.0 * inverse_depth[spoiled_rows] + 4.0)
+    if left_out == "moving":
+        static[spoiled_rows] = False
+    elif left_out == "transparent":
+        alpha[spoiled_rows] = 0.5
+    elif left_out == "unknown":
+        inverse_depth[spoiled_rows] = torch.nan
+    else:
+        depth[spoiled_rows] = 0.0
+    assert error(align_to_rendering(inverse_depth, static, depth, alpha), ALIGNMENT) < 1e-5
+
+
+def test_an_empty_rendering_aligns_nothing():
+    nothing = torch.zeros(HEIGHT, WIDTH)
+    assert align_to_rendering(random_inverse_depth(), EVERYWHERE, nothing, nothing).isnan().all()
+
+
+# Depth in scene units ------------------------------------------------------------------------------------------------
+
+
+def test_aligned_inverse_depth_becomes_depth():
+    inverse_depth = random_inverse_depth()
+    expected = 1.0 / (SCALE * inverse_depth.double() + OFFSET)
+    assert error(metric_depth(inverse_depth, ALIGNMENT), expected) < 1e-6
+
+
+def test_depth_at_or_past_infinity_is_unknown():
+    inverse_depth = torch.tensor([[1.0, 0.1, 0.0, -1.0]])
+    assert metric_depth(inverse_depth, torch.tensor([1.0, -0.1])).isnan().tolist() == [[False, True, True, True]]
+
+
+def test_unknown_inverse_depth_stays_unknown():
+    inverse_depth = torch.tensor([[torch.nan, 0.5]])
+    assert metric_depth(inverse_depth, ALIGNMENT).isnan().tolist() == [[True, False]]
+
+
+def test_all_depth_of_a_frame_that_is_not_aligned_is_unknown():
+    assert metric_depth(random_inverse_depth(), torch.full((2,), torch.nan)).isnan().all()

@@ -1,0 +1,357 @@
+"""Evaluation: figures recomputed here from pictures that are known."""
+
+import csv
+import dataclasses
+import json
+import math
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import train as script
+from tests import tiny
+from tests.data.captures import write_png
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.loaders.nerfies import load_capture
+from warpgs.evaluation import evaluate
+from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
+from warpgs.evaluation.lpips import Lpips
+from warpgs.render import Layer, Rendering
+from warpgs.runs import run as runs
+
+H, W = 12, 16
+CPU = torch.device("cpu")
+VAL = ("a", "b", "c")
+
+
+def frame(name, time, masks=True, covisible=False):
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]), W, H, time)
+    static, seen = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
+    static[:4], seen[:, :5] = False, True
+    image = torch.randint(0, 256, (H, W, 3), dtype=torch.uint8)
+    return Frame(name, camera, image, static if masks else None, None, seen if covisible else None)
+
+
+def capture(val=VAL, **kind):
+    """Training frames at times 0 and 1, evaluation frames between them."""
+    times = {"first": 0.0, "last": 1.0, **{name: (k + 1) / 4 for k, name in enumerate(val)}}
+    frames = {name: frame(name, time, **kind) for name, time in times.items()}
+    cameras = {name: f.camera for name, f in frames.items()}
+    return Capture("here", cameras, ["first", "last"], val, torch.zeros(0, 3), None, frames.__getitem__)
+
+
+def rendering(image, dynamic_alpha=None):
+    def layer(image, alpha):
+        return Layer(image, alpha, None)
+
+    alpha = torch.zeros(H, W) if dynamic_alpha is None else dynamic_alpha
+    nothing = torch.zeros(0, 2)
+    joint = layer(image, torch.ones(H, W))
+    return Rendering(joint, joint, layer(torch.zeros(H, W, 3), alpha), nothing.int(), nothing, None, None)
+
+
+def pictures_at(images):
+    """Renders the image that belongs to a camera's time."""
+    return lambda camera, branches: rendering(images[camera.time])
+
+
+def noisy(capture, spread=0.1):
+    """Renderings of the evaluation frames that are off by different amounts."""
+    images = {}
+    for k, name in enumerate(capture.val):
+        truth = capture.frame(name).image.double() / 255
+        images[capture.cameras[name].time] = (truth + (k + 1) * spread * torch.randn(H, W, 3).double()).float()
+    return images
+
+
+def evaluated(capture, images, **options):
+    return evaluate.evaluate(pictures_at(images), capture, CPU, quiet=True, **options)
+
+
+def decibels(capture, images, name, rows=slice(None), columns=slice(None)):
+    """−10 log₁₀ of the mean squared error within rows and columns, in NumPy."""
+    truth = capture.frame(name).image.numpy().astype(np.float64) / 255
+    image = images[capture.cameras[name].time].numpy().clip(0, 1)
+    return -10 * math.log10(((image - truth)[rows, columns] ** 2).mean())
+
+
+# PSNR and regions ---------------------------------------------------------------------------------------------------
+
+
+def test_psnr_is_the_mean_over_views_of_each_views_psnr():
+    """Not the PSNR of the mean error, which one bad view would rule."""
+    here = capture()
+    images = noisy(here)
+    expected = [decibels(here, images, name) for name in VAL]
+    result = evaluated(here, images)
+    assert [view.psnr for view in result.views] == pytest.approx(expected, abs=1e-3)
+    assert result.summary()["psnr"] == pytest.approx(sum(expected) / 3, abs=1e-3)
+
+
+def test_static_and_dynamic_psnr_are_those_of_the_masks_regions():
+    here = capture()
+    images = noisy(here)
+    for view in evaluated(here, images).views:
+        assert view.psnr_dynamic == pytest.approx(decibels(here, images, view.name, rows=slice(0, 4)), abs=1e-3)
+        assert view.psnr_static == pytest.approx(decibels(here, images, view.name, rows=slice(4, None)), abs=1e-3)
+
+
+def test_masked_psnr_is_that_of_the_covisible_pixels():
+    here = capture(covisible=True)
+    images = noisy(here)
+    for view in evaluated(here, images).views:
+        assert view.masked_psnr == pytest.approx(decibels(here, images, view.name, columns=slice(0, 5)), abs=1e-3)
+
+
+def test_masked_ssim_does_not_see_what_is_not_covisible():
+    here = capture(covisible=True)
+    images = noisy(here)
+    spoilt = {time: torch.cat([image[:, :5], torch.rand(H, W - 5, 3)], 1) for time, image in images.items()}
+    wanted = [view.masked_ssim for view in evaluated(here, images).views]
+    assert [view.masked_ssim for view in evaluated(here, spoilt).views] == wanted
+
+
+def test_values_outside_0_and_1_count_as_0_and_1():
+    here = capture()
+    images = noisy(here, spread=2.0)
+    clamped = {time: image.clamp(0, 1) for time, image in images.items()}
+    assert any(bool((image < 0).any() and (image > 1).any()) for image in images.values())
+    assert evaluated(here, images).views == evaluated(here, clamped).views
+
+
+def test_what_a_capture_does_not_have_is_not_measured():
+    view = evaluated(capture(masks=False), noisy(capture())).views[0]
+    for name in ("psnr_static", "psnr_dynamic", "ssim_static", "ssim_dynamic", "masked_psnr", "masked_ssim", "lpips"):
+        assert getattr(view, name) is None
+
+
+def test_a_region_of_no_pixel_is_not_measured():
+    here = capture()
+    for name in VAL:
+        here.frame(name).static_mask.fill_(True)
+    assert all(view.psnr_dynamic is None for view in evaluated(here, noisy(here)).views)
+
+
+def view_of(name, **values):
+    nothing = dict.fromkeys((f.name for f in dataclasses.fields(ViewMetrics)), None)
+    return ViewMetrics(**{**nothing, "name": name, "time": 0.0, "psnr": 20.0, "ssim": 0.5, **values})
+
+
+def test_a_mean_leaves_out_views_that_were_not_measured():
+    views = [view_of("a", psnr_static=10.0), view_of("b"), view_of("c", psnr_static=30.0)]
+    assert Evaluation(views, None, 1.0, None).summary()["psnr_static"] == 20.0
+
+
+def test_each_view_is_shown_once_in_order():
+    shown = []
+    here = capture()
+    evaluated(here, noisy(here), on_view=lambda index, frame, truth, rendering: shown.append((index, frame.name)))
+    assert shown == [(0, "a"), (1, "b"), (2, "c")]
+
+
+def test_lpips_is_measured_with_the_network_that_is_given():
+    class Half(Lpips):
+        def forward(self, image, truth):
+            return (image - truth).abs().mean() / 2
+
+    here = capture()
+    images = noisy(here)
+    result = evaluated(here, images, lpips=Half("squeeze"))
+    truth = here.frame("b").image.float() / 255
+    assert result.lpips_net == "squeeze"
+    assert result.views[1].lpips == pytest.approx(((images[0.5].clamp(0, 1) - truth).abs().mean() / 2).item())
+
+
+# Flicker ------------------------------------------------------------------------------------------------------------
+
+
+def gray(value):
+    return torch.full((H, W, 3), value)
+
+
+def test_flicker_is_the_mean_change_between_consecutive_moments():
+    images = {0.25: gray(0.2), 0.5: gray(0.5), 0.75: gray(0.4)}
+    assert evaluated(capture(), images).flicker == pytest.approx((0.3 + 0.1) / 2)
+
+
+def test_flicker_is_seen_through_the_middle_camera_alone():
+    here = capture()
+    for k, name in enumerate(VAL):
+        here.cameras[name].viewmat[0, 3] = k
+    seen = []
+
+    def render_at(camera, branches):
+        if branches:
+            seen.append((camera.viewmat[0, 3].item(), camera.time))
+        return rendering(gray(0.5))
+
+    evaluate.evaluate(render_at, here, CPU, quiet=True)
+    assert seen[len(VAL) :] == [(1.0, 0.25), (1.0, 0.5), (1.0, 0.75)]
+
+
+def test_flicker_leaves_out_what_is_dynamic_at_either_moment():
+    def render_at(camera, branches):
+        alpha = torch.zeros(H, W)
+        image = gray(0.5)
+        if camera.time == 0.5:
+            alpha[:3], image[:3] = 1.0, 1.0
+        return rendering(image, alpha)
+
+    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).flicker == 0.0
+
+
+@pytest.mark.parametrize("val", [("a",), ()])
+def test_flicker_needs_two_moments(val):
+    here = capture(val)
+    for camera in here.cameras.values():
+        object.__setattr__(camera, "time", 0.25)
+    assert evaluated(here, {0.25: gray(0.5)}).flicker is None
+
+
+def test_flicker_is_not_measured_where_all_is_dynamic():
+    def render_at(camera, branches):
+        return rendering(gray(camera.time), torch.ones(H, W))
+
+    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).flicker is None
+
+
+# Frames a second ----------------------------------------------------------------------------------------------------
+
+
+def test_frames_a_second_are_joint_images_by_the_clock_after_one_to_warm_up(monkeypatch):
+    now = [0.0]
+
+    def render_at(camera, branches):
+        now[0] += 0.0 if branches else (100.0 if now[0] == 0.0 else 0.02)
+        return rendering(gray(0.5))
+
+    monkeypatch.setattr(evaluate.time, "perf_counter", lambda: now[0])
+    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).fps == pytest.approx(50.0)
+
+
+# Without evaluation frames ------------------------------------------------------------------------------------------
+
+
+def test_without_evaluation_frames_no_quality_is_measured_but_flicker_and_speed_are():
+    summary = evaluated(capture(()), {0.0: gray(0.2), 1.0: gray(0.4)}).summary()
+    assert (summary["psnr"], summary["ssim"], summary["lpips"], summary["num_views"]) == (None, None, None, 0)
+    assert summary["flicker"] == pytest.approx(0.2)
+    assert summary["fps"] > 0
+
+
+# Files --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_view_is_a_line_and_what_was_not_measured_is_empty(tmp_path):
+    views = [view_of("a,b", psnr_static=12.5), view_of("c")]
+    evaluate.write_views(tmp_path / "views.csv", Evaluation(views, None, 1.0, None))
+    with open(tmp_path / "views.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["name"], row["psnr"], row["psnr_static"]) for row in rows] == [
+        ("a,b", "20.0", "12.5"),
+        ("c", "20.0", ""),
+    ]
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_json_has_no_values_that_other_readers_refuse(tmp_path, value):
+    evaluate.write_json(tmp_path / "metrics.json", {"psnr": value, "ssim": 0.5})
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    text = (tmp_path / "metrics.json").read_text()
+    assert json.loads(text, parse_constant=refuse) == {"psnr": None, "ssim": 0.5}
+
+
+# A whole run --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(quickly, tmp_path_factory):  # noqa: F811  # the fixture
+    """A run of train.py with its evaluation."""
+    data = tiny.write(tmp_path_factory.mktemp("cache"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "VIDEO_FRAMES", 2)
+        config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path_factory.mktemp("runs") / "run")
+        assert script.main(config) == 0
+    return config.out
+
+
+@pytest.fixture
+def figures(run):
+    return json.loads((run / "metrics.json").read_text())
+
+
+def test_metrics_have_all_that_reports_need(figures):
+    wanted = (
+        "psnr ssim lpips psnr_static psnr_dynamic flicker fps train_seconds num_static num_dynamic iterations commit"
+    )
+    assert set(wanted.split()) <= figures.keys()
+
+
+def test_metrics_of_a_run_are_of_its_last_iterate(figures, run):
+    state = tiny.state(run)
+    assert figures["iterations"] == tiny.LENGTH
+    assert figures["num_static"] == len(state["scene.static.means"]) > 0
+    assert figures["num_dynamic"] == len(state["scene.dynamic.means"]) > 0
+    assert 0 < figures["train_seconds"] < 600
+    assert figures["fps"] > 0
+
+
+def test_metrics_name_the_commit_of_a_checkout(figures):
+    root = Path(runs.__file__).parent
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
+    if head.returncode:
+        assert figures["commit"] is None
+    else:
+        assert re.fullmatch("[0-9a-f]{7,}", figures["commit"])
+        assert head.stdout.startswith(figures["commit"])
+
+
+def test_metrics_are_the_means_of_the_views(figures, run):
+    with open(run / "views.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == figures["num_views"] == 3
+    for name in ("psnr", "ssim", "psnr_static", "psnr_dynamic"):
+        assert figures[name] == pytest.approx(statistics.fmean(float(row[name]) for row in rows))
+
+
+def test_a_perfect_picture_of_one_view_is_no_number_in_json_but_one_in_the_table(tmp_path):
+    here = capture(("a",))
+    result = evaluated(here, {0.25: here.frame("a").image.float() / 255})
+    evaluate.write_json(tmp_path / "metrics.json", result.summary())
+    evaluate.write_views(tmp_path / "views.csv", result)
+    assert json.loads((tmp_path / "metrics.json").read_text())["psnr"] is None
+    assert ",inf," in (tmp_path / "views.csv").read_text()
+
+
+def test_evaluating_a_capture_whose_pictures_were_changed_measures_the_new_ones(run, tmp_path, monkeypatch):
+    """Pictures are read, not remembered."""
+    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    data, copy = tiny.write(tmp_path), shutil.copytree(run, tmp_path / "copy")
+    before = json.loads((run / "metrics.json").read_text())["psnr"]
+    for path in (data / "rgb/1x").iterdir():
+        write_png(path, np.zeros((tiny.SCENE.height, tiny.SCENE.width, 3), np.uint8))
+    runs.evaluate_run(copy, runs.open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
+    assert json.loads((copy / "metrics.json").read_text())["psnr"] != pytest.approx(before)
+
+
+def test_figures_are_kept_where_no_video_can_be_written(finished_run, tmp_path, monkeypatch):
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    for name in ("metrics.json", "views.csv"):
+        (run / name).unlink(missing_ok=True)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(OSError, match="pip install av"):
+        runs.evaluate_run(run, load_capture(tiny.write(tmp_path)), quiet=True)
+    assert json.loads((run / "metrics.json").read_text())["psnr"] > 0
+    assert len((run / "views.csv").read_text().splitlines()) > 1

@@ -1,0 +1,293 @@
+"""LPIPS: the networks are the ones that their weights belong to, and files that don't fit are refused in words."""
+
+import dataclasses
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+import train as script
+from tests import tiny
+from warpgs.config import TrainConfig
+from warpgs.evaluation import lpips
+
+NETS = ["squeeze", "alex", "vgg"]
+FILES = {"squeeze": "squeezenet1_1_features.pth", "alex": "alexnet-owt.pth", "vgg": "vgg16-397923af.pth"}
+
+WEIGHTS = os.environ.get("WARPGS_LPIPS")
+needs_weights = pytest.mark.skipif(not WEIGHTS, reason="WARPGS_LPIPS names no folder with the weights")
+
+
+@pytest.fixture(autouse=True)
+def _nothing_in_the_environment(monkeypatch):
+    monkeypatch.delenv("WARPGS_LPIPS", raising=False)
+
+
+def network(net):
+    """Of random weights."""
+    distance = lpips.Lpips(net)
+    for parameter in distance.features.parameters():
+        nn.init.normal_(parameter, std=0.05)
+    for weight in distance.weights:
+        nn.init.uniform_(weight)
+    return distance.eval()
+
+
+def write(folder, distance):
+    """The two files, named and built as their authors' are."""
+    folder.mkdir(exist_ok=True)
+    features = {f"features.{name}": value for name, value in distance.features.state_dict().items()}
+    torch.save({**features, "classifier.1.weight": torch.zeros(3)}, folder / FILES[distance.net])
+    heads = {f"lin{k}.model.1.weight": w[None, :, None, None].clone() for k, w in enumerate(distance.weights)}
+    torch.save(heads, folder / f"lpips_v0.1_{distance.net}_lin.pth")
+    return folder
+
+
+@pytest.fixture
+def pair():
+    return torch.rand(40, 44, 3), torch.rand(40, 44, 3)
+
+
+@pytest.fixture(scope="module")
+def real():
+    return lpips.find(Path(WEIGHTS))
+
+
+# The networks -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_equal_images_have_no_distance(net, pair):
+    assert network(net)(pair[0], pair[0].clone()).item() == 0.0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_different_images_have_some(net, pair):
+    assert network(net)(*pair).item() > 0.0
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_the_distance_is_the_same_both_ways(net, pair):
+    distance = network(net)
+    assert distance(pair[1], pair[0]).item() == pytest.approx(distance(*pair).item(), rel=1e-5)
+
+
+def test_the_distance_is_linear_in_the_weights_of_the_layers(pair):
+    distance = network("squeeze")
+    before = distance(*pair).item()
+    for weight in distance.weights:
+        weight.mul_(3.0)
+    assert distance(*pair).item() == pytest.approx(3.0 * before, rel=1e-5)
+
+
+def test_the_distance_does_not_depend_on_the_size_of_features(pair):
+    """They are compared at unit length: scaling the last layer changes nothing that is compared after it."""
+    distance = network("alex")
+    before = distance(*pair).item()
+    distance.features[10].weight.mul_(7.0)
+    distance.features[10].bias.mul_(7.0)
+    assert distance(*pair).item() == pytest.approx(before, rel=1e-4)
+
+
+def test_features_that_are_all_zero_are_no_distance(pair):
+    distance = network("squeeze")
+    for parameter in distance.features.parameters():
+        parameter.zero_()
+    assert distance(*pair).item() == 0.0
+
+
+def test_one_layer_by_hand():
+    """Σ w (a/|a| − b/|b|)², averaged over the pixels of the first layer of AlexNet."""
+    distance = network("alex")
+    for weight in distance.weights[1:]:
+        weight.zero_()
+    image, truth = torch.rand(32, 36, 3), torch.rand(32, 36, 3)
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    layer = distance.features[0].double()
+    units = []
+    for picture in (image, truth):
+        # The shift and scale of LPIPS are ImageNet's mean and deviation, for values in [-1, 1], rounded.
+        x = ((picture - mean) / std).permute(2, 0, 1)[None].double()
+        units.append(nn.functional.normalize(torch.relu(layer(x)), dim=1))
+    layer.float()
+    expected = ((units[0] - units[1]) ** 2 * distance.weights[0][:, None, None]).sum(1).mean().item()
+    assert distance(image, truth).item() == pytest.approx(expected, rel=5e-3)
+
+
+@pytest.mark.parametrize(("net", "count"), [("squeeze", 722_496), ("alex", 2_469_696), ("vgg", 14_714_688)])
+def test_a_network_has_as_many_parameters_as_published(net, count):
+    """Of the features of torchvision's SqueezeNet 1.1, AlexNet and VGG-16."""
+    assert sum(p.numel() for p in lpips.Lpips(net).features.parameters()) == count
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_the_smallest_pictures_leave_every_layer_a_pixel(net):
+    assert torch.isfinite(network(net)(torch.rand(32, 32, 3), torch.rand(32, 32, 3)))
+
+
+@pytest.mark.parametrize("size", [(31, 40), (40, 31), (1, 1)])
+def test_smaller_pictures_are_refused_in_words(size):
+    with pytest.raises(ValueError, match=r"LPIPS needs 32 pixels a side, got \["):
+        network("squeeze")(torch.rand(*size, 3), torch.rand(*size, 3))
+
+
+def test_no_gradient_is_kept(pair):
+    assert not network("squeeze")(*pair).requires_grad
+
+
+# Their files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_written_weights_are_found_and_measure_the_same(net, pair, tmp_path):
+    distance = network(net)
+    found = lpips.find(write(tmp_path, distance))
+    assert found.net == net
+    assert found(*pair).item() == distance(*pair).item()
+
+
+def test_the_linear_layers_may_be_named_as_their_authors_do(tmp_path, pair):
+    distance = network("squeeze")
+    write(tmp_path, distance)
+    (tmp_path / "lpips_v0.1_squeeze_lin.pth").rename(tmp_path / "squeeze.pth")
+    assert lpips.find(tmp_path)(*pair).item() == distance(*pair).item()
+
+
+def test_the_folder_may_be_named_in_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPGS_LPIPS", str(write(tmp_path, network("squeeze"))))
+    assert lpips.find(None).net == "squeeze"
+
+
+def test_a_folder_that_is_given_goes_before_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPGS_LPIPS", str(tmp_path / "nothing"))
+    assert lpips.find(write(tmp_path, network("alex"))).net == "alex"
+
+
+def test_without_a_folder_there_is_no_lpips():
+    assert lpips.find(None) is None
+    assert lpips.locate(None) is None
+
+
+def test_weights_are_located_without_being_read(tmp_path):
+    for name in (FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"):
+        (tmp_path / name).write_bytes(b"not weights")
+    assert lpips.locate(tmp_path) == (tmp_path, "squeeze")
+
+
+@pytest.mark.parametrize("missing", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
+def test_a_folder_that_lacks_a_file_says_what_is_wanted(tmp_path, missing):
+    (write(tmp_path, network("squeeze")) / missing).unlink()
+    with pytest.raises(
+        ValueError, match=r"holds no weights of LPIPS: one of squeezenet1_1.*lpips_v0\.1_<net>_lin\.pth"
+    ):
+        lpips.find(tmp_path)
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path}/nothing holds no weights of LPIPS"):
+        lpips.locate(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("missing", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
+def test_loading_names_the_file_that_is_missing(tmp_path, missing):
+    (write(tmp_path, network("squeeze")) / missing).unlink()
+    with pytest.raises(ValueError, match=r"squeeze.* is missing$"):
+        lpips.load(tmp_path, "squeeze")
+
+
+@pytest.mark.parametrize("name", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
+def test_a_damaged_file_is_named(tmp_path, name):
+    path = write(tmp_path, network("squeeze")) / name
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=f"{path} can't be read as weights"):
+        lpips.find(tmp_path)
+
+
+def test_weights_of_another_network_are_refused_in_one_line(tmp_path):
+    write(tmp_path, network("squeeze"))
+    write(tmp_path, network("alex"))
+    (tmp_path / FILES["alex"]).rename(tmp_path / FILES["squeeze"])
+    with pytest.raises(ValueError, match=r"are not the weights of LPIPS \(squeeze\)") as caught:
+        lpips.load(tmp_path, "squeeze")
+    assert "\n" not in str(caught.value)
+
+
+def test_linear_layers_of_another_network_are_refused_in_one_line(tmp_path):
+    write(tmp_path, network("squeeze"))
+    write(tmp_path, network("alex"))
+    (tmp_path / "lpips_v0.1_alex_lin.pth").rename(tmp_path / "lpips_v0.1_squeeze_lin.pth")
+    with pytest.raises(ValueError, match=r"are not the weights of LPIPS \(squeeze\)") as caught:
+        lpips.load(tmp_path, "squeeze")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [[1], torch.zeros(3), {"a": {"deeper": torch.zeros(3)}}, {1: torch.zeros(3)}])
+def test_a_file_of_something_else_is_refused_in_words(tmp_path, content):
+    path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
+    torch.save(content, path)
+    with pytest.raises(ValueError, match=str(path)):
+        lpips.find(tmp_path)
+
+
+def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
+    torch.save({"features.0.weight": Bomb()}, path)
+    with pytest.raises(ValueError, match="can't be read as weights"):
+        lpips.find(tmp_path)
+    assert not (tmp_path / "executed").exists()
+
+
+# Real weights -------------------------------------------------------------------------------------------------------
+
+
+@needs_weights
+def test_real_weights_give_equal_images_no_distance(real, pair):
+    assert real(pair[0], pair[0].clone()).item() == 0.0
+
+
+@needs_weights
+def test_real_weights_of_the_layers_are_not_negative(real):
+    assert all(bool((weight >= 0).all()) for weight in real.weights)
+
+
+@needs_weights
+def test_real_weights_call_more_noise_farther(real):
+    truth = torch.linspace(0, 1, 64).expand(64, 64)[..., None].repeat(1, 1, 3)
+    noise = torch.randn(64, 64, 3)
+    distances = [real((truth + s * noise).clamp(0, 1), truth).item() for s in (0.01, 0.05, 0.2)]
+    assert 0.0 < distances[0] < distances[1] < distances[2] < 2.0
+
+
+@needs_weights
+def test_real_weights_call_blur_farther_than_a_change_of_brightness_of_the_same_psnr(real):
+    """What PSNR can't tell apart and LPIPS was made for."""
+    truth = torch.rand(16, 16, 3).repeat_interleave(4, 0).repeat_interleave(4, 1) * 0.6 + 0.2
+    blurred = nn.functional.avg_pool2d(truth.permute(2, 0, 1), 7, 1, 3, count_include_pad=False).permute(1, 2, 0)
+    brighter = truth + (blurred - truth).square().mean().sqrt()
+    assert real(blurred, truth).item() > 2.0 * real(brighter, truth).item()
+
+
+# At the start of training -------------------------------------------------------------------------------------------
+
+
+def test_training_with_a_wrong_folder_is_refused_before_any_work(tmp_path):
+    config = dataclasses.replace(TrainConfig(), data=tmp_path / "capture", out=tmp_path / "run", lpips=tmp_path)
+    with pytest.raises(ValueError, match="holds no weights of LPIPS"):
+        script.start(config)
+    assert not (tmp_path / "run").exists()
+
+
+def test_resuming_with_a_folder_that_is_gone_is_refused_before_any_work(tmp_path):
+    weights = write(tmp_path / "weights", network("squeeze"))
+    data = tiny.write(tmp_path / "cache")
+    run = script.start(dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights)).run
+    shutil.rmtree(weights)
+    with pytest.raises(ValueError, match=f"{weights} holds no weights of LPIPS"):
+        script.start(script.parse(["--resume", str(run)]))

@@ -1,0 +1,201 @@
+"""The trunk and the two networks on it (paper Eq. 8b and 10)."""
+
+import pytest
+import torch
+
+from tests.reference.encoding import encode
+from tests.scenes import error, generator, random_like, relative_error
+from warpgs.config import ModelConfig
+from warpgs.model.fields import AppearanceField, DeformationField, Trunk
+
+CENTER = torch.tensor([1.0, -2.0, 0.5])
+HALF_SIZE = torch.tensor([2.0, 2.0, 2.0])
+TIME = torch.tensor([0.37])
+OUTPUTS = 5
+FIELDS = (DeformationField, AppearanceField)
+SHAPES = [(8, 4), (3, 2), (3, 1), (1, 4), (4, 4)]
+"""Numbers of layers, and the layer after which the encoding enters again: also none after which it could."""
+
+
+def model(**changes):
+    sizes = {"position_bands": 3, "time_bands": 2, "width": 16, "sh_degree": 3, "appearance_opacity": True}
+    return ModelConfig(**{**sizes, **changes})
+
+
+def woken(trunk):
+    """Gives the last layer, which begins at zero, values that show."""
+    for part in trunk.layers(trunk.values.data)[-1]:
+        part.copy_(torch.randn(part.shape, generator=generator()))
+
+
+def make_trunk(**changes):
+    trunk = Trunk(model(**changes), CENTER, HALF_SIZE, OUTPUTS)
+    woken(trunk)
+    return trunk
+
+
+def outputs_of(field, means, time=TIME):
+    outputs = field(means, time)
+    return outputs if isinstance(outputs, tuple) else (outputs,)
+
+
+def make_field(kind, **changes):
+    field = kind(model(**changes), CENTER, HALF_SIZE)
+    woken(field.trunk)
+    return field
+
+
+def random_means(num=9):
+    return CENTER + 2.0 * torch.rand(num, 3, generator=generator()) - 1.0
+
+
+def plain_trunk(parameters, means, skip):
+    """The layers one by one in double precision; parameters are [weight, bias, weight, bias …]."""
+    position = encode((means.double() - CENTER.double()) / HALF_SIZE.double(), 3)
+    encoding = torch.cat([position, encode(TIME.double()[:, None], 2).repeat(len(means), 1)], 1)
+    pairs = list(zip(parameters[::2], parameters[1::2], strict=True))
+    values = encoding
+    for number, (weight, bias) in enumerate(pairs[:-1]):
+        if number > 0 and number == skip:
+            values = torch.cat([values, encoding], 1)
+        values = (values @ weight.T + bias).clamp_min(0.0)
+    weight, bias = pairs[-1]
+    return values @ weight.T + bias
+
+
+def double_parameters(trunk):
+    return [part.double().requires_grad_() for layer in trunk.layers(trunk.values.detach()) for part in layer]
+
+
+@pytest.mark.parametrize(("depth", "skip"), SHAPES)
+def test_the_trunk_is_a_chain_of_layers_which_the_encoding_enters_again(depth, skip):
+    trunk = make_trunk(depth=depth, skip=skip)
+    expected = plain_trunk(double_parameters(trunk), random_means(), skip)
+    assert relative_error(trunk(random_means(), TIME), expected) < 2e-6
+
+
+@pytest.mark.parametrize(("depth", "skip"), SHAPES)
+def test_gradients_of_the_trunk_are_those_of_the_chain_of_layers(depth, skip):
+    trunk = make_trunk(depth=depth, skip=skip)
+    outputs = trunk(random_means(), TIME)
+    (cotangent,) = random_like([outputs])
+    outputs.backward(cotangent)
+    parameters = double_parameters(trunk)
+    plain_trunk(parameters, random_means(), skip).backward(cotangent.double())
+    ours = [part for layer in trunk.layers(trunk.values.grad) for part in layer]
+    for gradient, expected in zip(ours, parameters, strict=True):
+        assert relative_error(gradient, expected.grad) < 1e-5
+
+
+def test_nothing_flows_to_the_weights_of_padding():
+    trunk = make_trunk()
+    trunk(random_means(), TIME).square().sum().backward()
+    counted = torch.zeros_like(trunk.values)
+    for part in (part for layer in trunk.layers(counted) for part in layer):
+        part.fill_(1.0)
+    assert 0 < int((counted == 0).sum()) < len(counted) / 2
+    assert not trunk.values.grad[counted == 0].any()
+    assert not trunk.values[counted == 0].any()
+
+
+def test_layers_begin_as_those_of_torch_do():
+    trunk = Trunk(model(width=64), CENTER, HALF_SIZE, OUTPUTS)
+    for weight, bias in trunk.layers(trunk.values.detach())[:-1]:
+        most = weight.shape[1] ** -0.5
+        assert 0.95 * most < float(weight.abs().max()) <= most
+        assert 0.5 * most < float(bias.abs().max()) <= most
+
+
+def test_the_papers_trunk_has_eight_layers_of_256_units():
+    trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, OUTPUTS)
+    encoded = 3 * 21 + 21
+    shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
+    columns = [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
+    assert shapes == [*((256, c) for c in columns), (OUTPUTS, 256)]
+
+
+def test_positions_are_seen_relative_to_the_box():
+    trunk = make_trunk()
+    twin = Trunk(model(), torch.zeros(3), torch.ones(3), OUTPUTS)
+    twin.values.data.copy_(trunk.values.data)
+    means = random_means()
+    assert relative_error(twin((means - CENTER) / HALF_SIZE, TIME), trunk(means, TIME)) < 1e-6
+
+
+def test_the_box_is_saved_with_the_network():
+    state = make_trunk().state_dict()
+    assert torch.equal(state["center"], CENTER)
+    assert torch.equal(state["half_size"], HALF_SIZE)
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_networks_begin_as_no_change(kind):
+    outputs = kind(model(), CENTER, HALF_SIZE)(random_means(), TIME)
+    assert not any(output.any() for output in outputs)
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_a_network_that_begins_as_no_change_can_learn(kind):
+    field = kind(model(), CENTER, HALF_SIZE)
+    sum(output.sum() for output in field(random_means(), TIME)).backward()
+    head = field.trunk.layers(field.trunk.values.grad)[-1]
+    assert head.weight.any()
+    assert head.bias.all()
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_networks_depend_on_position_and_on_time(kind):
+    field = make_field(kind)
+    here, there = outputs_of(field, random_means()), outputs_of(field, random_means() + 0.1)
+    later = outputs_of(field, random_means(), TIME + 0.1)
+    for index, output in enumerate(here):
+        assert (output != there[index]).all()
+        assert (output != later[index]).all()
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_positions_get_no_gradient_from_networks(kind):
+    field, means = make_field(kind), random_means().requires_grad_()
+    sum(output.square().sum() for output in field(means, TIME)).backward()
+    assert means.grad is None
+    assert all(part.any() for layer in field.trunk.layers(field.trunk.values.grad) for part in layer)
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_each_gaussian_is_looked_at_alone(kind):
+    field, means = make_field(kind), random_means()
+    for together, alone in zip(outputs_of(field, means), outputs_of(field, means[3:4]), strict=True):
+        assert error(together[3:4], alone) < 1e-5
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+@pytest.mark.parametrize("num", [0, 1])
+def test_few_gaussians_are_enough(kind, num):
+    field = make_field(kind)
+    outputs = outputs_of(field, random_means(num))
+    sum(output.sum() for output in outputs).backward()
+    assert {len(output) for output in outputs} == {num}
+    assert all(parameter.grad.isfinite().all() for parameter in field.parameters())
+
+
+def test_the_deformation_has_offsets_of_position_rotation_and_scale():
+    field = make_field(DeformationField)
+    offsets = field(random_means(), TIME)
+    expected = plain_trunk(double_parameters(field.trunk), random_means(), skip=4)
+    assert offsets.shape == (9, 3 + 4 + 3)
+    assert relative_error(offsets, expected) < 2e-6
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_the_appearance_has_a_residual_of_every_coefficient_up_to_its_degree(degree):
+    residuals, logits = make_field(AppearanceField, appearance_degree=degree)(random_means(), TIME)
+    assert residuals.shape == (9, (degree + 1) ** 2, 3)
+    assert logits.shape == (9,)
+    together = torch.cat([residuals.flatten(1), logits[:, None]], 1)
+    assert len(together.unique(dim=1).T) == 3 * (degree + 1) ** 2 + 1
+
+
+def test_an_appearance_that_leaves_opacities_alone_has_no_residual_of_them():
+    residuals, logits = make_field(AppearanceField, appearance_opacity=False)(random_means(), TIME)
+    assert logits is None
+    assert residuals.all()

@@ -1,0 +1,234 @@
+"""The scene at a moment: static Gaussians with changing appearance, dynamic ones that move (paper Eq. 5, 8, 11)."""
+
+import pytest
+import torch
+
+from tests.reference.covariance import covariance, rotation
+from tests.scenes import error, generator, make_camera, make_splats, relative_error
+from warpgs.config import ModelConfig, RenderSettings
+from warpgs.model.gaussians import Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.model.splats import Splats
+from warpgs.render import render
+
+NUM_STATIC, NUM_DYNAMIC = 7, 5
+TIME = torch.tensor([0.3])
+LATER = torch.tensor([0.8])
+GEOMETRY = ("means", "quats", "scales")
+
+
+def model(**changes):
+    return ModelConfig(position_bands=2, time_bands=2, depth=3, width=8, skip=1, sh_degree=3, **changes)
+
+
+def make_gaussians(num, seed):
+    splats = make_splats(num, seed)
+    return Gaussians(
+        splats.means,
+        splats.quats,
+        splats.scales.log(),
+        splats.opacities.logit(),
+        splats.sh[:, :1].contiguous(),
+        splats.sh[:, 1:].contiguous(),
+    )
+
+
+def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, awake=True, **changes):
+    """A scene; if ``awake``, with networks that change something."""
+    static, dynamic = make_gaussians(num_static, 1), make_gaussians(num_dynamic, 2)
+    scene = SplitScene(static, dynamic, model(**changes), torch.zeros(3), torch.full((3,), 3.0))
+    if awake:
+        for network in (scene.deformation, scene.appearance):
+            for parameter in network.trunk.layers(network.trunk.values.data)[-1]:
+                parameter.copy_(0.2 * torch.randn(parameter.shape, generator=generator()))
+    return scene
+
+
+def named(splats):
+    return {name: getattr(splats, name) for name in Splats.tensor_names() if name != "colors"}
+
+
+def static_part(splats):
+    return {name: t[:NUM_STATIC] for name, t in named(splats).items()}
+
+
+def dynamic_part(splats):
+    return {name: t[NUM_STATIC:] for name, t in named(splats).items()}
+
+
+def differing(a, b):
+    return {name for name in a if not torch.equal(a[name], b[name])}
+
+
+# Eq. 5 ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_is_its_static_and_then_its_dynamic_gaussians():
+    scene = make_scene()
+    splats = scene.splats(TIME, moving=False, relit=False)
+    for part, gaussians in ((static_part(splats), scene.static), (dynamic_part(splats), scene.dynamic)):
+        assert torch.equal(part["means"], gaussians.means)
+        assert torch.equal(part["quats"], gaussians.quats)
+        assert error(part["scales"], gaussians.log_scales.exp()) < 1e-6
+        assert error(part["opacities"], gaussians.logit_opacities.sigmoid()) < 1e-6
+        assert torch.equal(part["sh"], gaussians.sh)
+
+
+def test_each_gaussian_says_of_which_branch_it_is():
+    assert make_scene().splats(TIME).is_dynamic.tolist() == [False] * NUM_STATIC + [True] * NUM_DYNAMIC
+
+
+def test_the_geometry_of_static_gaussians_does_not_depend_on_time():
+    scene = make_scene(appearance_opacity=True)
+    now, later = static_part(scene.splats(TIME)), static_part(scene.splats(LATER))
+    assert differing(now, later) == {"sh", "opacities"}
+
+
+def test_the_appearance_of_dynamic_gaussians_does_not_depend_on_time():
+    scene = make_scene(appearance_opacity=True)
+    now, later = dynamic_part(scene.splats(TIME)), dynamic_part(scene.splats(LATER))
+    assert differing(now, later) == set(GEOMETRY)
+
+
+@pytest.mark.parametrize("sizes", [(0, 4), (4, 0), (0, 0), (1, 1)])
+def test_either_branch_may_be_empty(sizes):
+    splats = make_scene(*sizes).splats(TIME)
+    assert len(splats.means) == sum(sizes)
+    assert int(splats.is_dynamic.sum()) == sizes[1]
+
+
+def test_the_degree_of_harmonics_is_passed_on():
+    scene = make_scene()
+    assert scene.splats(TIME, sh_degree=2).sh_degree == 2
+    assert scene.static_splats(sh_degree=1).sh_degree == 1
+
+
+def test_the_static_gaussians_alone_have_their_own_appearance():
+    scene = make_scene()
+    alone, whole = scene.static_splats(), static_part(scene.splats(TIME, relit=False))
+    for name in (*GEOMETRY, "opacities", "sh"):
+        assert error(getattr(alone, name), whole[name]) < 1e-6
+
+
+# Eq. 8 ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_residuals_are_added_to_the_coefficients_of_the_lowest_degrees(degree):
+    scene = make_scene(appearance_degree=degree)
+    residual, _ = scene.appearance(scene.static.means, TIME)
+    bases = (degree + 1) ** 2
+    sh = static_part(scene.splats(TIME))["sh"].detach()
+    assert residual.all()
+    assert error(sh[:, :bases], scene.static.sh[:, :bases].double() + residual.double()) < 1e-6
+    assert torch.equal(sh[:, bases:], scene.static.sh[:, bases:])
+
+
+def test_residuals_of_opacity_are_added_to_its_logit():
+    scene = make_scene(appearance_opacity=True)
+    _, residual = scene.appearance(scene.static.means, TIME)
+    logits = scene.static.logit_opacities.double() + residual.double()
+    assert residual.all()
+    assert error(static_part(scene.splats(TIME))["opacities"], 1.0 / (1.0 + torch.exp(-logits))) < 1e-6
+
+
+def test_opacities_stay_within_zero_and_one_whatever_their_residuals():
+    scene = make_scene(appearance_opacity=True)
+    for bias in (-1e6, 1e6):
+        scene.appearance.trunk.layers(scene.appearance.trunk.values.data)[-1].bias.fill_(bias)
+        opacities = static_part(scene.splats(TIME))["opacities"]
+        assert ((opacities >= 0) & (opacities <= 1)).all()
+
+
+def test_opacities_are_constant_where_the_config_says_so():
+    splats = static_part(make_scene(appearance_opacity=False).splats(TIME))
+    assert torch.equal(splats["opacities"], make_scene().static.opacities)
+
+
+def test_without_relighting_the_appearance_network_does_not_matter():
+    scene, plain = make_scene(appearance_opacity=True), make_scene(awake=False)
+    assert not differing(static_part(scene.splats(TIME, relit=False)), static_part(plain.splats(TIME, relit=False)))
+
+
+@pytest.mark.parametrize("appearance_opacity", [False, True])
+def test_relighting_begins_with_the_image_that_was_there(appearance_opacity):
+    scene = make_scene(awake=False, appearance_opacity=appearance_opacity, appearance_degree=3)
+    settings = RenderSettings(branches=True)
+    before, after = (render(scene.splats(TIME, relit=r), make_camera(), settings=settings) for r in (False, True))
+    for name in ("joint", "static", "dynamic"):
+        assert torch.equal(getattr(before, name).image, getattr(after, name).image)
+        assert getattr(before, name).alpha.any()
+
+
+# Eq. 11 --------------------------------------------------------------------------------------------------------------
+
+
+def test_positions_move_by_their_offset():
+    scene = make_scene()
+    shift = scene.deformation(scene.dynamic.means, TIME)[:, :3]
+    assert shift.all()
+    expected = scene.dynamic.means.double() + shift.double()
+    assert error(dynamic_part(scene.splats(TIME))["means"], expected) < 1e-6
+
+
+def test_covariances_are_those_of_equation_11b():
+    scene = make_scene()
+    dynamic = scene.dynamic
+    _, turn, stretch = scene.deformation(dynamic.means, TIME).double().split([3, 4, 3], 1)
+    R = rotation(dynamic.quats.double())
+    R_offset = rotation(turn + torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    A = R_offset @ R @ torch.diag_embed(stretch.exp()) @ R.mT
+    before = covariance(dynamic.quats.double(), dynamic.log_scales.double().exp())
+    moved = dynamic_part(scene.splats(TIME))
+    after = covariance(moved["quats"].double(), moved["scales"].double())
+    assert relative_error(after, A @ before @ A.mT) < 1e-6
+    assert relative_error(before, after) > 0.1
+
+
+def test_dynamic_gaussians_begin_where_they_are():
+    scene = make_scene(awake=False)
+    assert not differing(dynamic_part(scene.splats(TIME)), dynamic_part(scene.splats(TIME, moving=False)))
+
+
+def test_without_moving_time_does_not_matter_to_dynamic_gaussians():
+    scene = make_scene()
+    now, later = (scene.splats(time, moving=False) for time in (TIME, LATER))
+    assert not differing(dynamic_part(now), dynamic_part(later))
+
+
+def test_noise_on_time_moves_dynamic_gaussians_as_that_later_time_would():
+    scene = make_scene()
+    noisy, later = scene.splats(TIME, time_noise=LATER - TIME), scene.splats(LATER)
+    for name in GEOMETRY:
+        assert error(dynamic_part(noisy)[name], dynamic_part(later)[name]) < 1e-5
+
+
+def test_noise_on_time_leaves_static_gaussians_alone():
+    scene = make_scene(appearance_opacity=True)
+    noisy, plain = scene.splats(TIME, time_noise=LATER - TIME), scene.splats(TIME)
+    assert not differing(static_part(noisy), static_part(plain))
+
+
+def test_no_gradient_flows_to_positions_through_the_networks():
+    scene = make_scene(appearance_opacity=True, appearance_degree=3)
+    splats = scene.splats(TIME)
+    values = [splats.quats, splats.scales, splats.opacities, splats.sh]
+    sum(value.sum() for value in values).backward()
+    assert not scene.static.means.grad.any()
+    assert not scene.dynamic.means.grad.any()
+    for network in (scene.deformation, scene.appearance):
+        assert network.trunk.layers(network.trunk.values.grad)[0].weight.any()
+
+
+def test_the_gradient_of_moved_positions_is_that_of_positions():
+    scene = make_scene()
+    scene.splats(TIME).means.backward(torch.full((NUM_STATIC + NUM_DYNAMIC, 3), 2.0))
+    assert (scene.static.means.grad == 2.0).all()
+    assert (scene.dynamic.means.grad == 2.0).all()
+
+
+def test_an_empty_scene_takes_the_state_of_another():
+    scene = make_scene()
+    other = SplitScene.empty(NUM_STATIC, NUM_DYNAMIC, model())
+    other.load_state_dict(scene.state_dict())
+    assert not differing(named(scene.splats(TIME)), named(other.splats(TIME)))

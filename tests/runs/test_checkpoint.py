@@ -1,0 +1,366 @@
+"""Checkpoints: whole whatever happens while they are written, and read with no trust in what they hold."""
+
+import dataclasses
+import errno
+import json
+import os
+import pickle
+import resource
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from tests import tiny
+from tests.export.scenes import refusal
+from warpgs.runs import checkpoint
+from warpgs.model.scene import SplitScene
+
+TENSORS = {"scene.a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
+FACTS = {"iteration": 3, "moving": True, "peak_bytes": None}
+
+
+def scene(num_static=5, num_dynamic=3, model=tiny.MODEL):
+    made = SplitScene.empty(num_static, num_dynamic, model)
+    for parameter in made.parameters():
+        torch.nn.init.uniform_(parameter)
+    return made
+
+
+def tensors_of(a_scene):
+    return {f"scene.{name}": tensor for name, tensor in a_scene.state_dict().items()}
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = checkpoint.path_of(tmp_path, 3)
+    checkpoint.save(path, TENSORS, FACTS)
+    return path
+
+
+def write_raw(path, header, data=b"", length=None):
+    """A safetensors file of a header, which may lie about its own length."""
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text) if length is None else length) + text + data)
+    return path
+
+
+def metadata(**changes):
+    facts = {"format": "warpgs", "version": str(checkpoint.VERSION), "facts": "{}", **changes}
+    return {"__metadata__": {key: value for key, value in facts.items() if value is not None}}
+
+
+# Written and read ---------------------------------------------------------------------------------------------------
+
+
+def test_what_is_saved_is_read_back_bit_for_bit(path):
+    loaded = checkpoint.load(path)
+    assert tiny.differences(loaded.tensors, TENSORS) == []
+    assert loaded.facts == FACTS
+
+
+def test_who_may_read_other_files_may_read_a_checkpoint(path, tmp_path):
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_a_scene_is_read_back_bit_for_bit(tmp_path):
+    saved = scene()
+    checkpoint.save(tmp_path / "a.safetensors", tensors_of(saved), FACTS)
+    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL, tmp_path)
+    assert tiny.differences(dict(read.state_dict()), dict(saved.state_dict())) == []
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (1, 0), (0, 1)])
+def test_an_empty_branch_is_read_back(tmp_path, counts):
+    checkpoint.save(tmp_path / "a.safetensors", tensors_of(scene(*counts)), FACTS)
+    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL, tmp_path)
+    assert (len(read.static), len(read.dynamic)) == counts
+
+
+def test_checkpoints_are_listed_oldest_first(tmp_path):
+    for iteration in (10_000, 20, 3):
+        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
+    assert checkpoint.saved(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in (3, 20, 10_000)]
+
+
+def test_a_folder_without_checkpoints_has_none(tmp_path):
+    assert checkpoint.saved(tmp_path) == []
+
+
+@pytest.mark.parametrize(("count", "left"), [(2, [4, 5]), (1, [5]), (0, [5]), (9, [1, 2, 3, 4, 5])])
+def test_the_newest_checkpoints_are_kept(tmp_path, count, left):
+    for iteration in range(1, 6):
+        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
+    checkpoint.keep_newest(tmp_path, count)
+    assert checkpoint.saved(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in left]
+
+
+def test_what_a_killed_program_left_half_written_is_no_checkpoint_and_goes(path):
+    partial = path.with_name("0000009.partial")
+    partial.write_bytes(path.read_bytes()[:50])
+    assert checkpoint.saved(path.parent.parent) == [path]
+    checkpoint.keep_newest(path.parent.parent, 2)
+    assert list(path.parent.iterdir()) == [path]
+
+
+# A write that fails -------------------------------------------------------------------------------------------------
+
+
+WITH_SMALL_FILES = """
+import json, pathlib, resource, sys, torch
+from warpgs import checkpoint
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+checkpoint.save(pathlib.Path(sys.argv[1]), {"b": torch.zeros(100_000)}, json.loads(sys.argv[2]))
+"""
+"""Saves while the system refuses to write past 4 KiB of a file: in a process of its own, or the log of the tests, if it
+goes to a file, would be refused too."""
+
+
+LARGE = {"b": torch.zeros(100_000)}
+
+
+def full_disk(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def pressed_ctrl_c(*_):
+    raise KeyboardInterrupt
+
+
+def test_a_write_that_fails_half_way_leaves_the_old_checkpoint_alone(path):
+    before = path.read_bytes()
+    command = [sys.executable, "-c", WITH_SMALL_FILES, str(path), json.dumps(FACTS)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.stderr.splitlines()[-1].startswith(f"OSError: {path} could not be written")
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("failing", ["fsync", "replace"])
+def test_a_full_disk_leaves_the_old_checkpoint_alone(path, monkeypatch, failing):
+    before = path.read_bytes()
+    monkeypatch.setattr(os, failing, full_disk)
+    with pytest.raises(OSError, match="could not be written"):
+        checkpoint.save(path, LARGE, FACTS)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_full_disk_is_one_line_that_names_the_file_and_the_reason(path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="could not be written") as caught:
+        checkpoint.save(path, LARGE, FACTS)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert "No space left on device" in text
+    assert "\n" not in text
+
+
+def test_ctrl_c_while_writing_leaves_the_old_checkpoint_alone(path, monkeypatch):
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", pressed_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint.save(path, LARGE, FACTS)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda file: (done.append("written"), fsync(file)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("named"), replace(*paths)))
+    checkpoint.save(tmp_path / "a.safetensors", TENSORS, FACTS)
+    assert done == ["written", "named"]
+
+
+# Files that are not what they should be -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kept", [0, 1, 7, 8, 9, 100, -1])
+def test_a_truncated_file_is_damaged(path, kept):
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(ValueError, match=f"{path} is damaged"):
+        checkpoint.load(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"nothing\.safetensors does not exist"):
+        checkpoint.load(tmp_path / "nothing.safetensors")
+
+
+def test_a_file_of_another_version_is_refused(tmp_path):
+    path = write_raw(tmp_path / "a.safetensors", metadata(version="999"))
+    with pytest.raises(ValueError, match=r"has version 999, this program reads 2$"):
+        checkpoint.load(path)
+
+
+def test_a_file_of_another_program_is_refused(tmp_path):
+    save_file(TENSORS, tmp_path / "a.safetensors")
+    with pytest.raises(ValueError, match="is not a checkpoint of warpgs"):
+        checkpoint.load(tmp_path / "a.safetensors")
+
+
+LONG = '{"iteration": 1' + 5000 * "0" + "}"
+
+
+@pytest.mark.parametrize("facts", [LONG, None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
+def test_facts_that_are_no_object_are_damage(tmp_path, facts):
+    path = write_raw(tmp_path / "a.safetensors", metadata(facts=facts))
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(path)
+
+
+def test_a_fact_that_is_missing_is_named_with_the_file(path):
+    with pytest.raises(ValueError, match=f"{path} is damaged: it has no sh_degree"):
+        checkpoint.load(path).facts["sh_degree"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("moving", "yes"),
+        ("relit", 1),
+        ("sh_degree", 3),
+        ("sh_degree", 0.5),
+        ("sh_degree", []),
+        ("iteration", -1),
+        ("iteration", 10**400),
+    ],
+)
+def test_facts_that_no_stage_has_are_damage(path, name, value):
+    loaded = checkpoint.load(path)
+    facts = {"moving": True, "relit": True, "sh_degree": 2, "iteration": 5, name: value}
+    checkpoint.save(path, loaded.tensors, facts)
+    with pytest.raises(ValueError, match=f"{path} is damaged: {name} can't be"):
+        checkpoint.load(path).check_stage(2)
+
+
+def test_a_tensor_that_is_missing_is_named_with_the_file(path):
+    with pytest.raises(ValueError, match=f"{path} is damaged: it has no alignments"):
+        checkpoint.load(path).tensors["alignments"]
+
+
+def test_a_pickle_is_refused_and_not_executed(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "executed"),)
+
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(path)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_file_of_torch_save_is_refused(tmp_path):
+    torch.save(TENSORS, tmp_path / "a.safetensors")
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(tmp_path / "a.safetensors")
+
+
+@pytest.mark.parametrize("length", [2**63 - 1, 2**64 - 1, 2**40, 99_000_000])
+def test_a_header_that_claims_to_be_huge_is_damage(tmp_path, length):
+    path = write_raw(tmp_path / "a.safetensors", metadata(), length=length)
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(path)
+
+
+def test_a_tensor_larger_than_the_file_is_damage(tmp_path):
+    entry = {"dtype": "F32", "shape": [1_000_000_000, 3], "data_offsets": [0, 12_000_000_000]}
+    path = write_raw(tmp_path / "a.safetensors", {**metadata(), "scene.static.means": entry}, b"\0" * 12)
+    with pytest.raises(ValueError, match="is damaged"):
+        checkpoint.load(path)
+
+
+def read_whole(path):
+    """All that is read of a checkpoint before its scene is shown."""
+    loaded = checkpoint.load(path)
+    loaded.check_stage(tiny.MODEL.sh_degree)
+    checkpoint.load_scene(loaded, tiny.MODEL, path)
+
+
+def test_a_damaged_checkpoint_is_read_or_refused_in_a_line_but_never_anything_else(tmp_path):
+    path = checkpoint.path_of(tmp_path, 3)
+    checkpoint.save(path, tensors_of(scene()), {**FACTS, "relit": True, "sh_degree": 1})
+    read_whole(path)
+    whole, random = path.read_bytes(), np.random.default_rng(0)
+    header = 8 + struct.unpack("<Q", whole[:8])[0]
+    refused = 0
+    for _ in range(300):
+        data = bytearray(whole[: random.integers(len(whole))] if random.random() < 0.2 else whole)
+        for place in random.integers(0, min(header, len(data)) if random.random() < 0.8 else len(data), 3):
+            data[place] = random.choice([random.integers(256), *b'0123456789"[]{},:-'])
+        path.write_bytes(data)
+        said = refusal(read_whole, path)
+        refused += said is not None
+        assert said is None or str(path) in said
+    assert refused > 200
+
+
+def test_rows_of_no_width_make_no_gaussians(tmp_path):
+    """Such a tensor needs no byte of the file, however many rows it claims."""
+    rows = 4_000_000  # 0.9 GB as Gaussians
+    entry = {"dtype": "F32", "shape": [rows, 0], "data_offsets": [0, 0]}
+    header = {**metadata(), "scene.static.means": entry, "scene.dynamic.means": entry}
+    loaded = checkpoint.load(write_raw(tmp_path / "a.safetensors", header))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match="does not hold a scene"):
+        checkpoint.load_scene(loaded, tiny.MODEL, tmp_path / "a.safetensors")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+
+
+def test_a_config_that_claims_a_huge_network_takes_no_memory(path):
+    """0.8 GB that the file does not hold."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "does not hold a scene" in refused(tensors_of(scene()), dataclasses.replace(tiny.MODEL, width=4096, depth=8))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
+
+
+# Scenes that don't fit ----------------------------------------------------------------------------------------------
+
+
+def refused(tensors, model=tiny.MODEL):
+    path = checkpoint.Path("here.safetensors")
+    with pytest.raises(ValueError, match=r"^here\.safetensors ") as caught:
+        checkpoint.load_scene(checkpoint.Checkpoint(path, tensors, {}), model, path)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_scene_of_other_networks_is_refused():
+    wider = dataclasses.replace(tiny.MODEL, width=16)
+    assert "does not hold a scene of this run's config" in refused(tensors_of(scene()), wider)
+
+
+LACKING = {"static.means": "'static.means'", "static.quats": 'Missing key(s) in state_dict: "static.quats"'}
+
+
+@pytest.mark.parametrize("name", LACKING)
+def test_a_scene_that_lacks_a_tensor_is_refused(name):
+    tensors = tensors_of(scene())
+    del tensors[f"scene.{name}"]
+    assert f"does not hold a scene of this run's config: {LACKING[name]}" in refused(tensors)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (4, 3), (5, 4), (5, 3, 1)])
+def test_a_tensor_of_another_shape_is_refused(shape):
+    tensors = {**tensors_of(scene()), "scene.static.means": torch.zeros(shape)}
+    assert "does not hold a scene of this run's config" in refused(tensors)
+
+
+def test_a_tensor_too_many_is_refused():
+    tensors = {**tensors_of(scene()), "scene.static.velocities": torch.zeros(5, 3)}
+    assert 'Unexpected key(s) in state_dict: "static.velocities"' in refused(tensors)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_scene_that_is_not_finite_is_refused(value):
+    tensors = tensors_of(scene())
+    tensors["scene.dynamic.log_scales"][1, 2] = value
+    assert "holds values that are not finite" in refused(tensors)

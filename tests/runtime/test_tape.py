@@ -1,0 +1,118 @@
+"""The bridge between torch and Warp."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
+from warpgs.kernels.covariance import covariance as kernel
+from warpgs.render import render
+from warpgs.runtime import tape
+from warpgs.runtime.profiling import profile
+from warpgs.runtime.tape import Run
+
+
+def launch(quats, scales):
+    Run(torch.device("cpu"), []).launch(kernel, 7, quats, scales, torch.zeros(7, 3, 3))
+
+
+@pytest.mark.parametrize(
+    "quats",
+    [torch.ones(7, 4, dtype=torch.float64), torch.ones(7, 4, dtype=torch.int32), torch.ones(7, 3), torch.ones(7)],
+)
+def test_an_argument_that_the_kernel_would_misread_is_refused(quats):
+    with pytest.raises(TypeError, match="quats is a 1-d array of vec4"):
+        launch(quats, torch.ones(7, 3))
+
+
+def test_an_argument_that_is_not_contiguous_is_refused():
+    with pytest.raises(TypeError, match="scales must be contiguous"):
+        launch(torch.ones(7, 4), torch.ones(3, 7).T)
+
+
+def picture(seed: int) -> list[torch.Tensor]:
+    splats = as_leaves(make_splats(80, seed=seed))
+    image = render(splats, make_camera(40 + seed, 37)).joint.image
+    image.square().sum().backward()
+    return [image.detach(), *gradients(splats).values()]
+
+
+@pytest.fixture
+def shared_out(monkeypatch):
+    """Small launches go to all cores, too."""
+    monkeypatch.setattr(tape, "SMALLEST_SHARD", 1)
+
+
+def test_threads_that_render_at_once_draw_what_they_draw_alone(shared_out):
+    seeds = list(range(4)) * 8
+    alone = [picture(seed) for seed in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(picture, seeds))
+    for seed, values in zip(seeds, together, strict=True):
+        for value, expected in zip(values, alone[seed], strict=True):
+            assert torch.equal(value, expected)
+
+
+def test_one_core_draws_what_two_draw(shared_out):
+    cores = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        single = picture(0)
+        torch.set_num_threads(2)
+        double = picture(0)
+    finally:
+        torch.set_num_threads(cores)
+    assert torch.equal(single[0], double[0])
+    for value, expected in zip(single[1:], double[1:], strict=True):
+        assert (value - expected).norm() < 1e-6 * expected.norm()
+
+
+def test_a_profile_lists_the_kernels_of_both_ways():
+    with profile() as taken:
+        picture(0)
+    times = taken.times()
+    names = [t.name for t in times]
+    forward = ["project_fwd", "pack", "sort_pairs", "count_tiles", "emit_isects", "sort_pairs", "tile_ranges"]
+    assert names == [
+        *forward,
+        "sh_fwd",
+        "pack_features",
+        "composite_fwd",
+        "composite_bwd",
+        "unpack",
+        "sh_bwd",
+        "project_bwd",
+    ]
+    assert all(t.duration_ms > 0 for t in times)
+    assert [t.start_ms for t in times] == sorted(t.start_ms for t in times)
+
+
+def test_nothing_is_listed_after_a_profile_is_over():
+    with profile() as taken:
+        pass
+    picture(0)
+    assert taken.times() == []
+
+
+def test_two_profiles_at_once_are_refused():
+    with profile(), pytest.raises(RuntimeError, match="already"), profile():
+        pass
+
+
+@pytest.mark.parametrize("wanted", ["means", "quats", "scales", "opacities", "sh"])
+def test_gradients_flow_only_to_tensors_that_want_them(wanted):
+    everything, one = as_leaves(make_splats()), as_leaves(make_splats())
+    for name, tensor in float_tensors(one).items():
+        tensor.requires_grad_(name == wanted)
+    for splats in (everything, one):
+        render(splats, make_camera()).joint.image.sum().backward()
+    for name, gradient in gradients(one).items():
+        if name == wanted:
+            assert torch.equal(gradient, gradients(everything)[name])
+        else:
+            assert gradient is None
+
+
+def test_what_wants_no_gradient_records_none():
+    assert not render(make_splats(), make_camera()).joint.image.requires_grad

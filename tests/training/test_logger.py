@@ -1,0 +1,126 @@
+"""What a run says of itself."""
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from warpgs.training import logger as logbook
+from warpgs.training.logger import Logbook, Status
+
+TERMS = {"static": 0.25, "depth": 0.5}
+
+
+def status(iteration, **changes):
+    values = {"stage": "stage1", "loss": 0.75, "psnr": 21.5, "terms": TERMS, "num_static": 12_345, "num_dynamic": 67}
+    return Status(iteration=iteration, **{**values, **changes})
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Seconds, to be set."""
+    now = [1000.0]
+    monkeypatch.setattr(logbook.time, "monotonic", lambda: now[0])
+    return now
+
+
+def events(folder):
+    accumulator = EventAccumulator(str(folder))
+    accumulator.Reload()
+    return {tag: [(e.step, e.value) for e in accumulator.Scalars(tag)] for tag in accumulator.Tags()["scalars"]}
+
+
+def test_a_look_is_one_line(tmp_path, capsys):
+    with Logbook(tmp_path, 500, 0) as book:
+        book.show(status(50))
+    said = capsys.readouterr().out
+    assert said.count("\n") == 1
+    for part in ("50/500", "stage1", "loss 0.7500", "PSNR 21.50", "static 12,345", "dynamic 67"):
+        assert part in said
+
+
+def test_speed_and_time_left_are_of_the_iterations_since_the_last_look(tmp_path, capsys, clock):
+    with Logbook(tmp_path, 500, 0) as book:
+        clock[0] += 100.0
+        book.show(status(100))
+        clock[0] += 20.0
+        book.show(status(200))
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.endswith("1.0 it/s")  # which compiled kernels, too
+    assert "5.0 it/s  60 s left" in second
+
+
+def test_speed_of_a_resumed_run_counts_its_own_iterations(tmp_path, capsys, clock):
+    with Logbook(tmp_path, 500, 400) as book:
+        clock[0] += 5.0
+        book.show(status(450))
+        clock[0] += 20.0
+        book.show(status(460))
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.endswith("10.0 it/s")
+    assert "0.5 it/s  80 s left" in second
+
+
+def test_lines_are_seconds_apart(tmp_path, capsys, clock):
+    with Logbook(tmp_path, 500, 0) as book:
+        for iteration in range(10, 70, 10):
+            book.show(status(iteration))
+            clock[0] += logbook.LINE_EVERY / 4
+    assert [line.split("/")[0] for line in capsys.readouterr().out.splitlines()] == ["10", "60"]
+
+
+def test_the_last_iteration_has_a_line_however_soon_it_comes(tmp_path, capsys, clock):
+    with Logbook(tmp_path, 500, 0) as book:
+        book.show(status(499))
+        book.show(status(500))
+    assert capsys.readouterr().out.splitlines()[-1].startswith("500/500")
+
+
+def test_two_looks_at_one_moment_have_a_speed(tmp_path, capsys, clock):
+    with Logbook(tmp_path, 500, 0) as book:
+        book.show(status(500))
+    assert "it/s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["[bold]plain[/bold]", "path/[1]/x", "x" * 500])
+def test_what_is_said_is_printed_as_it_is_on_one_line(tmp_path, capsys, text):
+    with Logbook(tmp_path, 500, 0) as book:
+        book.say(text)
+    assert capsys.readouterr().out == f"{text}\n"
+
+
+def test_events_hold_every_look(tmp_path, clock):
+    with Logbook(tmp_path, 500, 0) as book:
+        for iteration in (50, 100):
+            clock[0] += 5.0
+            book.show(status(iteration, psnr=iteration / 10))
+    assert events(tmp_path) == {
+        "loss/total": [(50, 0.75), (100, 0.75)],
+        "loss/static": [(50, 0.25), (100, 0.25)],
+        "loss/depth": [(50, 0.5), (100, 0.5)],
+        "psnr/train": [(50, 5.0), (100, 10.0)],
+        "gaussians/static": [(50, 12_345.0), (100, 12_345.0)],
+        "gaussians/dynamic": [(50, 67.0), (100, 67.0)],
+        "speed/iterations per second": [(50, 10.0), (100, 10.0)],
+    }
+
+
+def test_events_are_written_when_training_fails(tmp_path):
+    def fail():
+        with Logbook(tmp_path, 500, 0) as book:
+            book.show(status(50))
+            raise ValueError("wrong")
+
+    with pytest.raises(ValueError, match="wrong"):
+        fail()
+    assert events(tmp_path)["loss/total"] == [(50, 0.75)]
+
+
+def test_in_a_terminal_there_is_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "200")
+    with Logbook(tmp_path, 500, 100) as book:
+        book.show(status(150))
+        book.say("a word above the bar")
+    said = capsys.readouterr().out
+    assert "150/500" in said
+    assert "a word above the bar" in said
+    assert "s left" not in said

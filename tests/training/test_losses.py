@@ -1,0 +1,422 @@
+"""The terms of the training loss (paper Eq. 9, 12, 14 and 15)."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.reference.ssim import ssim_map
+from tests.scenes import error, generator, make_camera, make_splats, relative_error
+from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
+from warpgs.data.capture import Capture, Frame
+from warpgs.model.gaussians import Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.ops.depth_error import depth_error
+from warpgs.render import render
+from warpgs.training.losses import dynamic_loss, image_loss, static_loss
+from warpgs.training.schedule import Protocol
+from warpgs.training.step import TERMS, Draw, Step
+from warpgs.training.views import Views
+
+HEIGHT, WIDTH = 21, 18
+BLACK = torch.zeros(3)
+PURPLE = torch.tensor([0.7, 0.1, 0.9])
+WEIGHTS = [0.0, 0.2, 1.0]
+
+
+def random_image(seed):
+    return torch.rand(HEIGHT, WIDTH, 3, generator=generator(seed))
+
+
+def static_mask():
+    """True where static: all but a block."""
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[5:13, 4:11] = False
+    return mask
+
+
+IMAGE, TRUTH, MASK = random_image(1), random_image(2), static_mask()
+
+
+def compared(image, truth, weight):
+    """L1 + λ (1 − SSIM) in double precision."""
+    image, truth = image.double(), truth.double()
+    return (image - truth).abs().mean() + weight * (1.0 - ssim_map(image, truth).mean())
+
+
+def where(mask):
+    return mask[..., None].double()
+
+
+def changed_at(image, mask):
+    return torch.where(mask[..., None], 1.0 - image, image)
+
+
+def gradient(loss, image, *arguments):
+    leaf = image.clone().requires_grad_()
+    loss(leaf, *arguments).backward()
+    return leaf.grad
+
+
+# Images --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_images_are_compared_by_l1_and_similarity(weight):
+    assert error(image_loss(IMAGE, TRUTH, weight), compared(IMAGE, TRUTH, weight)) < 1e-6
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_gradients_of_compared_images_are_those_of_the_reference(weight):
+    image = IMAGE.double().requires_grad_()
+    compared(image, TRUTH, weight).backward()
+    assert relative_error(gradient(image_loss, IMAGE, TRUTH, weight), image.grad) < 1e-5
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_equal_images_have_no_loss(weight):
+    assert abs(image_loss(TRUTH.clone(), TRUTH, weight).item()) < 1e-6
+
+
+# Eq. 9 ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_static_loss_masks_both_images(weight):
+    expected = compared(IMAGE * where(MASK), TRUTH * where(MASK), weight)
+    assert error(static_loss(IMAGE, TRUTH, MASK, weight), expected) < 1e-6
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_gradients_of_the_static_loss_are_those_of_equation_9(weight):
+    image = IMAGE.double().requires_grad_()
+    compared(image * where(MASK), TRUTH * where(MASK), weight).backward()
+    assert relative_error(gradient(static_loss, IMAGE, TRUTH, MASK, weight), image.grad) < 1e-5
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_static_image_is_free_where_something_moves(weight):
+    changed = static_loss(changed_at(IMAGE, ~MASK), changed_at(TRUTH, ~MASK), MASK, weight)
+    assert error(changed, static_loss(IMAGE, TRUTH, MASK, weight)) < 1e-6
+    assert not gradient(static_loss, IMAGE, TRUTH, MASK, weight)[~MASK].any()
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_static_image_is_bound_wherever_the_mask_says_static(weight):
+    assert gradient(static_loss, IMAGE, TRUTH, MASK, weight)[MASK].any(1).all()
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_where_all_is_static_the_static_loss_is_that_of_the_whole_image(weight):
+    everywhere = torch.ones_like(MASK)
+    assert error(static_loss(IMAGE, TRUTH, everywhere, weight), image_loss(IMAGE, TRUTH, weight)) < 1e-6
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_where_nothing_is_static_there_is_no_static_loss(weight):
+    nowhere = torch.zeros_like(MASK)
+    assert static_loss(IMAGE, TRUTH, nowhere, weight).abs() < 1e-6
+    assert not gradient(static_loss, IMAGE, TRUTH, nowhere, weight).any()
+
+
+# Eq. 12 --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_dynamic_loss_masks_the_truth_alone(weight):
+    expected = compared(IMAGE, TRUTH * where(~MASK), weight)
+    assert error(dynamic_loss(IMAGE, TRUTH, MASK, weight, BLACK), expected) < 1e-6
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_gradients_of_the_dynamic_loss_are_those_of_equation_12(weight):
+    image = IMAGE.double().requires_grad_()
+    compared(image, TRUTH * where(~MASK), weight).backward()
+    assert relative_error(gradient(dynamic_loss, IMAGE, TRUTH, MASK, weight, BLACK), image.grad) < 1e-5
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_truth_where_all_is_still_does_not_matter_to_the_dynamic_image(weight):
+    changed = dynamic_loss(IMAGE, changed_at(TRUTH, MASK), MASK, weight, BLACK)
+    assert error(changed, dynamic_loss(IMAGE, TRUTH, MASK, weight, BLACK)) < 1e-6
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+def test_the_dynamic_image_is_bound_everywhere(weight):
+    assert gradient(dynamic_loss, IMAGE, TRUTH, MASK, weight, BLACK).any(2).all()
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("background", [BLACK, PURPLE])
+def test_a_dynamic_image_of_what_moves_over_its_background_has_no_loss(weight, background):
+    perfect = background.repeat(HEIGHT, WIDTH, 1)
+    perfect[5:13, 4:11] = TRUTH[5:13, 4:11]
+    assert dynamic_loss(perfect, TRUTH, MASK, weight, background).abs() < 1e-6
+
+
+def test_a_dynamic_image_without_its_background_has_a_loss():
+    perfect = torch.zeros(HEIGHT, WIDTH, 3)
+    perfect[5:13, 4:11] = TRUTH[5:13, 4:11]
+    still = 1.0 - 8 * 7 / (HEIGHT * WIDTH)
+    expected = still * PURPLE.double().mean()
+    assert error(dynamic_loss(perfect, TRUTH, MASK, 0.0, PURPLE), expected) < 1e-6
+
+
+# Eq. 14 --------------------------------------------------------------------------------------------------------------
+
+DEPTH = 1.0 + IMAGE[..., 0]
+TARGET = 1.0 + TRUTH[..., 0]
+OPAQUE = torch.full((HEIGHT, WIDTH), 0.9)
+ALIGNMENT = torch.tensor([0.5, 0.1])
+
+
+def compared_depth(depth, alpha, target, region):
+    """The depth loss against a target, as inverse depth that has yet to be aligned."""
+    scale, offset = ALIGNMENT.double()
+    inverse_depth = ((1.0 / target.double() - offset) / scale).float()
+    return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region)
+
+
+def test_the_depth_loss_is_that_of_equation_14():
+    expected = ((DEPTH.double() - TARGET.double()) * MASK).abs().sum() / (HEIGHT * WIDTH)
+    assert error(compared_depth(DEPTH, OPAQUE, TARGET, MASK), expected) < 1e-6
+
+
+def test_depth_is_free_outside_the_region():
+    assert not gradient(compared_depth, DEPTH, OPAQUE, TARGET, MASK)[~MASK].any()
+
+
+def test_depth_is_pulled_to_its_target_with_equal_force():
+    expected = (DEPTH.double() - TARGET.double()).sign() / (HEIGHT * WIDTH)
+    assert error(gradient(compared_depth, DEPTH, OPAQUE, TARGET, torch.ones_like(MASK)), expected) < 1e-9
+
+
+@pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
+def test_pixels_of_unknown_depth_are_left_out(unknown):
+    target, known = TARGET.clone(), MASK.clone()
+    target[0] = unknown
+    known[0] = False
+    expected = compared_depth(DEPTH, OPAQUE, TARGET, known)
+    assert error(compared_depth(DEPTH, OPAQUE, target, MASK), expected) < 1e-7
+    pull = gradient(compared_depth, DEPTH, OPAQUE, target, MASK)
+    assert pull.isfinite().all()
+    assert not pull[0].any()
+
+
+def test_pixels_where_little_was_drawn_are_left_out():
+    alpha, drawn = OPAQUE.clone(), MASK.clone()
+    alpha[1] = 0.4
+    drawn[1] = False
+    assert error(compared_depth(DEPTH, alpha, TARGET, MASK), compared_depth(DEPTH, OPAQUE, TARGET, drawn)) < 1e-7
+
+
+def test_without_any_known_depth_there_is_no_loss():
+    target = torch.full_like(TARGET, torch.nan)
+    assert compared_depth(DEPTH, OPAQUE, target, MASK) == 0
+    assert not gradient(compared_depth, DEPTH, OPAQUE, target, MASK).any()
+
+
+# Eq. 15: the terms of an iteration -----------------------------------------------------------------------------------
+
+SPLATS = make_splats()
+CAMERA = make_camera()
+VIEW_MASK = torch.arange(CAMERA.width).expand(CAMERA.height, -1) < 30
+VIEW_IMAGE = torch.randint(0, 256, (CAMERA.height, CAMERA.width, 3), generator=generator(), dtype=torch.uint8)
+INVERSE_DEPTH = torch.rand(CAMERA.height, CAMERA.width, generator=generator()).half().float()
+ALIGNMENTS = torch.tensor([[0.5, 0.1]])
+LOSS = LossConfig(
+    ssim=0.3,
+    static=0.5,
+    dynamic=0.7,
+    joint=1.1,
+    depth=2.0,
+    depth_dynamic=0.4,
+    depth_end=2.0,  # no decay
+)
+NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
+SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, relight_from=100)
+STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
+"""The first iteration of each."""
+
+
+def make_gaussians(chosen):
+    s = SPLATS
+    values = (s.means, s.quats, s.scales.log(), s.opacities.logit(), s.sh[:, :1], s.sh[:, 1:])
+    return Gaussians(*(value[chosen].contiguous() for value in values))
+
+
+def prepared(stage, loss=LOSS, at=0, **options):
+    """A scene, an iteration of a stage (the first one or the one after ``at`` others) and what trains it then."""
+    frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
+    capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
+    config = TrainConfig(model=NETWORK, loss=loss, schedule=SCHEDULE, **options)
+    static, dynamic = make_gaussians(~SPLATS.is_dynamic), make_gaussians(SPLATS.is_dynamic)
+    scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
+    moment = Protocol(config, has_depth=True).at(STAGES[stage] + at)
+    assert moment.stage.name == stage
+    views = Views(capture, torch.device("cpu"), 1 << 30)
+    return scene, moment, Step(config, scene, views, ALIGNMENTS, capture.extent)
+
+
+def terms_of(stage, loss=LOSS):
+    """What the first iteration of a stage says of its loss, and the rendering that it compares."""
+    scene, moment, step = prepared(stage, loss)
+    with torch.no_grad():
+        splats = scene.splats(torch.zeros(1), moment.moving, moment.relit, moment.sh_degree)
+        rendering = render(splats, CAMERA, settings=RenderSettings(branches=True, depth=True))
+    step(moment, Draw(0, 0.0, PURPLE))
+    return dict(zip(TERMS, step.sums[:5], strict=True)), rendering
+
+
+def changed_by(stage, loss=LOSS, at=0, **options):
+    """Names of the parameters that an iteration of a stage changes; layers of networks count as the network."""
+    scene, moment, step = prepared(stage, loss, at, **options)
+    before = {name: p.detach().clone() for name, p in scene.named_parameters()}
+    step(moment, Draw(0, 0.0, PURPLE))
+    changed = [name for name, p in scene.named_parameters() if not torch.equal(p, before[name])]
+    return {name.split(".")[0] if name.startswith(("deformation", "appearance")) else name for name in changed}
+
+
+def of_static(names):
+    return {name.removeprefix("static.") for name in names if name.startswith("static.")}
+
+
+def of_dynamic(names):
+    return {name.removeprefix("dynamic.") for name in names if name.startswith("dynamic.")}
+
+
+def view_truth():
+    return VIEW_IMAGE.double() / 255.0
+
+
+def view_depth():
+    return 1.0 / (0.5 * INVERSE_DEPTH.double() + 0.1)
+
+
+def expected_depth(layer, region):
+    known = region & (layer.alpha > 0.5)
+    assert known.any()
+    return ((layer.depth.double() - view_depth()) * known).abs().mean()
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_static_term_is_the_weighted_static_loss_in_every_stage(stage):
+    terms, rendering = terms_of(stage)
+    truth = view_truth()
+    expected = 0.5 * compared(rendering.static.image * where(VIEW_MASK), truth * where(VIEW_MASK), 0.3)
+    assert error(terms["static"], expected) < 1e-6
+
+
+@pytest.mark.parametrize("stage", ["stage1", "stage2"])
+def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_background_drawn(stage):
+    terms, rendering = terms_of(stage)
+    dynamic = rendering.dynamic
+    image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
+    truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
+    assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
+
+
+def test_the_joint_term_compares_the_joint_image_with_the_whole_truth():
+    terms, rendering = terms_of("stage2")
+    assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("stage", "used"),
+    [
+        ("pretrain", {"static", "depth"}),
+        ("stage1", {"static", "dynamic", "depth", "depth_dynamic"}),
+        ("stage2", {"static", "dynamic", "joint", "depth", "depth_dynamic"}),
+    ],
+)
+def test_each_stage_has_its_terms(stage, used):
+    terms, _ = terms_of(stage)
+    assert {name for name, value in terms.items() if value != 0} == used
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_depth_term_is_that_of_the_static_branch_in_the_static_region(stage):
+    terms, rendering = terms_of(stage)
+    expected = 2.0 * expected_depth(rendering.static, VIEW_MASK)
+    assert error(terms["depth"], expected) < 1e-5
+
+
+def test_the_dynamic_branch_has_its_share_of_the_depth_loss_in_the_dynamic_region():
+    terms, rendering = terms_of("stage1")
+    expected = 0.4 * 2.0 * expected_depth(rendering.dynamic, ~VIEW_MASK)
+    assert error(terms["depth_dynamic"], expected) < 1e-5
+
+
+@pytest.mark.parametrize("stage", ["stage1", "stage2"])
+def test_the_weight_of_depth_decays_exponentially(stage):
+    constant, _ = terms_of(stage)
+    decaying, _ = terms_of(stage, dataclasses.replace(LOSS, depth_end=0.02))
+    assert error(decaying["depth"] / constant["depth"], torch.tensor(0.01 ** (STAGES[stage] / 72_000))) < 1e-5
+
+
+def test_without_a_weight_depth_does_not_count():
+    terms, _ = terms_of("stage1", dataclasses.replace(LOSS, depth=0.0))
+    assert terms["depth"] == 0
+    assert terms["depth_dynamic"] == 0
+
+
+# What gradients reach ------------------------------------------------------------------------------------------------
+
+GEOMETRY = {"means", "quats", "log_scales"}
+EARLY_APPEARANCE = {"logit_opacities", "sh_dc"}
+"""Harmonics of higher degrees come later."""
+NOTHING = LossConfig(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
+
+
+def test_in_pretraining_static_gaussians_alone_are_trained():
+    changed = changed_by("pretrain")
+    assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
+    assert len(changed) == len(of_static(changed))
+
+
+def test_in_stage_1_the_static_image_trains_static_gaussians_alone():
+    changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0))
+    assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
+    assert len(changed) == len(of_static(changed))
+
+
+def test_in_stage_1_the_dynamic_image_trains_dynamic_gaussians_alone():
+    changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0))
+    assert of_dynamic(changed) == GEOMETRY | EARLY_APPEARANCE
+    assert len(changed) == len(of_dynamic(changed))
+
+
+def test_in_stage_1_the_static_image_trains_the_appearance_network_once_it_is_in_use():
+    changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0), at=150)
+    assert of_static(changed) >= GEOMETRY | EARLY_APPEARANCE
+    assert changed == {f"static.{name}" for name in of_static(changed)} | {"appearance"}
+
+
+def test_in_stage_1_the_dynamic_image_trains_the_deformation_network_once_it_is_in_use():
+    changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0), at=150)
+    assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
+    assert changed == {f"dynamic.{name}" for name in of_dynamic(changed)} | {"deformation"}
+
+
+def test_in_stage_2_the_joint_image_trains_dynamic_gaussians_and_both_networks():
+    changed = changed_by("stage2", dataclasses.replace(NOTHING, joint=1.0))
+    assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
+    assert {"deformation", "appearance"} <= changed
+
+
+def test_in_stage_2_static_gaussians_are_frozen():
+    assert of_static(changed_by("stage2")) == set()
+
+
+def test_the_config_lets_stage_2_train_the_geometry_of_static_gaussians():
+    assert of_static(changed_by("stage2", static_geometry=True)) == GEOMETRY
+
+
+def test_the_config_lets_stage_2_train_the_appearance_of_static_gaussians():
+    assert of_static(changed_by("stage2", static_appearance=True)) == EARLY_APPEARANCE | {"sh_rest"}
+
+
+def test_without_the_appearance_network_stage_2_trains_the_appearance_of_static_gaussians():
+    changed = changed_by("stage2", app=False)
+    assert of_static(changed) == EARLY_APPEARANCE | {"sh_rest"}
+    assert "appearance" not in changed

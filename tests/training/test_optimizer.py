@@ -1,0 +1,294 @@
+"""The one Adam, its learning rates, and how its moments follow the Gaussians."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from tests.scenes import error, generator
+from warpgs.config import ModelConfig, OptimConfig
+from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.training.optimizer import GROUPS, exponential, forget, gather, learning_rates, make_optimizer
+
+NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=2, width=3)
+NETWORKS = ("deformation", "appearance")
+START = dict.fromkeys(NETWORKS, 0.0)
+END = dict.fromkeys(NETWORKS, 1.0)
+RATES = OptimConfig(
+    means=0.1,
+    quats=0.2,
+    scales=0.3,
+    opacities=0.4,
+    sh_dc=0.5,
+    sh_rest=0.6,
+    networks=0.7,
+    networks_end=0.07,
+)
+
+
+def make_gaussians(num, seed):
+    g = generator(seed)
+    shapes = [(num, 3), (num, 4), (num, 3), (num,), (num, 1, 3), (num, 15, 3)]
+    return Gaussians(*(torch.randn(shape, generator=g) for shape in shapes))
+
+
+def make_scene(num_static=5, num_dynamic=4):
+    torch.manual_seed(0)
+    static, dynamic = make_gaussians(num_static, 1), make_gaussians(num_dynamic, 2)
+    return SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
+
+
+def random_gradients(scene, seed):
+    g = generator(seed)
+    return {name: torch.randn(p.shape, generator=g) for name, p in scene.named_parameters()}
+
+
+def step(scene, optimizer, gradients):
+    for name, parameter in scene.named_parameters():
+        parameter.grad = gradients[name].clone()
+    optimizer.step()
+    optimizer.zero_grad()
+
+
+def trained(num_steps=3, rate=0.01, **sizes):
+    scene = make_scene(**sizes)
+    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), rate))
+    for seed in range(num_steps):
+        step(scene, optimizer, random_gradients(scene, seed))
+    return scene, optimizer
+
+
+WARM = dict.fromkeys(NETWORKS, 1.0)
+
+
+def rates_at(progress, network_progress, extent=1.0, config=RATES, warmth=WARM):
+    return dict(zip(GROUPS, learning_rates(config, extent, progress, network_progress, warmth), strict=True))
+
+
+# The optimizer -------------------------------------------------------------------------------------------------------
+
+
+def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
+    scene = make_scene()
+    optimizer = make_optimizer(scene, torch.zeros(len(GROUPS)))
+    group_from_parameter = {id(p): group["name"] for group in optimizer.param_groups for p in group["params"]}
+    for name, parameter in scene.named_parameters():
+        network_or_parameter = name.split(".")[0] if name.startswith(NETWORKS) else name
+        assert group_from_parameter[id(parameter)] == network_or_parameter
+    assert sum(len(group["params"]) for group in optimizer.param_groups) == len(list(scene.parameters()))
+
+
+def test_steps_are_those_of_adam():
+    scene = make_scene()
+    start = {name: p.detach().double() for name, p in scene.named_parameters()}
+    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    first = {name: torch.zeros_like(value) for name, value in start.items()}
+    second = {name: torch.zeros_like(value) for name, value in start.items()}
+    for iteration in range(1, 5):
+        gradients = random_gradients(scene, iteration)
+        step(scene, optimizer, gradients)
+        for name, gradient in gradients.items():
+            first[name] = 0.9 * first[name] + 0.1 * gradient.double()
+            second[name] = 0.999 * second[name] + 0.001 * gradient.double() ** 2
+            unbiased = first[name] / (1 - 0.9**iteration), second[name] / (1 - 0.999**iteration)
+            start[name] -= 0.01 * unbiased[0] / (unbiased[1].sqrt() + 1e-15)
+    for name, parameter in scene.named_parameters():
+        assert error(parameter.detach(), start[name]) < 1e-6
+
+
+def test_a_tiny_gradient_counts_as_much_as_a_large_one():
+    scene = make_scene()
+    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    before = scene.static.means.detach().clone()
+    tiny = {name: torch.full_like(p, 1e-10) for name, p in scene.named_parameters()}
+    step(scene, optimizer, tiny)
+    assert error(before - scene.static.means.detach(), torch.full_like(before, 0.01)) < 1e-6
+
+
+@pytest.mark.parametrize("group", range(len(GROUPS)))
+def test_each_group_moves_at_its_own_rate(group):
+    scene = make_scene()
+    rates = torch.zeros(len(GROUPS))
+    optimizer = make_optimizer(scene, rates)
+    before = {name: p.detach().clone() for name, p in scene.named_parameters()}
+    rates[group] = 0.125  # after the optimizer was made: it reads its rates anew
+    step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
+    for name, parameter in scene.named_parameters():
+        rate = 0.125 if name == GROUPS[group] or name.startswith(GROUPS[group] + ".") else 0.0
+        assert error(before[name] - parameter.detach(), torch.full_like(parameter, rate)) < 1e-5
+
+
+def test_parameters_without_gradient_stay():
+    scene, optimizer = trained()
+    before = scene.static.means.detach().clone()
+    scene.dynamic.means.grad = torch.ones(4, 3)
+    optimizer.step()
+    assert torch.equal(scene.static.means, before)
+
+
+# Resizing ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("branch", ["static", "dynamic"])
+def test_kept_gaussians_keep_their_moments_and_new_ones_begin_at_zero(branch):
+    scene, optimizer = trained()
+    gaussians = getattr(scene, branch)
+    before = {name: dict(optimizer.state[getattr(gaussians, name)]) for name in PARAMETERS}
+    gather(optimizer, gaussians, torch.tensor([3, 0, 1, 1, 3]), num_kept=3)
+    for name in PARAMETERS:
+        after = optimizer.state[getattr(gaussians, name)]
+        for moment in ("exp_avg", "exp_avg_sq"):
+            assert after[moment].shape == getattr(gaussians, name).shape
+            assert torch.equal(after[moment][:3], before[name][moment][[3, 0, 1]])
+            assert before[name][moment][[1, 3]].all()
+            assert not after[moment][3:].any()
+
+
+def test_values_follow_their_parents_whether_kept_or_new():
+    scene, optimizer = trained()
+    before = {name: getattr(scene.static, name).detach().clone() for name in PARAMETERS}
+    parents = torch.tensor([4, 2, 2, 0])
+    gather(optimizer, scene.static, parents, num_kept=2)
+    for name in PARAMETERS:
+        assert torch.equal(getattr(scene.static, name), before[name][parents])
+
+
+def test_the_next_steps_of_kept_gaussians_are_those_without_resizing():
+    (resized, its_optimizer), (untouched, optimizer) = trained(), trained()
+    kept = torch.tensor([4, 1, 2])
+    gather(its_optimizer, resized.static, torch.cat([kept, kept[:1]]), num_kept=3)
+    for seed in (10, 11):
+        gradients = random_gradients(untouched, seed)
+        shared = {
+            name: torch.cat([g[kept], torch.zeros_like(g[:1])]) if name.startswith("static.") else g
+            for name, g in gradients.items()
+        }
+        step(untouched, optimizer, gradients)
+        step(resized, its_optimizer, shared)
+    for name in PARAMETERS:
+        expected = getattr(untouched.static, name)[kept]
+        assert error(getattr(resized.static, name)[:3], expected) < 1e-6
+
+
+def test_resizing_one_branch_leaves_everything_else():
+    scene, optimizer = trained()
+    others = {name: p for name, p in scene.named_parameters() if not name.startswith("static.")}
+    before = {name: {k: v.clone() for k, v in optimizer.state[p].items()} for name, p in others.items()}
+    values = {name: p.detach().clone() for name, p in others.items()}
+    gather(optimizer, scene.static, torch.tensor([0]), num_kept=1)
+    for name, parameter in others.items():
+        assert torch.equal(parameter, values[name])
+        assert all(torch.equal(optimizer.state[parameter][key], value) for key, value in before[name].items())
+
+
+def test_resizing_before_the_first_step_needs_no_moments():
+    scene = make_scene()
+    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    gather(optimizer, scene.static, torch.tensor([1, 1, 1]), num_kept=1)
+    before = scene.static.means.detach().clone()
+    step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
+    assert error(before - scene.static.means.detach(), torch.full((3, 3), 0.01)) < 1e-5
+
+
+def test_all_gaussians_may_go_and_training_goes_on():
+    scene, optimizer = trained()
+    gather(optimizer, scene.dynamic, torch.zeros(0, dtype=torch.int64), num_kept=0)
+    step(scene, optimizer, random_gradients(scene, 9))
+    assert len(scene.dynamic) == 0
+    assert optimizer.state[scene.dynamic.sh_rest]["exp_avg"].shape == (0, 15, 3)
+
+
+def test_resizing_drops_gradients():
+    scene, optimizer = trained()
+    scene.static.means.grad = torch.ones(5, 3)
+    gather(optimizer, scene.static, torch.arange(5), num_kept=5)
+    assert scene.static.means.grad is None
+
+
+def test_forgetting_sets_the_moments_of_one_parameter_to_zero():
+    scene, optimizer = trained()
+    forget(optimizer, scene.static.logit_opacities)
+    for name, parameter in scene.named_parameters():
+        state = optimizer.state[parameter]
+        for moment in ("exp_avg", "exp_avg_sq"):
+            assert state[moment].any() == (name != "static.logit_opacities")
+
+
+def test_forgetting_what_was_never_trained_changes_nothing():
+    scene = make_scene()
+    optimizer = make_optimizer(scene, torch.zeros(len(GROUPS)))
+    forget(optimizer, scene.static.means)
+    assert not optimizer.state.get(scene.static.means, {})
+
+
+# Learning rates ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("start", "end"), [(8e-4, 1.6e-6), (1e-3, 1e-3), (1e-6, 1.0)])
+def test_an_exponential_schedule_runs_from_start_to_end(start, end):
+    assert exponential(start, end, 0.0) == pytest.approx(start, rel=1e-12)
+    assert exponential(start, end, 1.0) == pytest.approx(end, rel=1e-12)
+
+
+def test_halfway_an_exponential_schedule_is_at_the_geometric_mean():
+    assert exponential(8e-4, 1.6e-6, 0.5) == pytest.approx(math.sqrt(8e-4 * 1.6e-6), rel=1e-12)
+
+
+def test_equal_steps_of_an_exponential_schedule_have_equal_ratios():
+    values = [exponential(3.0, 0.2, k / 10) for k in range(11)]
+    ratios = [b / a for a, b in itertools.pairwise(values)]
+    assert ratios == pytest.approx([(0.2 / 3.0) ** 0.1] * 10, rel=1e-12)
+
+
+@pytest.mark.parametrize(("progress", "expected"), [(-0.5, 2.0), (1.5, 0.01)])
+def test_an_exponential_schedule_is_constant_outside_its_range(progress, expected):
+    assert exponential(2.0, 0.01, progress) == pytest.approx(expected, rel=1e-12)
+
+
+def test_each_rate_of_the_config_reaches_its_group():
+    rates = rates_at(0.0, START)
+    for branch in ("static", "dynamic"):
+        parameters = [rates[f"{branch}.{name}"] for name in PARAMETERS]
+        assert parameters == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    assert [rates[name] for name in NETWORKS] == pytest.approx([0.7, 0.7])
+
+
+@pytest.mark.parametrize(("progress", "share"), [(0.0, 1.0), (0.5, 0.1), (1.0, 0.01)])
+def test_positions_slow_down_to_a_hundredth_in_units_of_the_extent(progress, share):
+    rates = rates_at(progress, START, extent=3.0)
+    for branch in ("static", "dynamic"):
+        assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * share)
+
+
+def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_extent():
+    now, later = rates_at(0.0, START), rates_at(0.9, END, extent=5.0)
+    changed = {name for name in GROUPS if now[name] != later[name]}
+    assert changed == {"static.means", "dynamic.means", *NETWORKS}
+
+
+def test_each_network_has_its_own_progress():
+    rates = rates_at(0.3, {"deformation": 0.5, "appearance": 1.0})
+    assert rates["deformation"] == pytest.approx(math.sqrt(0.7 * 0.07))
+    assert rates["appearance"] == pytest.approx(0.07)
+
+
+def test_the_default_rates_of_networks_are_the_papers():
+    now, later = rates_at(0.0, START, config=OptimConfig()), rates_at(1.0, END, config=OptimConfig())
+    for name in NETWORKS:
+        assert now[name] == pytest.approx(8e-4)
+        assert later[name] == pytest.approx(1.6e-6)
+
+
+def test_a_rate_of_zero_stays_zero():
+    rates = torch.tensor([exponential(0.0, 0.0, progress) for progress in (0.0, 0.5, 1.0)])
+    assert not rates.any()
+
+
+def test_a_network_that_is_not_warm_yet_has_a_share_of_its_rate():
+    progress = dict.fromkeys(NETWORKS, 0.3)
+    warm = rates_at(0.3, progress)
+    for name in NETWORKS:
+        cold = rates_at(0.3, progress, warmth={**WARM, name: 0.25})
+        assert cold == {**warm, name: pytest.approx(0.25 * warm[name])}

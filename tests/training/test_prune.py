@@ -1,0 +1,176 @@
+"""Visibility-driven pruning of static Gaussians (paper Eq. 15)."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests.reference.render import as_dict
+from tests.reference.render import render as reference
+from tests.scenes import error, make_camera, make_splats
+from warpgs.config import ModelConfig
+from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.training.optimizer import GROUPS, make_optimizer
+from warpgs.training.prune import prune_invisible, visibility
+
+NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
+AHEAD = make_camera()
+SURE = 20.0
+"""Logit of an opacity that is 1 in single precision."""
+
+
+def turned_around(camera):
+    """The same camera looking the other way."""
+    return dataclasses.replace(camera, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat)
+
+
+def shifted(camera, x, time):
+    viewmat = camera.viewmat.clone()
+    viewmat[0, 3] += x
+    return dataclasses.replace(camera, viewmat=viewmat, time=time)
+
+
+CAMERAS = [AHEAD, shifted(AHEAD, 2.5, 0.4), shifted(AHEAD, -3.0, 0.7), turned_around(AHEAD)]
+
+
+def in_front(depths, sizes, opacities):
+    """Round Gaussians on the optical axis of ``AHEAD`` at some depths."""
+    depths = torch.tensor(depths)
+    viewed = torch.linalg.inv(AHEAD.K) @ torch.tensor([AHEAD.width / 2, AHEAD.height / 2, 1.0])
+    points = (depths[:, None] * viewed - AHEAD.viewmat[:3, 3]) @ AHEAD.viewmat[:3, :3]
+    gaussians = Gaussians.from_points(points, torch.rand(len(points), 3), torch.tensor(sizes), 0.5)
+    gaussians.logit_opacities.data = torch.tensor(opacities).logit().clamp(max=SURE)
+    return gaussians
+
+
+def random_gaussians():
+    """Scattered, some seen by no camera and some of them opaque."""
+    splats = make_splats()
+    logits = splats.opacities.logit()
+    logits[::7] = SURE
+    return Gaussians(splats.means, splats.quats, splats.scales.log(), logits, splats.sh[:, :1], splats.sh[:, 1:])
+
+
+def make_scene(static, dynamic=None):
+    return SplitScene(static, dynamic or Gaussians.empty(0), NETWORK, torch.zeros(3), torch.ones(3))
+
+
+def make_scene_and_optimizer(static, dynamic=None):
+    scene = make_scene(static, dynamic)
+    return scene, make_optimizer(scene, torch.zeros(len(GROUPS)))
+
+
+def expected_visibility(gaussians, cameras):
+    splats = as_dict(make_scene(gaussians).static_splats())
+    alpha = splats["opacities"].detach()
+    total = torch.zeros(len(gaussians), dtype=torch.float64)
+    for camera in cameras:
+        with torch.no_grad():
+            _, _, weights = reference(splats, camera, torch.zeros(3, dtype=torch.float64))
+        rendered = (weights > 0).any(2).any(1)
+        total += torch.where(rendered, 1.0 - torch.where(alpha > 0.99, 0.99, alpha), 0.0)
+    return total / len(cameras)
+
+
+def test_visibility_is_that_of_equation_15_over_all_views():
+    static = random_gaussians()
+    expected = expected_visibility(static, CAMERAS)
+    scores = visibility(make_scene(static), CAMERAS, 3)
+    assert error(scores, expected) < 1e-6
+    assert len(expected.unique()) > 20
+    assert (expected == 0).any()
+
+
+def test_an_opaque_gaussian_that_every_view_sees_keeps_a_hundredth():
+    scores = visibility(make_scene(in_front([2.0], [0.2], [1.0])), [AHEAD] * 3, 3)
+    assert error(scores, torch.tensor([0.01])) < 1e-7
+
+
+def test_a_gaussian_that_no_view_sees_scores_nothing():
+    scores = visibility(make_scene(in_front([-2.0, 2.0], [0.2, 0.2], [0.5, 0.5])), [AHEAD] * 2, 3)
+    assert scores[0] == 0
+    assert scores[1] > 0
+
+
+def test_a_gaussian_behind_a_wall_scores_nothing():
+    hidden = in_front([2.0, 2.1, 5.0], [9.0, 9.0, 0.1], [1.0, 1.0, 0.5])
+    free = in_front([5.0], [0.1], [0.5])
+    assert visibility(make_scene(hidden), [AHEAD], 3)[2] == 0
+    assert visibility(make_scene(free), [AHEAD], 3)[0] == 0.5
+
+
+def test_dynamic_gaussians_hide_no_static_ones():
+    walls = in_front([2.0, 2.1], [9.0, 9.0], [1.0, 1.0])
+    assert visibility(make_scene(in_front([5.0], [0.1], [0.5]), walls), [AHEAD], 3)[0] == 0.5
+
+
+@pytest.mark.parametrize("unseen", [0, 1, 3])
+def test_views_that_do_not_see_a_gaussian_count_in_the_mean(unseen):
+    cameras = [AHEAD] + [turned_around(AHEAD)] * unseen
+    scores = visibility(make_scene(in_front([2.0], [0.2], [0.25])), cameras, 3)
+    assert error(scores, torch.tensor([0.75 / (1 + unseen)])) < 1e-6
+
+
+def test_cameras_may_come_one_by_one():
+    scene = make_scene(random_gaussians())
+    assert torch.equal(visibility(scene, iter(CAMERAS), 3), visibility(scene, CAMERAS, 3))
+
+
+def test_visibility_does_not_depend_on_the_order_of_the_views():
+    scene = make_scene(random_gaussians())
+    assert error(visibility(scene, CAMERAS[::-1], 3), visibility(scene, CAMERAS, 3)) < 1e-7
+
+
+def test_visibility_asks_for_no_gradients():
+    assert not visibility(make_scene(random_gaussians()), [AHEAD], 3).requires_grad
+
+
+def test_pruning_keeps_those_that_reach_the_threshold_in_their_order():
+    static = random_gaussians()
+    scores = expected_visibility(static, CAMERAS)
+    middle = 0.5 * scores.sort().values[29:31].sum().item()  # between two scores: half of the sixty are below
+    kept = scores > middle
+    before = {name: getattr(static, name).detach().clone() for name in PARAMETERS}
+    scene, optimizer = make_scene_and_optimizer(static)
+    assert prune_invisible(scene, optimizer, CAMERAS, 3, middle) == int((~kept).sum())
+    for name in PARAMETERS:
+        assert torch.equal(getattr(scene.static, name), before[name][kept])
+
+
+def test_a_score_at_the_threshold_is_enough():
+    scene, optimizer = make_scene_and_optimizer(in_front([2.0], [0.2], [0.5]))
+    assert prune_invisible(scene, optimizer, [AHEAD], 3, threshold=0.5) == 0
+    assert len(scene.static) == 1
+
+
+def test_a_threshold_of_zero_removes_nothing():
+    scene, optimizer = make_scene_and_optimizer(random_gaussians())
+    assert prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=0.0) == 0
+    assert len(scene.static) == 60
+
+
+def test_dynamic_gaussians_are_never_pruned():
+    scene, optimizer = make_scene_and_optimizer(random_gaussians(), random_gaussians())
+    before = scene.dynamic.means.detach().clone()
+    assert prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=2.0) == 60
+    assert len(scene.static) == 0
+    assert torch.equal(scene.dynamic.means, before)
+
+
+def test_the_moments_of_kept_gaussians_go_with_them():
+    scene, optimizer = make_scene_and_optimizer(in_front([2.0, -2.0, 3.0], [0.1] * 3, [0.5] * 3))
+    for parameter in scene.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    scene.static.logit_opacities.grad = torch.tensor([1.0, 2.0, 3.0])
+    optimizer.step()
+    before = optimizer.state[scene.static.logit_opacities]["exp_avg"].clone()
+    assert prune_invisible(scene, optimizer, [AHEAD], 3, threshold=1e-3) == 1
+    assert before.unique().numel() == 3
+    assert torch.equal(optimizer.state[scene.static.logit_opacities]["exp_avg"], before[[0, 2]])
+
+
+def test_a_scene_without_static_gaussians_has_nothing_to_prune():
+    scene, optimizer = make_scene_and_optimizer(Gaussians.empty(0), random_gaussians())
+    assert visibility(scene, CAMERAS, 3).shape == (0,)
+    assert prune_invisible(scene, optimizer, CAMERAS, 3, threshold=0.1) == 0

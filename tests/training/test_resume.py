@@ -1,0 +1,221 @@
+"""A run that was stopped, in whatever way, goes on as if it had not been."""
+
+import dataclasses
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import train as script
+from tests import tiny
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+SCRIPT = str(Path(__file__).parents[2] / "train.py")
+
+# Long enough to be killed in the middle.
+LONG = {
+    "preset": "quick",
+    "device": "cpu",
+    "iterations": 120,
+    "checkpoint-every": 15,
+    "keep-checkpoints": 100,
+    "model.width": 8,
+    "model.depth": 2,
+    "model.skip": 1,
+    "model.max-static-points": 100,
+    "model.dynamic-points": 50,
+    "densify.max-gaussians": 200,
+    "densify.every": 20,
+    "densify.gradient": 1e-5,
+}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """A run that nothing stopped."""
+    run = tmp_path_factory.mktemp("whole")
+    trainer = tiny.trainer(data, run)
+    assert tiny.train(trainer)
+    return run
+
+
+def resumed(data, run):
+    trainer = tiny.trainer(data, run)
+    trainer.restore_newest()
+    assert tiny.train(trainer)
+    return trainer
+
+
+def test_the_tiny_run_grows_and_prunes(whole):
+    counts = [len(checkpoint.load(path).tensors["scene.static.means"]) for path in checkpoint.saved(whole)]
+    assert max(counts) > counts[0]
+    assert 10 < counts[-1] < max(counts)
+
+
+def test_two_runs_are_the_same_bit_for_bit(data, whole, tmp_path):
+    tiny.train(tiny.trainer(data, tmp_path))
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+# In pretraining, between warm-up and growth, between growth and reset, at the start of stage II.
+@pytest.mark.parametrize("stop", [3, 9, 14, 22])
+def test_a_run_stopped_and_resumed_is_the_same_bit_for_bit(data, whole, tmp_path, stop):
+    first = tiny.trainer(data, tmp_path)
+    assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= stop))
+    assert first.iteration == stop
+    resumed(data, tmp_path)
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+def test_a_run_stopped_after_every_iteration_is_the_same_bit_for_bit(data, whole, tmp_path):
+    finished = tiny.train(tiny.trainer(data, tmp_path), tiny.StopWhen(lambda: True))
+    sessions = 1
+    while not finished:
+        trainer = tiny.trainer(data, tmp_path)
+        trainer.restore_newest()
+        finished = tiny.train(trainer, tiny.StopWhen(lambda: True)) or trainer.iteration == tiny.LENGTH
+        sessions += 1
+    assert sessions == tiny.LENGTH
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+def test_resuming_from_an_earlier_checkpoint_is_the_same_bit_for_bit(data, whole, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
+    trainer.restore(checkpoint.path_of(whole, 7))
+    tiny.train(trainer)
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+def test_another_seed_is_another_run(data, whole, tmp_path):
+    """What the others compare is not the same by itself."""
+    config = dataclasses.replace(tiny.CONFIG, seed=1)
+    tiny.train(tiny.trainer(data, tmp_path, config))
+    assert "scene.static.means" in tiny.differences(tiny.state(tmp_path), tiny.state(whole))
+
+
+def test_resuming_a_finished_run_changes_nothing(data, whole):
+    before = {path: path.read_bytes() for path in checkpoint.saved(whole)}
+    trainer = resumed(data, whole)
+    assert trainer.iteration == tiny.LENGTH
+    assert {path: path.read_bytes() for path in checkpoint.saved(whole)} == before
+
+
+def test_training_time_adds_up_over_sessions(data, tmp_path):
+    first = tiny.trainer(data, tmp_path)
+    first.seconds = 1000.0
+    tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 5))
+    resumed(data, tmp_path)
+    seconds = checkpoint.load(checkpoint.saved(tmp_path)[-1]).facts["train_seconds"]
+    assert 1000.0 < seconds < 1100.0
+
+
+@pytest.fixture
+def stopped(data, tmp_path):
+    """A run as train.py leaves it after Ctrl-C, with checkpoints of iterations 0, 7 and 10."""
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")
+    trainer = script.start(config)
+    tiny.train(trainer, tiny.StopWhen(lambda: trainer.iteration >= 10))
+    return trainer.run
+
+
+@pytest.mark.parametrize("kept", [0, 4, 100, -1])
+def test_a_truncated_newest_checkpoint_is_named_and_not_gone_on_from(stopped, kept):
+    newest = checkpoint.saved(stopped)[-1]
+    newest.write_bytes(newest.read_bytes()[:kept])
+    with pytest.raises(ValueError, match=f"{newest} is damaged"):
+        script.start(script.parse(["--resume", str(stopped)]))
+
+
+def test_without_its_damaged_newest_checkpoint_a_run_goes_on_from_the_one_before(stopped, whole):
+    checkpoint.saved(stopped)[-1].unlink()
+    trainer = script.start(script.parse(["--resume", str(stopped)]))
+    assert trainer.iteration == 7
+    tiny.train(trainer)
+    assert tiny.differences(tiny.state(stopped), tiny.state(whole)) == []
+
+
+def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tmp_path, monkeypatch):
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    options = [
+        "--data",
+        str(data),
+        *(word for key, value in LONG.items() for word in (f"--{key}", str(value))),
+        "--out",
+    ]
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    with subprocess.Popen([sys.executable, SCRIPT, *options, str(killed)], stdout=subprocess.DEVNULL) as run:
+        try:
+            while len(checkpoint.saved(killed)) < 3:
+                assert run.poll() is None
+                time.sleep(0.005)
+        finally:
+            run.kill()
+    assert run.returncode == -signal.SIGKILL
+    last = checkpoint.load(checkpoint.saved(killed)[-1]).facts["iteration"]
+    assert 30 <= last < 120
+
+    reference = script.start(script.parse([*options, str(whole)]))
+    tiny.train(reference)
+    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    assert script.main(script.parse(["--resume", str(killed)])) == 0
+    assert tiny.differences(tiny.state(killed), tiny.state(whole)) == []
+    assert (killed / "metrics.json").is_file()
+
+
+# Checkpoints that don't fit -----------------------------------------------------------------------------------------
+
+
+def rewritten(run, change):
+    """The newest checkpoint with its tensors and facts changed."""
+    path = checkpoint.saved(run)[-1]
+    loaded = checkpoint.load(path)
+    tensors, facts = dict(loaded.tensors), dict(loaded.facts)
+    change(tensors, facts)
+    checkpoint.save(path, tensors, facts)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["adam.exp_avg.static.means", "adam.exp_avg_sq.dynamic.sh_dc", "gradients.total", "alignments"]
+)
+def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    path = rewritten(run, lambda tensors, facts: tensors.update({name: tensors[name][:2].clone()}))
+    with pytest.raises(ValueError, match=rf"{path.name} is damaged: expected {name} as "):
+        tiny.trainer(data, run).restore_newest()
+
+
+@pytest.mark.parametrize(("name", "value"), [("iteration", "x"), ("train_seconds", None), ("rollbacks", -1)])
+def test_facts_that_are_no_numbers_are_refused_by_name(data, tmp_path, name, value):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    rewritten(run, lambda tensors, facts: facts.update({name: value}))
+    with pytest.raises(ValueError, match=f"is damaged: {name} can't be"):
+        tiny.trainer(data, run).restore_newest()
+
+
+def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
+    run = tmp_path / "run"
+    tiny.train(tiny.trainer(data, run))
+    rewritten(run, lambda tensors, facts: facts["views"].reverse())
+    with pytest.raises(ValueError, match="was trained on other frames than builtin has now"):
+        tiny.trainer(data, run).restore_newest()
+
+
+def test_a_run_that_died_before_its_first_checkpoint_begins_anew(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path / "run")
+    trainer.restore_newest()
+    assert trainer.iteration == 0

@@ -1,0 +1,285 @@
+"""Training gets through what captures lack and what goes wrong on the way, or says in words why not."""
+
+import dataclasses
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import train as script
+from tests import tiny
+from tests.data.captures import edit_json, write_png
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.evaluation import evaluate
+from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
+from warpgs.training import losses
+from warpgs.training.step import Step
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+SCRIPT = str(Path(__file__).parents[2] / "train.py")
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture
+def data(original, tmp_path):
+    """A copy, to take things from."""
+    return shutil.copytree(original, tmp_path / "capture")
+
+
+@pytest.fixture
+def run(tmp_path):
+    return tmp_path / "run"
+
+
+def is_finite(run):
+    return all(bool(torch.isfinite(t).all()) for name, t in tiny.state(run).items() if name.startswith("scene."))
+
+
+def end_to_end(data, run, monkeypatch, capsys, **changes):
+    """What ``train.py`` says and measures."""
+    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(evaluate, "TIMED_FRAMES", 2)
+    # Without a reset of opacities, after which what is large goes: where little is known, Gaussians start large.
+    schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=tiny.LENGTH)
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=run, schedule=schedule, **changes)
+    assert script.main(config) == 0
+    assert is_finite(run)
+    assert checkpoint.load(checkpoint.saved(run)[-1]).facts["iteration"] == tiny.LENGTH
+    return capsys.readouterr().out, json.loads((run / "metrics.json").read_text())
+
+
+# Values that are not finite -----------------------------------------------------------------------------------------
+
+
+def spoil_loss(monkeypatch, trainer, is_spoilt):
+    """Makes the loss, and so all gradients, NaN in the iterations of which ``is_spoilt`` says so."""
+    whole = losses.static_loss
+    monkeypatch.setattr(
+        losses, "static_loss", lambda *a: whole(*a) * (torch.nan if is_spoilt(trainer.iteration) else 1.0)
+    )
+
+
+@pytest.fixture
+def spoilt_once(data, run, monkeypatch):
+    """A trainer whose loss is NaN when it first comes to iteration 10; its last checkpoint is of iteration 7 then."""
+    trainer, iterations = tiny.trainer(data, run), [10]
+    spoil_loss(monkeypatch, trainer, lambda k: k in iterations and not iterations.remove(k))
+    return trainer
+
+
+def test_after_a_loss_that_is_not_finite_training_goes_back_and_says_so(spoilt_once, capsys):
+    assert tiny.train(spoilt_once)
+    said = capsys.readouterr().out
+    assert "the loss or a parameter is not finite after iteration 14: back to iteration 7" in said
+    assert said.count("not finite") == 1
+
+
+def test_a_loss_that_was_not_finite_once_leaves_a_finite_scene_at_the_end(spoilt_once, run):
+    tiny.train(spoilt_once)
+    assert checkpoint.load(checkpoint.saved(run)[-1]).facts["iteration"] == tiny.LENGTH
+    assert is_finite(run)
+
+
+def test_after_going_back_the_noise_is_another(spoilt_once, data, run, tmp_path):
+    """Else the same loss would come again."""
+    straight = tiny.trainer(data, tmp_path / "straight")
+    tiny.train(straight)
+    tiny.train(spoilt_once)
+    assert "scene.static.means" in tiny.differences(tiny.state(run), tiny.state(straight.run))
+
+
+def test_a_run_that_went_back_resumes_bit_for_bit(spoilt_once, data, run, tmp_path):
+    tiny.train(spoilt_once)
+    again = tiny.trainer(data, tmp_path / "again")
+    again.restore(checkpoint.path_of(run, 14))
+    tiny.train(again)
+    assert tiny.differences(tiny.state(again.run), tiny.state(run)) == []
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "sh_dc"])
+def test_gaussians_that_are_not_finite_are_no_good_state(data, run, name):
+    """None is pruned before the next checkpoint."""
+    trainer = tiny.trainer(data, run)
+
+    def spoil():
+        if trainer.iteration == 1:
+            getattr(trainer.scene.static, name).data[0] = torch.nan
+        return trainer.iteration == 7
+
+    tiny.train(trainer, tiny.StopWhen(spoil))
+    assert is_finite(run)
+
+
+def test_a_loss_that_is_never_finite_ends_in_words(data, run, monkeypatch):
+    trainer = tiny.trainer(data, run)
+    spoil_loss(monkeypatch, trainer, lambda k: k >= 8)
+    with pytest.raises(ValueError, match="is not finite after iteration 14, and was not after 3 returns") as caught:
+        tiny.train(trainer)
+    assert str(checkpoint.path_of(run, 7)) in str(caught.value)
+    assert is_finite(run)
+
+
+def test_a_loss_that_is_not_finite_from_the_start_ends_in_words(data, run, monkeypatch):
+    trainer = tiny.trainer(data, run)
+    spoil_loss(monkeypatch, trainer, lambda k: True)
+    with pytest.raises(ValueError, match="is not finite after iteration 7"):
+        tiny.train(trainer)
+
+
+# Memory -------------------------------------------------------------------------------------------------------------
+
+
+def run_as_main(monkeypatch, capsys, *arguments):
+    """Exit code and error output of train.py."""
+    monkeypatch.setattr("sys.argv", [SCRIPT, *map(str, arguments)])
+    with pytest.raises(SystemExit) as caught:
+        runpy.run_path(SCRIPT, run_name="__main__")
+    return caught.value.code, capsys.readouterr().err
+
+
+def test_out_of_memory_is_one_line_that_says_what_to_try(data, run, monkeypatch, capsys):
+    def out_of_memory(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore of torch's advice.")
+
+    monkeypatch.setattr(Step, "__call__", out_of_memory)
+    options = ["--data", data, "--preset", "quick", "--device", "cpu", "--out", run]
+    code, text = run_as_main(monkeypatch, capsys, *options)
+    assert code == 2
+    assert text.count("\n") == 1
+    assert "out of memory" in text
+    assert "--densify.max-gaussians" in text
+    assert "--factor" in text
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError("no more"), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate")]
+)
+def test_out_of_memory_on_the_cpu_is_one_line_too(data, run, monkeypatch, capsys, error):
+    def out_of_memory(*_):
+        raise error
+
+    monkeypatch.setattr(Step, "__call__", out_of_memory)
+    options = ["--data", data, "--preset", "quick", "--device", "cpu", "--out", run]
+    code, text = run_as_main(monkeypatch, capsys, *options)
+    assert code == 2
+    assert text.count("\n") == 1
+    assert "out of memory" in text
+
+
+def test_a_capture_that_is_refused_leaves_no_run_folder(data, run, monkeypatch, capsys):
+    shutil.rmtree(data / "resized_mask")
+    options = ["--data", data, "--preset", "quick", "--device", "cpu", "--out", run]
+    code, text = run_as_main(monkeypatch, capsys, *options)
+    assert code == 2
+    assert "--assume static" in text
+    assert not run.exists()
+
+
+# What captures lack -------------------------------------------------------------------------------------------------
+
+
+def test_without_depth_the_pretraining_goes_to_stage_1(data, run):
+    shutil.rmtree(data / "depth")
+    trainer = tiny.trainer(data, run)
+    assert trainer.protocol.pretrain.end == 0
+    assert trainer.protocol.stage1.end == tiny.SCHEDULE.pretrain + tiny.SCHEDULE.stage1
+    assert trainer.protocol.num_iterations == tiny.LENGTH
+
+
+def test_a_capture_without_depth_trains(data, run, monkeypatch, capsys):
+    shutil.rmtree(data / "depth")
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["num_dynamic"] > 0
+
+
+def test_a_capture_without_points_trains(data, run, monkeypatch, capsys):
+    (data / "points.npy").unlink()
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["num_static"] + metrics["num_dynamic"] > 0
+
+
+def test_a_capture_without_depth_and_points_trains(data, run, monkeypatch, capsys):
+    shutil.rmtree(data / "depth")
+    (data / "points.npy").unlink()
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["num_static"] + metrics["num_dynamic"] > 0
+
+
+def test_a_capture_without_evaluation_frames_trains_and_says_what_is_not_measured(data, run, monkeypatch, capsys):
+    edit_json(data / "dataset.json", val_ids=[])
+    said, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert "the capture has no frames to evaluate on: PSNR, SSIM and LPIPS not measured" in said
+    assert metrics["psnr"] is None
+    assert metrics["num_views"] == 0
+    assert metrics["iterations"] == tiny.LENGTH
+
+
+def test_a_capture_of_one_training_frame_trains(data, run, monkeypatch, capsys):
+    edit_json(data / "dataset.json", train_ids=["left_000000"])
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["psnr"] > 0
+
+
+def mask_all(data, value):
+    for path in (data / "resized_mask/1x").iterdir():
+        write_png(path, np.full((tiny.SCENE.height, tiny.SCENE.width), value, np.uint8))
+
+
+def test_a_capture_in_which_all_moves_trains(data, run, monkeypatch, capsys):
+    mask_all(data, 0)
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["num_dynamic"] > 0
+    assert metrics["psnr_static"] is None
+    assert metrics["psnr_dynamic"] == metrics["psnr"]
+
+
+def test_a_capture_in_which_nothing_moves_trains(data, run, monkeypatch, capsys):
+    mask_all(data, 255)
+    _, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert metrics["psnr_dynamic"] is None
+    assert metrics["psnr_static"] == metrics["psnr"]
+
+
+def test_assuming_that_nothing_moves_trains_no_dynamic_gaussians(data, run, monkeypatch, capsys):
+    _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="static")
+    assert metrics["num_dynamic"] == 0
+    assert metrics["num_static"] > 0
+
+
+def test_assuming_that_all_moves_trains_no_static_gaussians(data, run, monkeypatch, capsys):
+    _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="dynamic")
+    assert metrics["num_static"] == 0
+    assert metrics["num_dynamic"] > 0
+
+
+@pytest.mark.parametrize("assume", ["static", "dynamic"])
+def test_an_empty_branch_resumes(data, run, assume):
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=run, assume=assume)
+    first = script.start(config)
+    tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 24))
+    again = script.start(script.parse(["--resume", str(run)]))
+    assert again.iteration == 24
+    assert tiny.train(again)
+
+
+def test_a_capture_without_masks_is_refused_with_what_to_try(data, run):
+    shutil.rmtree(data / "resized_mask")
+    with pytest.raises(ValueError, match=r"has no mask of what moves.*--assume static"):
+        script.start(dataclasses.replace(tiny.CONFIG, data=data, out=run, dataset="nerfds"))
+
+
+def test_a_capture_without_masks_trains_when_told_what_moves(data, run, monkeypatch, capsys):
+    shutil.rmtree(data / "resized_mask")
+    _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="static", dataset="nerfds")
+    assert metrics["psnr"] > 0
+    assert metrics["psnr_static"] is None

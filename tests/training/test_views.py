@@ -1,0 +1,124 @@
+"""Training views are the same, wherever they are kept."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests import tiny
+from tests.data.captures import ids_of, write_capture
+from warpgs.data.capture import Capture
+from warpgs.data.loaders.nerfies import load_capture
+from warpgs.training.views import Views
+
+CPU = torch.device("cpu")
+PLENTY = 1 << 30
+
+
+@pytest.fixture(scope="module", params=["nerfds", "iphone", "builtin"])
+def capture(request, tmp_path_factory):
+    """With masks; with depth; with both."""
+    folder = tmp_path_factory.mktemp(request.param)
+    return load_capture(tiny.write(folder) if request.param == "builtin" else write_capture(folder, request.param))
+
+
+def views_of(capture, resident_bytes=PLENTY, **options):
+    if capture.frame(capture.train[0]).static_mask is None:
+        options = {"assume": "static", **options}
+    return Views(capture, CPU, resident_bytes, **options)
+
+
+def without(capture, **changes):
+    """The capture with parts of its frames changed."""
+
+    def read(name):
+        return dataclasses.replace(capture.frame(name), **changes)
+
+    return Capture("less", capture.cameras, capture.train, capture.val, capture.points, None, read)
+
+
+def assert_same(a, b):
+    for name in ("time", "image", "static_mask", "inverse_depth"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert left.dtype == right.dtype
+        assert torch.equal(left.nan_to_num(-1.0), right.nan_to_num(-1.0)), name
+    assert torch.equal(a.camera.viewmat, b.camera.viewmat)
+    assert torch.equal(a.camera.K, b.camera.K)
+    assert a.camera.size == b.camera.size
+
+
+def test_views_fit_or_do_not(capture):
+    assert views_of(capture).resident
+    assert not views_of(capture, resident_bytes=0).resident
+
+
+def test_resident_views_are_the_same_as_those_that_are_read(capture):
+    kept, read = views_of(capture), views_of(capture, resident_bytes=0)
+    assert len(kept) == len(read) == len(capture.train)
+    for index in range(len(kept)):
+        assert_same(kept[index], read[index])
+
+
+def test_a_view_picked_on_the_device_is_the_one_of_its_index(capture):
+    views = views_of(capture)
+    for index in range(len(views)):
+        assert_same(views.pick(torch.tensor([index])), views[index])
+
+
+def test_a_view_has_its_frames_picture_time_and_mask(capture):
+    views = views_of(capture)
+    for index, name in enumerate(capture.train):
+        frame, view = capture.frame(name), views[index]
+        assert torch.equal((view.image * 255).round().byte(), frame.image)
+        assert view.image.max() <= 1.0
+        assert view.time.tolist() == pytest.approx([frame.camera.time])
+        if frame.static_mask is not None:
+            assert torch.equal(view.static_mask, frame.static_mask)
+
+
+def test_inverse_depth_is_kept_to_half_precision_and_unknown_where_it_is(capture):
+    view, frame = views_of(capture)[1], capture.frame(capture.train[1])
+    if frame.inverse_depth is None:
+        assert view.inverse_depth.isnan().all()
+    else:
+        assert torch.equal(view.inverse_depth.isnan(), frame.inverse_depth.isnan())
+        assert torch.allclose(view.inverse_depth, frame.inverse_depth, rtol=2**-11, atol=1e-7, equal_nan=True)
+
+
+def test_evaluation_frames_are_no_training_views(capture):
+    assert len(views_of(capture)) == len(capture.train) < len(capture.train) + len(capture.val)
+
+
+@pytest.mark.parametrize(("assume", "is_static"), [("static", True), ("dynamic", False)])
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_what_is_assumed_goes_before_masks(capture, resident_bytes, assume, is_static):
+    views = Views(capture, CPU, resident_bytes, assume)
+    assert all(bool((views[index].static_mask == is_static).all()) for index in range(len(views)))
+
+
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_a_frame_without_a_mask_is_refused_by_name_with_what_to_try(capture, resident_bytes):
+    bare = without(capture, static_mask=None)
+    with pytest.raises(
+        ValueError, match=rf"frame {capture.train[0]} has no mask .*--assume static or --assume dynamic"
+    ):
+        Views(bare, CPU, resident_bytes)
+
+
+def test_frames_of_different_sizes_are_read_as_they_are_needed(tmp_path):
+    """They make no stack."""
+    whole = load_capture(write_capture(tmp_path))
+    smaller = ids_of("nerfds")[0][2]
+    cameras = {**whole.cameras, smaller: dataclasses.replace(whole.cameras[smaller], width=20, height=10)}
+
+    def read(name):
+        frame = whole.frame(name)
+        if name != smaller:
+            return frame
+        image, mask = frame.image[:10, :20], frame.static_mask[:10, :20]
+        return dataclasses.replace(frame, camera=cameras[name], image=image, static_mask=mask)
+
+    views = Views(Capture("mixed", cameras, whole.train, whole.val, whole.points, None, read), CPU, PLENTY)
+    assert not views.resident
+    assert views[2].image.shape == (10, 20, 3)
+    assert views[1].image.shape == (24, 40, 3)

@@ -1,0 +1,1 @@
+"""``warpgs bench``: times of renders, training steps and playback."""

@@ -1,0 +1,93 @@
+"""Random scenes to measure rendering with."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.model.splats import Splats
+
+Branches = Literal["none", "random", "disc"]
+
+SEED = 0
+DISC_AREA = 0.2
+"""Share of the image that the disc of dynamic Gaussians covers."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a random scene is made of.
+
+    Attributes:
+        name: How it is called on the command line.
+        width, height: Size of the image [px].
+        num_gaussians: All of them inside the image.
+        pixels: Twice the median standard deviation of a Gaussian on screen [px].
+    """
+
+    name: str
+    width: int
+    height: int
+    num_gaussians: int
+    pixels: float
+
+    def make(self, branches: Branches, device: str) -> tuple[Splats, Camera]:
+        """The scene, with ``is_dynamic`` unless ``branches`` is none."""
+        splats, camera = random_splats(self.num_gaussians, self.width, self.height, self.pixels, SEED)
+        if branches == "random":
+            coins = torch.rand(self.num_gaussians, generator=torch.Generator().manual_seed(SEED + 1))
+            splats = dataclasses.replace(splats, is_dynamic=coins < 0.5)
+        if branches == "disc":
+            splats = dataclasses.replace(splats, is_dynamic=in_disc(splats.means, camera))
+        return splats.to(device), camera.to(device)
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        Scene("small", 480, 270, 100_000, 3.0),
+        Scene("large", 1920, 1080, 1_000_000, 4.0),
+        Scene("wide", 1920, 1080, 200_000, 20.0),
+    )
+}
+
+
+def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> tuple[Splats, Camera]:
+    """Gaussians spread evenly over an image and over depths of 2 to 10, with random shapes, opacities and colours.
+
+    A seed stands for the same scene on every machine: all values are drawn on CPU, in a fixed order.
+
+    Args:
+        N: Number of Gaussians.
+        width, height: Size of the image [px].
+        pixels: Twice the median standard deviation of a Gaussian on screen [px].
+        seed: Of torch's CPU generator.
+
+    Returns:
+        Splats with three colour channels, and a camera at the origin that looks along +z, with a focal length of 0.9
+        image widths.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    focal = 0.9 * width
+    z = torch.rand(N, generator=generator) * 8 + 2
+    u = torch.rand(N, generator=generator) * width
+    v = torch.rand(N, generator=generator) * height
+    means = torch.stack([(u - width / 2) * z / focal, (v - height / 2) * z / focal, z], -1)
+    quats = torch.randn(N, 4, generator=generator)
+    scales = torch.exp(torch.randn(N, 3, generator=generator) * 0.8) * (pixels * 0.5) * z[:, None] / focal
+    opacities = torch.sigmoid(torch.randn(N, generator=generator) * 1.5)
+    colors = torch.rand(N, 3, generator=generator)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Splats(means, quats, scales, opacities, colors), Camera(torch.eye(4), K, width, height)
+
+
+def in_disc(means: Tensor, camera: Camera) -> Tensor:
+    """[N] whether centres, in camera space, project into a disc of ``DISC_AREA`` around the middle of the image."""
+    middle = torch.tensor([camera.width / 2, camera.height / 2])
+    homogeneous = means @ camera.K.T
+    centers = homogeneous[:, :2] / homogeneous[:, 2:]
+    return (centers - middle).square().sum(-1) < DISC_AREA * camera.width * camera.height / math.pi

@@ -1,0 +1,139 @@
+"""``warpgs bench --steps`` and ``--fps``: whole training steps, and frames a second of a trained scene."""
+
+import dataclasses
+import statistics
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs.cameras import Camera
+from warpgs.config import PRESETS
+from warpgs.data.capture import Capture, Frame
+from warpgs.evaluation.evaluate import frame_rate
+from warpgs.model.gaussians import SH_C0, Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.model.splats import Splats
+from warpgs.runs import run as runs
+from warpgs.runs.trained import Player
+from warpgs.training import point_cloud as init
+from warpgs.training.schedule import Moment, Protocol
+from warpgs.training.step import WARM_UPS, Draw, Step
+from warpgs.training.views import Views
+
+from .report import print_rows
+from .scenes import SEED, in_disc, random_splats
+from .timing import milliseconds
+
+SMALLEST = (480, 270)
+STEPS = {
+    "cuda": [
+        *((num, SMALLEST) for num in (50_000, 100_000, 133_000, 200_000, 400_000, 800_000, 1_600_000)),
+        *((100_000, size) for size in ((960, 540), (1920, 1080), (3840, 2160))),
+    ],
+    "cpu": [(num, (240, 136)) for num in (5_000, 10_000)],
+}
+"""Numbers of Gaussians and sizes of images to measure. 133,000 is what Deformable-3DGS ends with on such a capture."""
+
+PIXELS = 3.0
+"""Twice the median standard deviation of a Gaussian on screen, for each 480 pixels of the image's width [px]."""
+
+NUM_VIEWS = 4
+
+
+def random_capture(splats: Splats, camera: Camera) -> Capture:
+    """Views of noise, a disc of which moves; its points are the centres of the Gaussians."""
+    generator = torch.Generator().manual_seed(SEED)
+    width, height = camera.size
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    rays = torch.stack([columns - camera.K[0, 2], rows - camera.K[1, 2], torch.full_like(rows, 1)], -1).float()
+    rays[..., :2] /= camera.K[0, 0]
+    static = ~in_disc(rays.reshape(-1, 3), camera).reshape(height, width)
+    image = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=generator)
+    cameras = {str(k): dataclasses.replace(camera, time=k / (NUM_VIEWS - 1)) for k in range(NUM_VIEWS)}
+    inverse_depth = torch.full((height, width), 0.2)
+
+    def read(name: str) -> Frame:
+        return Frame(name, cameras[name], image, static, inverse_depth)
+
+    return Capture("noise", cameras, list(cameras), [], splats.means, None, read)
+
+
+def random_scene(splats: Splats, camera: Camera) -> SplitScene:
+    """The Gaussians in raw form, those in a disc in the middle dynamic, with the networks of the paper."""
+    config = PRESETS["paper"].model
+    assert splats.colors is not None
+    moving = in_disc(splats.means, camera)
+    parts = []
+    for part in (~moving, moving):
+        parts.append(
+            Gaussians(
+                splats.means[part],
+                splats.quats[part],
+                splats.scales[part].log(),
+                splats.opacities[part].clamp(1e-4, 1.0 - 1e-4).logit(),
+                ((splats.colors[part] - 0.5) / SH_C0)[:, None],
+                torch.zeros(int(part.sum()), (config.sh_degree + 1) ** 2 - 1, 3),
+            )
+        )
+    return SplitScene(parts[0], parts[1], config, *init.scene_box(splats.means))
+
+
+def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
+    """Times whole training steps (render, loss, way back, Adam) of both stages; prints and returns the figures."""
+    rows = [measure_steps(num, size, device, repeats) for num, size in STEPS[device]]
+    print_rows("whole training steps, medians", rows)
+    return rows
+
+
+def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int) -> dict[str, Any]:
+    """Median time [ms] of a step of stage I and of stage II, and the most memory that tensors took meanwhile."""
+    splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / SMALLEST[0], SEED)
+    config = dataclasses.replace(PRESETS["paper"], device="cuda" if device == "cuda" else "cpu")
+    capture = random_capture(splats, camera)
+    views = Views(capture, torch.device(device), config.resident_bytes)
+    alignments = torch.tensor([[1.0, 0.0]], device=device).repeat(NUM_VIEWS, 1)
+    scene = random_scene(splats, camera).to(device)
+    if device == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    protocol = Protocol(config, has_depth=True)
+    result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
+    for stage in (protocol.stage1, protocol.stage2):
+        step = Step(config, scene, views, alignments, capture.extent)
+        moment = protocol.at((stage.start + stage.end) // 2)
+        result[f"{stage.name}_ms"] = statistics.median(_times(step, moment, device, repeats))
+    if device == "cuda":
+        result["peak_memory_mb"] = torch.cuda.max_memory_allocated() // 10**6
+    return result
+
+
+def _times(step: Step, moment: Moment, device: str, repeats: int) -> Iterable[float]:
+    draws = [
+        Draw(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k))) for k in range(repeats)
+    ]
+    for draw in [draws[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
+        step(moment, draw)
+    return [milliseconds(partial(step, moment, draw), device) for draw in draws]
+
+
+def bench_fps(folder: Path, device: str) -> dict[str, Any]:
+    """Frames a second of a run's newest checkpoint through its evaluation cameras; prints and returns the figures."""
+    config = runs.resolve(dataclasses.replace(runs.load_config(folder), device="cuda" if device == "cuda" else "cpu"))
+    capture = runs.open_capture(config)
+    scene, facts = runs.newest_scene(folder, config)
+    cameras = [capture.cameras[name].to(torch.device(device)) for name in capture.val or capture.train]
+    player = Player(scene.to(device), config, facts)
+    result = {
+        "run": str(folder),
+        "width": cameras[0].width,
+        "height": cameras[0].height,
+        "static": len(scene.static),
+        "dynamic": len(scene.dynamic),
+        "frames_per_second": frame_rate(player.play, cameras),
+    }
+    if device == "cuda":  # on CPU nothing is replayed
+        result["eager_frames_per_second"] = frame_rate(lambda camera: player(camera, False), cameras)
+    print_rows("frames a second, both networks evaluated for every frame", [result])
+    return result

@@ -1,0 +1,72 @@
+"""Alignment of monocular depth: a scale and an offset of inverse depth for every frame (paper, Sec. DAP)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.kernels.constants import SMALLEST_INVERSE_DEPTH
+
+REWEIGHTINGS = 50
+"""Rounds of iteratively reweighted least squares: with 30 % outliers the fit has settled by then."""
+
+FEWEST_SAMPLES = 16
+"""Samples under which a frame is not aligned and its depth not used."""
+
+
+def fit_scale_offset(values: Float[Tensor, " S"], targets: Float[Tensor, " S"]) -> Float[Tensor, "2"]:
+    """(a, b) that minimise Σ |a · values + b − targets|.
+
+    By iteratively reweighted least squares: each round solves the two normal equations in closed form with weights
+    1 / |residual|, so that points seen through other surfaces do not count. Float64 inside.
+
+    Returns:
+        [2]; NaN if there are fewer than 16 samples, they all have one value, or the fit turns depth around (a ≤ 0).
+    """
+    nothing = values.new_full((2,), torch.nan)
+    if values.shape[0] < FEWEST_SAMPLES:
+        return nothing
+    x, y = values.double(), targets.double()
+    weights = torch.ones_like(x)
+    floor = 1e-4 * y.abs().median().clamp_min(1e-12)  # keeps the weight of a perfect sample finite
+    a = b = x.new_tensor(0.0)
+    for _ in range(REWEIGHTINGS):
+        total = weights.sum()
+        mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
+        variance = (weights * (x - mean_x) ** 2).sum()
+        a = (weights * (x - mean_x) * (y - mean_y)).sum() / variance
+        b = mean_y - a * mean_x
+        weights = 1.0 / (a * x + b - y).abs().clamp_min(floor)
+    if not bool(torch.isfinite(a + b)) or bool(a <= 0):
+        return nothing
+    return torch.stack([a, b]).to(values.dtype)
+
+
+def align_to_points(
+    inverse_depth: Float[Tensor, "H W"],
+    static: Tensor,
+    camera: Camera,
+    points: Float[Tensor, "P 3"],
+) -> Float[Tensor, "2"]:
+    """Scale and offset of a frame's inverse depth against the sparse points that it sees in its static region."""
+    row, column, z, inside = camera.project(points)
+    values = inverse_depth[row, column]
+    known = inside & values.isfinite() & static[row, column]
+    return fit_scale_offset(values[known], 1.0 / z[known])
+
+
+def align_to_rendering(
+    inverse_depth: Float[Tensor, "H W"],
+    static: Tensor,
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+) -> Float[Tensor, "2"]:
+    """Scale and offset of a frame's inverse depth against the depth rendered of the static Gaussians."""
+    known = static & inverse_depth.isfinite() & (alpha > 0.9) & (depth > 0)
+    return fit_scale_offset(inverse_depth[known], 1.0 / depth[known])
+
+
+def metric_depth(inverse_depth: Float[Tensor, "H W"], alignment: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:
+    """Depth in scene units of an aligned frame; NaN where unknown, and where the alignment says at or past infinity."""
+    aligned = alignment[0] * inverse_depth + alignment[1]
+    return torch.where(aligned > SMALLEST_INVERSE_DEPTH, 1.0 / aligned, torch.nan)

@@ -1,0 +1,84 @@
+"""Motion between two frames that their cameras do not explain, inside and outside of the mask."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from .capture import Frame
+
+SMALLEST_SIDE, FLATTEST = 16, 16
+"""Shorter side [px], and largest ratio of the sides: optical flow crashes on less."""
+
+LONGEST_SIDE = 512
+"""Pictures are compared at this size [px]."""
+
+FEWEST_PIXELS = 200
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Median distances of pixels from their epipolar lines, textured pixels only [px].
+
+    Attributes:
+        static: Of pixels that the mask calls static.
+        moving: Of the others; None where there are too few.
+    """
+
+    static: float
+    moving: float | None
+
+
+def motion_between(first: Frame, second: Frame) -> Motion | None:
+    """Optical flow (DIS) from the first frame to the second against the epipolar lines of their cameras.
+
+    Returns:
+        None where too few pixels have texture, or the pictures are too flat for optical flow.
+    """
+    height, width = first.image.shape[:2]
+    factor = min(1.0, LONGEST_SIDE / max(height, width))
+    size = round(width * factor), round(height * factor)
+    if min(size) < SMALLEST_SIDE:
+        return None
+    a, b = (_grey(frame, size) for frame in (first, second))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(a, b, None)
+    distance = _epipolar_distance(first, second, flow)
+    slope = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
+    textured = slope > max(np.quantile(slope, 0.6), 8.0)
+    static = np.ones(a.shape, bool)
+    if first.static_mask is not None:
+        mask = first.static_mask.numpy().astype(np.uint8)
+        static = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    values = [distance[textured & region] for region in (static, ~static)]
+    if len(values[0]) < FEWEST_PIXELS:
+        return None
+    moving = float(np.median(values[1])) if len(values[1]) >= FEWEST_PIXELS else None
+    return Motion(float(np.median(values[0])), moving)
+
+
+def _grey(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    plane = cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY)
+    return cv2.createCLAHE(2.0, (8, 8)).apply(cv2.resize(plane, size, interpolation=cv2.INTER_AREA))
+
+
+def _epipolar_distance(first: Frame, second: Frame, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:
+    """Distance from x' to the line F x, with F = K'⁻ᵀ [t]× R K⁻¹ (Hartley and Zisserman, 9.2.2)."""
+    height, width = flow.shape[:2]
+    matrices = []
+    for frame in (first, second):
+        scale = np.diag([width / frame.camera.width, height / frame.camera.height, 1.0])
+        matrices.append(scale @ frame.camera.K.double().numpy())
+    relative = second.camera.viewmat.double().numpy() @ np.linalg.inv(first.camera.viewmat.double().numpy())
+    t = relative[:3, 3]
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x, y, np.ones_like(x)], -1)
+    there = pixels[..., :2] + flow
+    rotated = pixels @ (matrices[1] @ relative[:3, :3] @ np.linalg.inv(matrices[0])).T
+    if np.linalg.norm(t) < 1e-6:  # the camera has only turned: every pixel's place is known
+        return np.linalg.norm(there - rotated[..., :2] / rotated[..., 2:], axis=-1)
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    essential = cross @ relative[:3, :3]
+    lines = pixels @ (np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])).T
+    norm = np.maximum(np.hypot(lines[..., 0], lines[..., 1]), 1e-12)
+    return np.abs(lines[..., 0] * there[..., 0] + lines[..., 1] * there[..., 1] + lines[..., 2]) / norm

@@ -1,0 +1,1 @@
+"""Evaluation on held-out views: metrics and LPIPS."""

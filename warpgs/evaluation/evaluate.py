@@ -1,0 +1,209 @@
+"""Evaluation of a scene on the frames of a capture that it was not trained on."""
+
+import csv
+import io
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture, Frame
+from warpgs.files import write_text
+from warpgs.progress import progress
+from warpgs.render import Rendering
+
+from . import metrics
+from .lpips import Lpips
+
+RenderAt = Callable[[Camera, bool], Rendering]
+"""Renders the scene through a camera at the camera's time, with or without the images of the branches."""
+
+STATIC_ALPHA = 0.05
+"""A pixel counts as static for the flicker score where the dynamic image is fainter than this in both frames."""
+
+FLICKER_FRAMES = 30
+TIMED_FRAMES = 30
+TIMED_SECONDS = 0.5
+"""Frames are timed in rounds of so many, for so long."""
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """One view's figures; None where they could not be measured.
+
+    Images are clamped to [0, 1] and not rounded to 8 bits. ``_static`` and ``_dynamic`` are over the pixels of that
+    region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures.
+    """
+
+    name: str
+    time: float
+    psnr: float
+    ssim: float
+    lpips: float | None
+    psnr_static: float | None
+    psnr_dynamic: float | None
+    ssim_static: float | None
+    ssim_dynamic: float | None
+    masked_psnr: float | None
+    masked_ssim: float | None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of all views and of the whole.
+
+    Attributes:
+        views: One entry a view.
+        flicker: Mean absolute change between consecutive renderings of the static region through the middle camera of
+            the evaluation, held fixed; None with fewer than two moments. There is no truth of a fixed camera in a
+            capture of a moving one, so changes that are real (shadows) count too.
+        fps: Joint images a second, everything that depends on time included.
+        lpips_net: Network of LPIPS; None when it was not measured.
+    """
+
+    views: list[ViewMetrics]
+    flicker: float | None
+    fps: float
+    lpips_net: str | None
+
+    def summary(self) -> dict[str, Any]:
+        """Means over the views that have a figure; None where none has."""
+        means = {f.name: _mean([getattr(v, f.name) for v in self.views]) for f in fields(ViewMetrics)[2:]}
+        return {
+            **means,
+            "flicker": self.flicker,
+            "fps": self.fps,
+            "lpips_net": self.lpips_net,
+            "num_views": len(self.views),
+        }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return statistics.fmean(known) if known else None
+
+
+@torch.no_grad()
+def evaluate(
+    render_at: RenderAt,
+    capture: Capture,
+    device: torch.device,
+    lpips: Lpips | None = None,
+    on_view: Callable[[int, Frame, Float[Tensor, "H W 3"], Rendering], None] | None = None,
+    play: Callable[[Camera], object] | None = None,
+    quiet: bool = False,
+) -> Evaluation:
+    """Compares the scene with every evaluation frame of a capture.
+
+    Without any, flicker and frames a second are measured through its training cameras, and nothing else is.
+
+    Args:
+        render_at: The scene.
+        capture: Where the frames come from.
+        device: Where the scene is rendered.
+        lpips: On ``device``; not measured if None.
+        on_view: Called with each view's number, frame, truth in [0, 1] and rendering.
+        play: Renders a joint image where speed matters; ``render_at`` by default.
+        quiet: Whether to show no progress bar.
+    """
+    play = play or (lambda camera: render_at(camera, False))
+    views = []
+    for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
+        frame = capture.frame(name)
+        truth = frame.image.to(device).float() / 255.0
+        rendering = render_at(frame.camera.to(device), True)
+        views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
+        if on_view is not None:
+            on_view(index, frame, truth, rendering)
+    cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
+    return Evaluation(
+        views, _flicker(render_at, cameras, quiet), frame_rate(play, cameras), lpips.net if lpips else None
+    )
+
+
+def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
+    def within(metric: Callable[..., float], region: Bool[Tensor, "H W"] | None) -> float | None:
+        if region is None or not bool(region.any()):
+            return None
+        return metric(image, truth, region.to(image.device))
+
+    static, covisible = frame.static_mask, frame.covisible
+    dynamic = None if static is None else ~static
+    return ViewMetrics(
+        name=frame.name,
+        time=frame.camera.time,
+        psnr=metrics.psnr(image, truth),
+        ssim=metrics.ssim(image, truth),
+        lpips=None if lpips is None else float(lpips(image, truth)),
+        psnr_static=within(metrics.psnr, static),
+        psnr_dynamic=within(metrics.psnr, dynamic),
+        ssim_static=within(metrics.ssim, static),
+        ssim_dynamic=within(metrics.ssim, dynamic),
+        masked_psnr=within(metrics.psnr, covisible),
+        masked_ssim=within(metrics.masked_ssim, covisible),
+    )
+
+
+def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> list[Camera]:
+    """One camera at consecutive times of others."""
+    times = sorted({c.time for c in cameras})
+    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, moment) for moment in times[:most]]
+
+
+def _flicker(render_at: RenderAt, cameras: Sequence[Camera], quiet: bool) -> float | None:
+    changes = []
+    before: Rendering | None = None
+    for camera in progress(_at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES), "flicker", quiet):
+        after = render_at(camera, True)
+        if before is not None:
+            assert before.dynamic is not None
+            assert after.dynamic is not None
+            static = (before.dynamic.alpha < STATIC_ALPHA) & (after.dynamic.alpha < STATIC_ALPHA)
+            change = metrics.flicker(before.joint.image.clamp(0, 1), after.joint.image.clamp(0, 1), static)
+            changes += [] if math.isnan(change) else [change]
+        before = after
+    return _mean(changes)
+
+
+def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:
+    """Frames a second by the clock, after one to warm up, through one camera after the other."""
+    device = cameras[0].viewmat.device
+
+    def play_all() -> None:
+        for k in range(TIMED_FRAMES):
+            play(cameras[k % len(cameras)])
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+
+    play(cameras[0])
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    start, rounds = time.perf_counter(), 0
+    while time.perf_counter() - start < TIMED_SECONDS:
+        play_all()
+        rounds += 1
+    return rounds * TIMED_FRAMES / (time.perf_counter() - start)
+
+
+def write_views(path: Path, evaluation: Evaluation) -> None:
+    """Writes one line a view as CSV; nothing between commas is "not measured"."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [f.name for f in fields(ViewMetrics)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: "" if v is None else v for k, v in asdict(view).items()} for view in evaluation.views)
+    write_text(path, text.getvalue())
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Writes a JSON object; what is not finite becomes null, which every reader understands."""
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+    write_text(path, json.dumps(plain, indent=2) + "\n")

@@ -1,1 +1,0 @@
-"""Networks over position and time."""

@@ -1,0 +1,1 @@
+"""What is trained: Gaussians, static and dynamic, and the two networks."""

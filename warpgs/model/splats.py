@@ -1,0 +1,75 @@
+"""Gaussians in activated form, ready to be rendered."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from warpgs.ops.sh import check_coefficients
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.streams import join
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians with activated values, coloured either by ``colors`` or by ``sh``.
+
+    Attributes:
+        means: [N, 3] centres.
+        quats: [N, 4] rotations (w, x, y, z), of any length but zero.
+        scales: [N, 3] standard deviations along the Gaussians' own axes.
+        opacities: [N] in [0, 1].
+        colors: [N, C] features to blend as they are, any number of channels.
+        sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
+        is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
+        sh_degree: Highest degree of ``sh`` to use; all by default.
+        sh_stream: CUDA stream that ``sh`` is still being computed on; ``render`` waits for it where it needs colours.
+            None if it is there, or as soon as the current stream comes to it.
+
+    Raises:
+        ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+    colors: Float[Tensor, "N C"] | None = None
+    sh: Float[Tensor, "N bases 3"] | None = None
+    is_dynamic: Bool[Tensor, " N"] | None = None
+    sh_degree: int | None = None
+    sh_stream: torch.cuda.Stream | None = None
+
+    def __post_init__(self) -> None:
+        sizes: dict[str, int] = {}
+        check_tensor("means", self.means, ("N", 3), sizes)
+        check_tensor("quats", self.quats, ("N", 4), sizes)
+        check_tensor("scales", self.scales, ("N", 3), sizes)
+        check_tensor("opacities", self.opacities, ("N",), sizes)
+        if (self.colors is None) == (self.sh is None):
+            raise ValueError("splats need exactly one of colors and sh")
+        if self.colors is not None:
+            check_tensor("colors", self.colors, ("N", "C"), sizes)
+            if sizes["C"] == 0:
+                raise ValueError("colors must have at least one channel, got none")
+        if self.sh is not None:
+            check_coefficients(sizes, self.sh, self.sh_degree)
+        if self.is_dynamic is not None:
+            check_tensor("is_dynamic", self.is_dynamic, ("N",), sizes, (torch.bool,))
+        check_same_device({name: getattr(self, name) for name in self.tensor_names()})
+
+    @staticmethod
+    def tensor_names() -> tuple[str, ...]:
+        return ("means", "quats", "scales", "opacities", "colors", "sh", "is_dynamic")
+
+    @property
+    def num_channels(self) -> int:
+        """Channels of an image of these splats."""
+        return 3 if self.colors is None else self.colors.shape[1]
+
+    def to(self, device: torch.device | str) -> "Splats":
+        join(self.sh_stream)
+        moved = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
+        return dataclasses.replace(self, **moved, sh_stream=None)

@@ -1,0 +1,1 @@
+"""The bridge between torch and Warp: launches, streams, graphs, profiling, checks."""

@@ -1,1 +1,0 @@
-"""What a scene is made of: Gaussians, static and dynamic."""

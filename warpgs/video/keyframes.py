@@ -1,0 +1,185 @@
+"""Camera paths from a JSON file of keyframes.
+
+    {"up": [0, -1, 0], "keyframes": [
+        {"view": "000012", "time": 0.0, "at": 0},
+        {"position": [0.1, 0, -1], "target": [0, 0, 0], "time": 0.5, "focal": 600, "at": 2.5},
+        {"view": "000040", "time": 1.0, "at": 4}]}
+
+Every keyframe has a ``time`` of the scene in [0, 1], and is a ``view`` of the capture, or a ``position`` with a
+``target`` [scene units], or what the viewer saves: a ``viewmat`` with ``K``, ``width`` and ``height``. Pictures have
+the size of the first keyframe, which is the capture's unless it says its own. ``focal`` [px of that size] replaces the
+focal length. ``at`` says where on the path a keyframe comes, in any unit that grows; left out everywhere, keyframes are
+evenly spread. ``up`` is the capture's own where it is left out.
+"""
+
+import dataclasses
+import itertools
+import json
+import reprlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture
+from warpgs.files import read_bounded
+
+from . import camera_paths as paths
+
+POSES = ("view", "position", "viewmat")
+KEYS = {*POSES, "target", "K", "width", "height", "time", "focal", "at"}
+RIGID = 1e-3
+"""How far a rotation times its transpose may be from the identity."""
+
+LARGEST_FILE = 1 << 20
+LARGEST_SIDE = 32768
+LARGEST = 1e9
+"""Of all numbers."""
+
+SHORTEST = 1e-3
+"""Focal length [px]."""
+
+
+def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
+    """So many cameras along the keyframes of a file.
+
+    Raises:
+        ValueError: If the file is missing, damaged, or says something that is no path; the message names it.
+    """
+    values = _load(path)
+    if unknown := sorted(set(values) - {"up", "keyframes"}):
+        raise ValueError(f"{path} has an unknown field {unknown[0]!r}, expected up and keyframes")
+    keyframes = values.get("keyframes")
+    if not isinstance(keyframes, list) or not keyframes:
+        raise ValueError(f"{path} has no list of keyframes")
+    up = _vector(f"{path}: up", values["up"]) if "up" in values else paths.upward(capture)
+    cameras: list[Camera] = []
+    for k, value in enumerate(keyframes):
+        size = cameras[0].size if cameras else None
+        cameras.append(_keyframe(f"{path}: keyframe {k}", value, capture, up, size))
+    places = _places(path, keyframes)
+    at = [places[0] + (places[-1] - places[0]) * share for share in paths.evenly(frames)]
+    return paths.interpolated(cameras, places, at, smooth=True)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    data = read_bounded(path, LARGEST_FILE)
+    try:
+        values = json.loads(data.decode())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected an object with keyframes, got {type(values).__name__}")
+    return values
+
+
+def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[int, int] | None) -> Camera:
+    """The camera of a keyframe, in the size of the first one."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{name} is no object")
+    if unknown := sorted(set(value) - KEYS):
+        raise ValueError(f"{name} has an unknown field {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
+    if sum(pose in value for pose in POSES) != 1 or ("target" in value) != ("position" in value):
+        raise ValueError(f"{name} must have either a view, or a position and a target, or a viewmat")
+    camera = _placed(name, value, capture, up)
+    camera = camera if size is None else _in_size(camera, size)
+    if "focal" in value:
+        focal = _focal(f"{name}: focal", value["focal"])
+        K = camera.K.clone()
+        K[1, 1] *= focal / float(K[0, 0])
+        K[0, 0] = focal
+        camera = dataclasses.replace(camera, K=K)
+    time = _number(f"{name}: time", value.get("time"))
+    if not 0 <= time <= 1:
+        raise ValueError(f"{name}: time must be in [0, 1], got {time}")
+    return dataclasses.replace(camera, time=time)
+
+
+def _placed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Camera:
+    first = capture.cameras[capture.train[0]]
+    if "view" in value:
+        view = value["view"]
+        if not isinstance(view, str) or view not in capture.cameras:
+            raise ValueError(f"{name}: {capture.name} has no view {reprlib.repr(view)}")
+        return capture.cameras[view]
+    if "viewmat" in value:
+        return _saved(name, value, first)
+    position, target = (_vector(f"{name}: {end}", value[end]) for end in ("position", "target"))
+    forward = target - position
+    if float(torch.linalg.cross(forward, up).norm()) <= 1e-4 * float(forward.norm() * up.norm()):
+        raise ValueError(f"{name}: from its position, its target is nowhere, or straight up or down")
+    turned = Camera.looking_at(position, target, up, 1.0, first.size)
+    return Camera(turned.viewmat, first.K, first.width, first.height)
+
+
+def _saved(name: str, value: dict[str, Any], first: Camera) -> Camera:
+    """A camera as the viewer saves it; without intrinsics, it has those of the capture's first."""
+    viewmat = _matrix(f"{name}: viewmat", value["viewmat"], 4)
+    R = viewmat[:3, :3]
+    off = float((R @ R.T - torch.eye(3)).abs().max())
+    if off > RIGID or float(torch.linalg.det(R)) < 0 or viewmat[3].tolist() != [0, 0, 0, 1]:
+        raise ValueError(f"{name}: viewmat is no rotation and translation from the world to a camera")
+    if not {"K", "width", "height"} & value.keys():
+        return Camera(viewmat, first.K, first.width, first.height)
+    if not {"K", "width", "height"} <= value.keys():
+        raise ValueError(f"{name} must have all of K, width and height, or none")
+    K = _matrix(f"{name}: K", value["K"], 3)
+    for axis in range(2):
+        _focal(f"{name}: K", value["K"][axis][axis])
+    if not (K[0, 1] == K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
+        raise ValueError(f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+    width, height = value["width"], value["height"]
+    if any(type(side) is not int or not 0 < side <= LARGEST_SIDE for side in (width, height)):
+        raise ValueError(f"{name}: expected a width and a height of 1 to {LARGEST_SIDE}, got {width!r} and {height!r}")
+    return Camera(viewmat, K, width, height)
+
+
+def _in_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view in a picture of another size, which shows as much from top to bottom."""
+    width, height = size
+    zoom = height / camera.height
+    K = camera.K.clone()
+    K[:2] *= zoom
+    K[0, 2] += (width - camera.width * zoom) / 2
+    return Camera(camera.viewmat, K, width, height, camera.time)
+
+
+def _places(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
+    given = [value["at"] for value in keyframes if "at" in value]
+    if not given:
+        return [float(k) for k in range(len(keyframes))]
+    if len(given) < len(keyframes):
+        raise ValueError(f"{path}: either every keyframe has a field at, or none")
+    places = [_number(f"{path}: at", place) for place in given]
+    if any(b <= a for a, b in itertools.pairwise(places)):
+        raise ValueError(f"{path}: at must grow from keyframe to keyframe, got {places}")
+    return places
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise ValueError(f"{name} must be a number, got {reprlib.repr(value)}")
+    return float(value)
+
+
+def _focal(name: str, value: Any) -> float:
+    """A focal length that is one in single precision, too, and in a picture of any size."""
+    focal = _number(name, value)
+    if focal < SHORTEST:
+        raise ValueError(f"{name} must have a focal length of at least {SHORTEST} px, got {focal}")
+    return focal
+
+
+def _vector(name: str, value: Any) -> Tensor:
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError(f"{name} must be three numbers, got {reprlib.repr(value)}")
+    return torch.tensor([_number(name, v) for v in value])
+
+
+def _matrix(name: str, value: Any, size: int) -> Tensor:
+    if not isinstance(value, list) or len(value) != size or any(type(r) is not list or len(r) != size for r in value):
+        raise ValueError(f"{name} must be {size} rows of {size} numbers")
+    return torch.tensor([[_number(name, v) for v in row] for row in value])
