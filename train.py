@@ -13,7 +13,7 @@ from warpgs.data.check import quick_findings
 from warpgs.errors import is_out_of_memory, one_line, out_of_memory
 from warpgs.runs import run as runs
 from warpgs.training.interrupt import Interrupt
-from warpgs.training.logger import Logbook
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.trainer import Trainer
 
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
@@ -78,9 +78,9 @@ def main(config: TrainConfig) -> int:
     with (
         runs.held(folder),
         Interrupt() as interrupt,
-        Logbook(folder / "events", steps, trainer.iteration) as logbook,
+        TrainingLogger(folder / "events", steps, trainer.iteration) as logger,
     ):
-        finished = trainer.train(logbook, interrupt)
+        finished = trainer.train(logger, interrupt)
     if not finished:
         print(f"stopped after iteration {trainer.iteration} of {steps}; go on with --resume {folder}", file=sys.stderr)
         return 130

@@ -24,7 +24,7 @@ from .blocks import (
     state_types,
     tile_list,
 )
-from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, SMALLEST_ALPHA
+from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, MIN_ALPHA
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -180,7 +180,7 @@ def make_composite_bwd(
                                     behind += background[m * background_stride + c] * v
                             if wp.static(with_depth):
                                 v_depth = read_of(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
-                                v_drawn = v_depth / wp.max(1.0 - T[k], SMALLEST_ALPHA)
+                                v_drawn = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
                                 v_color[k * wp.static(C) + wp.static(num_features)] += v_drawn
                                 behind += v_drawn * depth[m * height * width + pixel]
                             R[k] += T[k] * behind

@@ -6,7 +6,7 @@ Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
     image = Σ_i alpha_i T_i feature_i + T_end background.
 
-Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, SMALLEST_ALPHA).
+Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, MIN_ALPHA).
 
 Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one launch. Each image has lane
 groups of its own, which walk a list of their own: state for one image leaves room for more groups on a multiprocessor,
@@ -33,7 +33,7 @@ from .blocks import (
     state_types,
     tile_list,
 )
-from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, SMALLEST_ALPHA, TRANSMITTANCE_MIN
+from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, MIN_ALPHA, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -227,6 +227,6 @@ def make_composite_fwd(
                                 image[p, c] = value
                             if wp.static(num_features < C):
                                 drawn = color[k * wp.static(C) + wp.static(num_features)]
-                                depth[p] = drawn / wp.max(1.0 - t, SMALLEST_ALPHA)
+                                depth[p] = drawn / wp.max(1.0 - t, MIN_ALPHA)
 
     return composite_fwd

@@ -35,9 +35,9 @@ NEVER_DRAWN = wp.constant(-1.0e30)
 CULLED_DEPTH = wp.constant(0x7F7FFFFF)
 """Sort key of a Gaussian that is not drawn: the bits of the largest float."""
 
-SMALLEST_ALPHA = wp.constant(1.0e-6)
+MIN_ALPHA = wp.constant(1.0e-6)
 """Opacity that depth is at least divided by: keeps it finite where nothing was drawn."""
 
-SMALLEST_INVERSE_DEPTH = wp.constant(1.0e-3)
+MIN_INVERSE_DEPTH = wp.constant(1.0e-3)
 """Aligned monocular depth is unknown from here on to infinity [1 / scene units]: next to zero, an error of its inverse
 would be a vast one of depth."""

@@ -11,7 +11,7 @@ was drawn, and where the target is unknown (NaN fails the comparison) or next to
 import warp as wp
 
 from .absolute import slope_of_abs
-from .constants import SMALLEST_INVERSE_DEPTH
+from .constants import MIN_INVERSE_DEPTH
 
 OPAQUE = wp.constant(0.5)
 """Opacity that a pixel must exceed to have a depth to speak of."""
@@ -29,7 +29,7 @@ def depth_difference(
     """Depth minus target; 0 where there is nothing to compare."""
     result = float(0.0)
     aligned = alignment[0] * inverse_depth[p] + alignment[1]
-    if region[p] != wp.uint8(0) and alpha[p] > OPAQUE and aligned > SMALLEST_INVERSE_DEPTH:
+    if region[p] != wp.uint8(0) and alpha[p] > OPAQUE and aligned > MIN_INVERSE_DEPTH:
         result = depth[p] - 1.0 / aligned
     return result
 

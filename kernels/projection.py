@@ -30,7 +30,7 @@ from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
 mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
 
 LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
-LARGEST_EXTENT = wp.constant(1.0e8)
+MAX_EXTENT = wp.constant(1.0e8)
 """Half extent [px] past which a splat is culled: it must fit an int32, and float32 no longer tells its pixels apart."""
 
 
@@ -130,8 +130,8 @@ def project_fwd(
         and mean2d[0] - radius_x < float(width)
         and mean2d[1] + radius_y > 0.0
         and mean2d[1] - radius_y < float(height)
-        and radius_x < LARGEST_EXTENT
-        and radius_y < LARGEST_EXTENT
+        and radius_x < MAX_EXTENT
+        and radius_y < MAX_EXTENT
     ):
         return
     means2d[i] = mean2d

@@ -32,7 +32,7 @@ DYNAMIC = wp.constant(1 << 30)
 """Bit of an intersection whose Gaussian is dynamic, where there are branches; the others are the Gaussian's index. To
 look the branch up for every intersection would be to read all over memory."""
 
-MOST_WITH_BRANCHES = 1 << 29
+MAX_WITH_BRANCHES = 1 << 29
 """Gaussians that there must be fewer of with branches: a place in a list shares an int with two bits."""
 
 

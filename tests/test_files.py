@@ -1,11 +1,23 @@
 """Files are whole or not there, and none is read that never ends."""
 
 import errno
+import json
 import os
 
+import cv2
+import numpy as np
 import pytest
 
-from warpgs.files import partial_of, read_bounded, remove_numbered, write_text, write_whole
+from warpgs.files import (
+    partial_path,
+    read_bounded,
+    remove_numbered,
+    write_array,
+    write_bytes,
+    write_json,
+    write_png,
+    write_text,
+)
 
 
 @pytest.fixture
@@ -25,7 +37,7 @@ def pressed_ctrl_c(*_):
 
 
 def test_parts_are_written_one_after_the_other(path):
-    assert write_whole(path, [b"ab", b"", b"cde"]) == 5
+    assert write_bytes(path, [b"ab", b"", b"cde"]) == 5
     assert path.read_bytes() == b"abcde"
     assert list(path.parent.iterdir()) == [path]
 
@@ -52,7 +64,7 @@ def test_ctrl_c_leaves_the_old_file_and_nothing_else(path, monkeypatch):
 
 
 def test_files_of_one_stem_are_written_in_different_places(tmp_path):
-    assert partial_of(tmp_path / "a.png") != partial_of(tmp_path / "a.mp4")
+    assert partial_path(tmp_path / "a.png") != partial_path(tmp_path / "a.mp4")
 
 
 def test_a_file_below_a_file_is_named(path):
@@ -62,15 +74,15 @@ def test_a_file_below_a_file_is_named(path):
 
 def test_a_file_is_read_up_to_its_limit(path):
     assert read_bounded(path, 3) == b"old"
-    with pytest.raises(ValueError, match=rf"{path} has 3 bytes, more than the 2 that"):
+    with pytest.raises(ValueError, match=rf"{path} has 3 bytes, more than the maximum of 2"):
         read_bounded(path, 2)
 
 
 @pytest.mark.parametrize("kind", ["folder", "missing", "device"])
-def test_what_is_no_file_is_not_read(tmp_path, kind):
+def test_only_regular_files_are_read(tmp_path, kind):
     path = {"folder": tmp_path, "missing": tmp_path / "a", "device": tmp_path / "zero"}[kind]
     (tmp_path / "zero").symlink_to("/dev/zero")
-    with pytest.raises(ValueError, match=rf"{path} is no file"):
+    with pytest.raises(ValueError, match=rf"{path} is (not a file|missing)"):
         read_bounded(path, 10)
 
 
@@ -79,3 +91,34 @@ def test_numbered_files_are_removed_up_to_the_first_gap(tmp_path):
         (tmp_path / name).write_text("")
     remove_numbered(tmp_path, lambda k: f"{k}.a")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.b", "3.a"]
+
+
+WRITERS = [(write_png, np.zeros((4, 5, 3), np.uint8)), (write_json, {"a": 1}), (write_array, np.zeros(3))]
+
+
+def test_pictures_keep_their_colours_and_depths(tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
+    grey = np.random.default_rng(0).integers(0, 65536, (4, 5), dtype=np.uint16)
+    write_png(tmp_path / "deep/rgb.png", rgb)
+    write_png(tmp_path / "deep/grey.png", grey)
+    assert np.array_equal(cv2.imread(str(tmp_path / "deep/rgb.png"))[..., ::-1], rgb)
+    assert np.array_equal(cv2.imread(str(tmp_path / "deep/grey.png"), cv2.IMREAD_UNCHANGED), grey)
+
+
+def test_arrays_and_json_are_read_back(tmp_path):
+    write_array(tmp_path / "deep/a.npy", np.arange(6.0).reshape(2, 3))
+    write_json(tmp_path / "deep/a.json", {"a": [1, 2.5]})
+    assert np.array_equal(np.load(tmp_path / "deep/a.npy"), np.arange(6.0).reshape(2, 3))
+    assert json.loads((tmp_path / "deep/a.json").read_text()) == {"a": [1, 2.5]}
+
+
+@pytest.mark.parametrize(("write", "values"), WRITERS)
+def test_a_full_disk_is_told_with_the_files_name(write, values, tmp_path):
+    partial_path(tmp_path / "file").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="file could not be written: No space left on device"):
+        write(tmp_path / "file", values)
+
+
+def test_numbers_that_are_not_finite_are_null_in_json(tmp_path):
+    write_json(tmp_path / "a.json", {"a": [float("nan"), 1.0], "b": float("inf")})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": None}

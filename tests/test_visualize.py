@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from warpgs import visualize as pictures
-from warpgs.data.writer import write_png
+from warpgs.files import write_png
 from warpgs.render import Layer, Rendering
 
 H, W = 20, 32
@@ -45,7 +45,7 @@ def test_bytes_of_a_trained_image_need_no_detaching():
 def test_error_is_brighter_where_it_is_larger():
     truth = torch.zeros(H, W, 3)
     image = torch.linspace(0, pictures.ERROR_RANGE, W)[None, :, None].expand(H, W, 3)
-    brightness = pictures.error_picture(image, truth).astype(int).sum(2)
+    brightness = pictures.error_image(image, truth).astype(int).sum(2)
     assert (np.diff(brightness, axis=1)[:, 1:] >= 0).all()
     assert brightness[0, 0] < 20
     assert brightness[0, -1] > 600
@@ -53,12 +53,12 @@ def test_error_is_brighter_where_it_is_larger():
 
 def test_error_is_the_same_both_ways():
     a, b = torch.rand(H, W, 3), torch.rand(H, W, 3)
-    assert (pictures.error_picture(a, b) == pictures.error_picture(b, a)).all()
+    assert (pictures.error_image(a, b) == pictures.error_image(b, a)).all()
 
 
 def test_error_above_its_range_has_the_brightest_colour():
-    most = pictures.error_picture(torch.full((H, W, 3), pictures.ERROR_RANGE), torch.zeros(H, W, 3))
-    assert (pictures.error_picture(torch.ones(H, W, 3), torch.zeros(H, W, 3)) == most).all()
+    most = pictures.error_image(torch.full((H, W, 3), pictures.ERROR_RANGE), torch.zeros(H, W, 3))
+    assert (pictures.error_image(torch.ones(H, W, 3), torch.zeros(H, W, 3)) == most).all()
 
 
 def test_a_comparison_shows_truth_joint_static_dynamic_and_error_in_that_order(rendering):
@@ -66,7 +66,7 @@ def test_a_comparison_shows_truth_joint_static_dynamic_and_error_in_that_order(r
     below = sheet[pictures.CAPTION_HEIGHT :]
     assert below.shape == (H, 5 * W, 3)
     assert [int(below[5, k * W + 5, 0]) for k in range(4)] == [255, 51, 102, 153]
-    error = pictures.error_picture(rendering.joint.image, torch.full((H, W, 3), 1.0))
+    error = pictures.error_image(rendering.joint.image, torch.full((H, W, 3), 1.0))
     assert (below[:, 4 * W :] == error).all()
 
 

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
 from warpgs.training.interrupt import Interrupt
-from warpgs.training.logger import Logbook
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
@@ -79,8 +79,8 @@ def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
 
 
 def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
-    with Logbook(trainer.run / "events", trainer.protocol.num_iterations, trainer.iteration) as logbook:
-        return trainer.train(logbook, interrupt)
+    with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, trainer.iteration) as logger:
+        return trainer.train(logger, interrupt)
 
 
 def finished(folder: Path) -> Path:

@@ -148,7 +148,7 @@ class Schedule:
     """Iterations of stage I between visibility-driven prunings."""
     deform_from: int = 3_000
     """Iteration of stage I from which dynamic Gaussians move."""
-    relight_from: int = 0
+    appearance_from: int = 0
     """Iteration of stage I from which the appearance network changes static Gaussians. In the paper that is stage II;
     by then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
     warmup: int = 1_000
@@ -202,7 +202,7 @@ class TrainConfig:
     vdp: bool = True
     """Visibility-driven pruning."""
     app: bool = True
-    """Appearance network of the static Gaussians, from ``schedule.relight_from`` on."""
+    """Appearance network of the static Gaussians, from ``schedule.appearance_from`` on."""
     stage2: bool = True
     """Joint optimisation; without it, stage I takes its iterations too."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
@@ -302,7 +302,7 @@ MOST = {
 }
 """Largest values of numbers that memory is taken by before anything else bounds it."""
 
-LARGEST = 10**15
+MAX_VALUE = 10**15
 """No number of a config is larger."""
 
 
@@ -332,7 +332,7 @@ def _check_numbers(prefix: str, part: Any) -> None:
         if dataclasses.is_dataclass(value):
             _check_numbers(f"{name}.", value)
         elif isinstance(value, int | float):
-            least, most = LEAST.get(name, 0), MOST.get(name, LARGEST)
+            least, most = LEAST.get(name, 0), MOST.get(name, MAX_VALUE)
             if not value >= least:
                 raise ValueError(f"{name} must be a number of at least {least}, got {value}")
             if value > most:

@@ -1,25 +1,36 @@
-"""Files that are whole or not there, and files that are read only if they are no longer than they may be."""
+"""Reading and writing files: atomic writes, bounded reads, JSON, PNG and .npy; every error names the file."""
 
+import io
+import json
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped, UInt
+
+MAX_JSON = 64 << 20
+"""Size of a JSON file [bytes]; metadata.json of a long capture has a few."""
 
 
-def partial_of(path: Path) -> Path:
-    """Where a file is written before it has its name."""
+def partial_path(path: Path) -> Path:
+    """The temporary path that a file is written to before it is renamed."""
     return path.with_name(path.name + ".partial")
 
 
 @contextmanager
-def beside(path: Path) -> Iterator[Path]:
-    """A place to write a file to, which is moved to ``path`` at the end; after any error, Ctrl-C too, nothing is left.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path to write to, renamed to ``path`` on success; after any error, Ctrl-C too, nothing remains.
 
     Raises:
-        OSError: If it can't be written; the message names ``path``.
+        OSError: If the file cannot be written; the message names ``path``.
     """
-    partial = partial_of(path)
+    partial = partial_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -31,41 +42,107 @@ def beside(path: Path) -> Iterator[Path]:
             partial.unlink()
 
 
-def write_whole(path: Path, parts: Iterable[bytes]) -> int:
-    """Writes parts one after the other; returns their size [bytes].
+def write_bytes(path: Path, parts: Iterable[bytes]) -> int:
+    """Writes the concatenation of ``parts``; returns the size of the file [bytes].
 
     Raises:
-        OSError: If the file can't be written; the message names it.
+        OSError: If the file cannot be written; the message names it.
     """
-    with beside(path) as partial, open(partial, "wb") as file:
+    with atomic_path(path) as partial, open(partial, "wb") as file:
         return sum(file.write(part) for part in parts)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text.
+    """Writes a text as UTF-8.
 
     Raises:
-        OSError: If the file can't be written; the message names it.
+        OSError: If the file cannot be written; the message names it.
     """
-    write_whole(path, [text.encode()])
+    write_bytes(path, [text.encode()])
 
 
-def read_bounded(path: Path, most: int) -> bytes:
-    """All of a file that is no longer than ``most`` bytes.
+def write_json(path: Path, values: Any) -> None:
+    """Writes values as JSON; numbers that are not finite become null, which every reader understands.
 
     Raises:
-        ValueError: If it is no file (a device would never end), or longer; the message names it.
+        OSError: If the file cannot be written; the message names it.
     """
-    if not path.is_file():
-        raise ValueError(f"{path} is no file")
-    size = path.stat().st_size
-    if size > most:
-        raise ValueError(f"{path} has {size:,} bytes, more than the {most:,} that this program reads")
-    return path.read_bytes()
+    write_text(path, json.dumps(_finite(values), indent=2, default=str) + "\n")
+
+
+def _finite(values: Any) -> Any:
+    if isinstance(values, float):
+        return values if math.isfinite(values) else None
+    if isinstance(values, dict):
+        return {key: _finite(value) for key, value in values.items()}
+    return [_finite(value) for value in values] if isinstance(values, list | tuple) else values
+
+
+def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W 3"]) -> None:
+    """Writes a greyscale or RGB image of 8 or 16 bits.
+
+    Raises:
+        OSError: If the file cannot be written; the message names it.
+    """
+    encoded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not encoded:
+        raise OSError(f"{path} could not be encoded")
+    write_bytes(path, [data.tobytes()])
+
+
+def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
+    """Writes an array as .npy.
+
+    Raises:
+        OSError: If the file cannot be written; the message names it.
+    """
+    data = io.BytesIO()  # numpy's own writing to a file loses the reason of a failure
+    np.save(data, values)
+    write_bytes(path, [data.getvalue()])
+
+
+def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
+    """The content of a regular file of at most ``max_bytes``.
+
+    Args:
+        path: The file.
+        max_bytes: Its largest size.
+        hint: Why the file is needed, for the message when it is missing.
+
+    Raises:
+        ValueError: If it is missing, not a regular file (a device would never end) or larger; the message names it.
+    """
+    try:
+        if not path.exists():
+            raise ValueError(f"{path} is missing{': ' + hint if hint else ''}")
+        if not path.is_file():
+            raise ValueError(f"{path} is not a file")
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise ValueError(f"{path} has {size:,} bytes, more than the maximum of {max_bytes:,}")
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        ValueError: If the file is missing or too large, is not JSON, or holds something other than an object.
+    """
+    data = read_bounded(path, max_bytes, hint)
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
+    return value
 
 
 def remove_numbered(folder: Path, name: Callable[[int], str]) -> None:
-    """Removes the files that are called ``name(0)``, ``name(1)`` … up to the first that is not there."""
+    """Removes the files ``name(0)``, ``name(1)`` … up to the first that does not exist."""
     for k in count():
         path = folder / name(k)
         if not path.is_file():

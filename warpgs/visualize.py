@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .files import beside, partial_of
+from .files import atomic_path, partial_path
 from .render import Rendering
 
 ERROR_RANGE = 0.25
@@ -34,7 +34,7 @@ def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
-def error_picture(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+def error_image(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
     """Mean absolute error in colours, dark where there is none."""
     error = (image - truth).abs().mean(-1).div(ERROR_RANGE)
     level = (error.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
@@ -50,7 +50,7 @@ def comparison(truth: Float[Tensor, "H W 3"], rendering: Rendering) -> UInt8[np.
         "joint": to_bytes(rendering.joint.image),
         "static": to_bytes(rendering.static.image),
         "dynamic": to_bytes(rendering.dynamic.image),
-        f"error (0 to {ERROR_RANGE})": error_picture(rendering.joint.image.clamp(0, 1), truth),
+        f"error (0 to {ERROR_RANGE})": error_image(rendering.joint.image.clamp(0, 1), truth),
     }
     return np.concatenate([_captioned(name, picture) for name, picture in pictures.items()], axis=1)
 
@@ -99,13 +99,13 @@ class Video:
         if self._file is None:
             return
         if error is None:
-            with self._named(), beside(self.path):
+            with self._named(), atomic_path(self.path):
                 self._file.mux(self._stream.encode(None))
                 self._file.close()
         else:
             with suppress(_ffmpeg().FFmpegError):
                 self._file.close()
-            partial_of(self.path).unlink(missing_ok=True)
+            partial_path(self.path).unlink(missing_ok=True)
 
     def _open(self, width: int, height: int) -> None:
         av = _ffmpeg()
@@ -115,7 +115,7 @@ class Video:
             raise OSError(f"{self.path} could not be written: Is a directory")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         # The index goes first, so that a browser plays a file while it is loading.
-        self._file = av.open(str(partial_of(self.path)), "w", format="mp4", options={"movflags": "faststart"})
+        self._file = av.open(str(partial_path(self.path)), "w", format="mp4", options={"movflags": "faststart"})
         self._stream = self._file.add_stream(CODEC, Fraction(self.rate).limit_denominator(1000))
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         self._stream.options = {"crf": str(VIDEO_LOSS)}

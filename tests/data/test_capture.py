@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import SMALLEST_EXTENT, Capture, Frame
+from warpgs.data.capture import MIN_EXTENT, Capture, Frame
 
 
 def camera(x: float) -> Camera:
@@ -53,7 +53,7 @@ def test_the_extent_is_a_tenth_more_than_the_radius_of_the_training_cameras():
 
 
 def test_a_camera_that_stands_still_has_the_smallest_extent():
-    assert capture(xs=(3.0,))[0].extent == SMALLEST_EXTENT
+    assert capture(xs=(3.0,))[0].extent == MIN_EXTENT
 
 
 def test_a_capture_without_training_frames_is_refused():

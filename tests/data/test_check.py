@@ -13,7 +13,7 @@ from tests.data import captures
 from tests.data.captures import edit_json, write_array
 from tests.prepare import filmed
 from warpgs.data.check import check_capture, quick_findings
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
 
 

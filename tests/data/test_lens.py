@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from warpgs.data.lens import Lens, filling_zoom, pinhole_matrix, straighten
+from warpgs.data.lens import Lens, filling_zoom, pinhole_matrix, undistort
 
 PINHOLE = Lens(160, 120, (140.0, 150.0), (83.0, 57.0))
 PINCUSHION = dataclasses.replace(PINHOLE, radial=(0.25, -0.05, 0.01), tangential=(0.01, -0.02))
@@ -39,7 +39,7 @@ def grid(x, y):
 
 @BENT
 def test_a_grid_seen_through_the_distortion_gets_straight(lens):
-    straight = straighten(taken_by(lens, grid), lens).astype(int)
+    straight = undistort(taken_by(lens, grid), lens).astype(int)
     truth = seen_by_pinhole(lens, grid).astype(int)
     bent = taken_by(lens, grid).astype(int)
     assert np.abs(straight - truth)[2:-2, 2:-2].max() <= 12  # interpolation of 8-bit values; half a pixel would be 45
@@ -65,16 +65,16 @@ def test_no_pixel_of_the_straight_picture_lies_outside_the_lens_picture(lens):
 
 def test_a_pinhole_is_left_as_it_is():
     picture = taken_by(PINHOLE, grid)
-    assert straighten(picture, PINHOLE) is picture
+    assert undistort(picture, PINHOLE) is picture
     assert pinhole_matrix(PINHOLE).tolist() == [[140, 0, 83], [0, 150, 57], [0, 0, 1]]
 
 
 def test_masks_and_depth_get_no_new_values():
     mask = seen_by_pinhole(PINHOLE, lambda x, y: x + y > 0.1)
     depth = np.where(mask, np.float32(np.nan), np.float32(2.0))
-    straight = straighten(depth, BARREL)
-    assert straighten(mask, BARREL).dtype == bool
-    assert np.array_equal(np.isnan(straight), straighten(mask, BARREL))
+    straight = undistort(depth, BARREL)
+    assert undistort(mask, BARREL).dtype == bool
+    assert np.array_equal(np.isnan(straight), undistort(mask, BARREL))
     assert set(np.unique(straight[~np.isnan(straight)])) == {2.0}
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.data.captures import edit_json, write_array, write_capture, write_json
 from warpgs.config import MaskPerturbation
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 
 
 @pytest.fixture

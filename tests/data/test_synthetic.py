@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from warpgs.data import synthetic
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, picture
 
 SMALL = BuiltinScene(width=48, height=28, num_frames=4, num_samples=2, num_points=200)

@@ -21,7 +21,7 @@ from tests.data.captures import write_png
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips

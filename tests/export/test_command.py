@@ -11,7 +11,7 @@ from tests import tiny
 from tests.export import scenes
 from tests.export.pages import read_page
 from warpgs.cli import main
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.export import command as command_module
 from warpgs.export import opening, page
 from warpgs.export.command import Export, export_run
@@ -127,7 +127,7 @@ def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
 
 
 def test_a_page_of_too_many_gaussians_is_refused_before_anything_is_baked(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(page, "MOST_GAUSSIANS", 3)
+    monkeypatch.setattr(page, "MAX_GAUSSIANS", 3)
     monkeypatch.setattr(command_module, "bake", lambda *_: pytest.fail("baked"))
     monkeypatch.setattr(command_module, "find_capture", lambda *_: pytest.fail("opened"))
     with pytest.raises(ValueError, match="a page holds at most 3 static Gaussians"):
@@ -176,7 +176,7 @@ def test_ply_files_need_no_capture(stranded, tmp_path):
 def test_a_page_without_a_capture_begins_at_a_guess_that_sees_the_scene(stranded, tmp_path):
     assert "the cameras are guessed, because the capture is not at hand" in export(stranded, tmp_path, format="html")
     moments = Moments.of_run(stranded)
-    camera = paths.guessed(paths.Ball.around(moments.scene.static.means.detach()))
+    camera = paths.default_camera(paths.Ball.around(moments.scene.static.means.detach()))
     inside = camera.project(moments.scene.static.means.detach())[3]
     assert inside.float().mean() > 0.7
 

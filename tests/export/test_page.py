@@ -13,7 +13,7 @@ from warpgs.export import page
 from warpgs.export.baking import bake, baked_bytes
 from warpgs.export.page import Start, write_page
 from warpgs.model.gaussians import SH_C0
-from warpgs.video.camera_paths import evenly
+from warpgs.video.camera_paths import evenly_spaced
 
 KEYS = 9
 
@@ -32,7 +32,7 @@ def moments():
 
 @pytest.fixture(scope="module")
 def baked(moments):
-    return bake(moments.at, evenly(KEYS))
+    return bake(moments.at, evenly_spaced(KEYS))
 
 
 @pytest.fixture
@@ -53,14 +53,14 @@ def test_between_key_times_the_image_comes_closer_with_more_of_them(moments):
     truths = {time: scenes.image(moments.at(time)) for time in (0.38, 0.71)}
     quality = []
     for keys in (2, 5, 17):
-        coarse = bake(moments.at, evenly(keys))
+        coarse = bake(moments.at, evenly_spaced(keys))
         quality.append(np.mean([scenes.psnr(scenes.image(coarse.at(t)), truth) for t, truth in truths.items()]))
     assert quality[0] + 3 < quality[1] < quality[2] - 3
 
 
 @pytest.mark.parametrize("keys", [1, 2])
 def test_a_scene_of_few_key_times_is_shown_at_every_time(moments, keys):
-    few = bake(moments.at, evenly(keys))
+    few = bake(moments.at, evenly_spaced(keys))
     for time in (0.0, 0.5, 1.0):
         assert len(few.at(time)) == 60
     assert scenes.psnr(scenes.image(few.at(0.0)), scenes.image(moments.at(0.0))) > 50
@@ -68,7 +68,7 @@ def test_a_scene_of_few_key_times_is_shown_at_every_time(moments, keys):
 
 @pytest.mark.parametrize(("static", "dynamic"), [(0, 20), (40, 0), (0, 0)])
 def test_a_branch_without_gaussians_is_kept_empty(path, static, dynamic):
-    baked = bake(scenes.moments(static, dynamic).at, evenly(3))
+    baked = bake(scenes.moments(static, dynamic).at, evenly_spaced(3))
     write_page(path, baked, start())
     back = read_page(path)
     assert [len(back.static), len(back.dynamic)] == [static, dynamic]
@@ -81,7 +81,7 @@ def test_a_gaussian_that_is_not_finite_at_one_time_is_left_out_of_all(moments):
         cloud.means[[3, 50], 0] = np.nan if time == 0.5 else 0.0
         return cloud
 
-    broken = bake(at, evenly(3))
+    broken = bake(at, evenly_spaced(3))
     assert [len(broken.static), len(broken.dynamic)] == [39, 19]
     assert broken.at(0.5).finite.all()
 
@@ -92,7 +92,7 @@ def test_a_gaussian_without_thickness_does_not_coarsen_the_others(moments):
         cloud.log_scales[0, 0] = -46.0
         return cloud
 
-    kept = bake(at, evenly(2)).at(0.0)
+    kept = bake(at, evenly_spaced(2)).at(0.0)
     assert np.abs(kept.log_scales[1:40] - moments.at(0.0).log_scales[1:40]).max() < 16 / 1023
 
 
@@ -102,7 +102,7 @@ def test_a_mean_far_away_leaves_the_others_within_a_thousandth_of_a_pixel(moment
         cloud.means[0] = 1000.0
         return cloud
 
-    kept = bake(at, evenly(2)).at(0.0)
+    kept = bake(at, evenly_spaced(2)).at(0.0)
     assert np.abs(kept.means[1:40] - moments.at(0.0).means[1:40]).max() < 1001 / 2**21
 
 
@@ -113,7 +113,7 @@ def test_a_colour_far_from_any_other_does_not_coarsen_them(moments, value):
         cloud.sh[[0, -1]] = value
         return cloud
 
-    kept = bake(at, evenly(2)).at(0.0)
+    kept = bake(at, evenly_spaced(2)).at(0.0)
     for rows in (slice(1, 40), slice(40, 59)):
         errors = np.abs(kept.sh[rows] - moments.at(0.0).sh[rows])
         assert errors[:, 0].max() < 0.51 * 3 / 255 / SH_C0
@@ -179,6 +179,6 @@ def test_too_many_key_times_are_refused(path, baked):
 
 
 def test_too_many_gaussians_are_refused(path, baked, monkeypatch):
-    monkeypatch.setattr(page, "MOST_GAUSSIANS", 39)
+    monkeypatch.setattr(page, "MAX_GAUSSIANS", 39)
     with pytest.raises(ValueError, match="at most 39 static Gaussians, got 40"):
         write_page(path, baked, start())

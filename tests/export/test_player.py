@@ -12,7 +12,7 @@ from warpgs import visualize as pictures
 from warpgs.cameras import Camera
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
-from warpgs.video.camera_paths import evenly
+from warpgs.video.camera_paths import evenly_spaced
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium here")
 
@@ -28,7 +28,7 @@ def moments():
 
 @pytest.fixture(scope="module")
 def baked(moments):
-    return bake(moments.at, evenly(5))
+    return bake(moments.at, evenly_spaced(5))
 
 
 @pytest.fixture(scope="module")

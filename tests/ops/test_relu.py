@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.scenes import generator
-from warpgs.ops.relu import MOST_CHUNKS, ROWS_PER_CHUNK, num_sums, relu_backward
+from warpgs.ops.relu import MAX_CHUNKS, ROWS_PER_CHUNK, num_sums, relu_backward
 
 
 def random_half(*shape, seed=0):
@@ -20,7 +20,7 @@ def relu_of(x):
 
 
 @pytest.mark.parametrize(
-    ("num", "columns", "beside"), [(1, 8, 0), (37, 16, 24), (MOST_CHUNKS * ROWS_PER_CHUNK + 3, 8, 0)]
+    ("num", "columns", "beside"), [(1, 8, 0), (37, 16, 24), (MAX_CHUNKS * ROWS_PER_CHUNK + 3, 8, 0)]
 )
 def test_gradients_pass_where_features_are_positive_and_are_added_up(num, columns, beside):
     features = random_half(num, columns + beside)

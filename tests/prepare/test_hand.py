@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.prepare.options import Options
 from warpgs.prepare.pipeline import Preparation
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.prepare import filmed
-from warpgs.prepare.dense import Flows, Footage, Sighting, filled, triangulate
+from warpgs.prepare.dense import Flows, Observation, PosedFrames, filled, triangulate
 from warpgs.prepare.depth import static_depth, write_depth
 from warpgs.prepare.motion_masks import find_moving, lift, outline, tidy, vote
 
@@ -16,7 +16,7 @@ def film():
 
 @pytest.fixture(scope="module")
 def footage(film):
-    return Footage(lift(film[0]), filmed.lens(), filmed.poses(24), filmed.points())
+    return PosedFrames(lift(film[0]), filmed.lens(), filmed.poses(24), filmed.points())
 
 
 def wall_depth(frame: int, row: int, column: int) -> float:
@@ -27,30 +27,30 @@ def wall_depth(frame: int, row: int, column: int) -> float:
     return float((6.0 - center[2]) / direction[2])
 
 
-def sighting(rho: float, rotation: np.ndarray, shift: np.ndarray) -> Sighting:
+def observation(rho: float, rotation: np.ndarray, shift: np.ndarray) -> Observation:
     ray = np.array([0.1, -0.2, 1.0], np.float32)
     turned = (rotation @ ray).astype(np.float32)
     seen = turned + rho * shift
     place = np.broadcast_to((seen[:2] / seen[2])[:, None, None], (2, 1, 1)).astype(np.float32)
-    return Sighting(place, turned[:, None, None], shift.astype(np.float32), np.ones((1, 1), bool))
+    return Observation(place, turned[:, None, None], shift.astype(np.float32), np.ones((1, 1), bool))
 
 
 def test_depth_is_solved_exactly_from_exact_places():
     shifts = [np.array([0.3, 0.0, 0.1]), np.array([-0.2, 0.1, 0.0])]
-    found = triangulate([sighting(0.4, np.eye(3), shift) for shift in shifts], 200.0)
+    found = triangulate([observation(0.4, np.eye(3), shift) for shift in shifts], 200.0)
     assert found.inverse_depth.item() == pytest.approx(0.4, rel=1e-3)
     assert found.residual.item() < 1e-2
 
 
 def test_one_wrong_place_among_many_is_outvoted():
     shifts = [np.array([0.3, 0.0, 0.0]), np.array([-0.3, 0.0, 0.0]), np.array([0.0, 0.3, 0.0]), np.array([0.2, 0.2, 0])]
-    wrong = sighting(3.0, np.eye(3), np.array([0.25, 0.0, 0.0]))
-    found = triangulate([*(sighting(0.4, np.eye(3), shift) for shift in shifts), wrong], 200.0)
+    wrong = observation(3.0, np.eye(3), np.array([0.25, 0.0, 0.0]))
+    found = triangulate([*(observation(0.4, np.eye(3), shift) for shift in shifts), wrong], 200.0)
     assert found.inverse_depth.item() == pytest.approx(0.4, rel=0.05)
 
 
 def test_a_pixel_that_one_frame_sees_has_no_depth():
-    found = triangulate([sighting(0.4, np.eye(3), np.array([0.3, 0.0, 0.0]))], 200.0)
+    found = triangulate([observation(0.4, np.eye(3), np.array([0.3, 0.0, 0.0]))], 200.0)
     assert np.isnan(found.inverse_depth).all()
 
 
@@ -87,7 +87,7 @@ def test_the_board_that_moves_is_masked(film, footage):
 
 def test_nothing_is_masked_where_nothing_moves():
     images, _ = filmed.film(16, moves=False)
-    found = find_moving(lift(images), Footage(lift(images), filmed.lens(), filmed.poses(16), filmed.points()))
+    found = find_moving(lift(images), PosedFrames(lift(images), filmed.lens(), filmed.poses(16), filmed.points()))
     assert np.mean(found) < 0.02
 
 

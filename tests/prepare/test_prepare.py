@@ -13,8 +13,8 @@ import pytest
 
 from tests.prepare import filmed
 from warpgs.data.check import check_capture
-from warpgs.data.lens import straighten
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.lens import undistort
+from warpgs.data.loaders import load_capture
 from warpgs.prepare.frames import Selection
 from warpgs.prepare.given_masks import read_moving
 from warpgs.prepare.options import Options
@@ -161,7 +161,7 @@ def test_masks_drawn_over_straight_pictures_are_not_straightened_again(ending, s
 
     monkeypatch.setattr("warpgs.prepare.pipeline.recover_cameras", recover)
     mask = filmed.film(24)[1][10]
-    for kind, expected in (("shot{:03d}", straighten(mask, bent)), ("frame_{:06d}", mask)):
+    for kind, expected in (("shot{:03d}", undistort(mask, bent)), ("frame_{:06d}", mask)):
         folder = tmp_path / kind[:4]
         folder.mkdir()
         for k in range(24):
@@ -169,7 +169,7 @@ def test_masks_drawn_over_straight_pictures_are_not_straightened_again(ending, s
         prepare(shots, tmp_path / kind[:3], masks=str(folder), depth="none")
         capture = load_capture(tmp_path / kind[:3])
         assert np.array_equal(~capture.frame("frame_000010").static_mask.numpy(), expected)
-    assert (mask != straighten(mask, bent)).sum() > 100
+    assert (mask != undistort(mask, bent)).sum() > 100
 
 
 def test_masks_of_another_shape_are_refused_by_name_and_smaller_ones_are_enlarged(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from tests.prepare import filmed
 from warpgs.data.lens import Lens
 from warpgs.data.loaders.nerfies import load_capture, recognise
-from warpgs.prepare.scene import resized_lens, scene_units, static_points, straight_lens
+from warpgs.prepare.scene import pinhole_lens, resized_lens, scene_units, static_points
 from warpgs.prepare.sfm import Cameras
 
 
@@ -63,10 +63,10 @@ def test_strays_do_not_shrink_the_scene():
 
 def test_a_straight_lens_stays_and_a_bent_one_zooms_in():
     lens = Lens(64, 48, (50.0, 50.0), (32.0, 24.0))
-    assert straight_lens(lens) == lens
+    assert pinhole_lens(lens) == lens
     bent = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
-    assert straight_lens(bent).focal[0] >= 50.0
-    assert straight_lens(bent).is_straight
+    assert pinhole_lens(bent).focal[0] >= 50.0
+    assert pinhole_lens(bent).is_pinhole
 
 
 def test_a_resized_lens_sees_the_same():

@@ -15,8 +15,8 @@ import pytest
 from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
 from warpgs.config import PRESETS
-from warpgs.data.loaders.nerfies import load_capture
-from warpgs.report.charts import HEIGHT, MOST_POINTS, WIDTH, Series, chart
+from warpgs.data.loaders import load_capture
+from warpgs.report.charts import HEIGHT, MAX_POINTS, WIDTH, Series, chart
 from warpgs.report.command import Report, extremes
 from warpgs.report.figures import config_rows, in_words
 from warpgs.report.record import read_records
@@ -316,13 +316,13 @@ def points_of(drawn):
         [(0.0, 1.0)],
         [(0.0, 0.0), (5.0, 0.0)],
         [(3.0, -1e-9), (3.0, 1e9)],
-        [(float(k), float(k % 7)) for k in range(5 * MOST_POINTS + 3)],
+        [(float(k), float(k % 7)) for k in range(5 * MAX_POINTS + 3)],
     ],
 )
 def test_a_curve_is_inside_its_chart(points):
     for curve in points_of(chart("c", "x", [Series("s", "red", points)])):
         assert all(0 <= x <= WIDTH and 0 <= y <= HEIGHT for x, y in curve)
-        assert len(curve) <= MOST_POINTS
+        assert len(curve) <= MAX_POINTS
 
 
 def test_higher_values_are_drawn_higher():

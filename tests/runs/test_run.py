@@ -10,7 +10,7 @@ import torch
 from tests import tiny
 from warpgs.runs import checkpoint, run as runs
 from warpgs.config import PRESETS, MaskPerturbation, TrainConfig, scaled
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 
 UNUSUAL = dataclasses.replace(
     tiny.CONFIG,

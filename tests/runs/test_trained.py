@@ -7,7 +7,7 @@ import torch
 
 from tests.export import scenes
 from warpgs.runs import trained as playback
-from warpgs.runs.trained import MOST_RECORDINGS, Player
+from warpgs.runs.trained import MAX_RECORDINGS, Player
 
 
 @pytest.fixture
@@ -53,10 +53,10 @@ def test_each_size_is_recorded_once(player, recorded):
 
 
 def test_the_oldest_of_many_recordings_goes(player, recorded):
-    sizes = [(32 + 2 * k, 24) for k in range(MOST_RECORDINGS + 1)]
+    sizes = [(32 + 2 * k, 24) for k in range(MAX_RECORDINGS + 1)]
     for size in sizes:
         player.play(scenes.camera(*size))
-    assert [player.is_recorded(size) for size in sizes] == [False] + [True] * MOST_RECORDINGS
+    assert [player.is_recorded(size) for size in sizes] == [False] + [True] * MAX_RECORDINGS
 
 
 def test_on_the_cpu_nothing_is_recorded(player):

@@ -90,8 +90,8 @@ def test_without_gradients_too(recordings):
 
 def test_what_is_in_use_is_not_replayed(recordings):
     warm_up()
-    drawn = [draw(seed) for seed in range(replay.MOST_RECORDINGS + 2)]
-    assert len(recordings) == replay.MOST_RECORDINGS
+    drawn = [draw(seed) for seed in range(replay.MAX_RECORDINGS + 2)]
+    assert len(recordings) == replay.MAX_RECORDINGS
     kept = [[image.clone() for image in images] for _, _, images in drawn]
     values = [everything(d) for d in drawn]
     for images, (_, _, still) in zip(kept, drawn, strict=True):
@@ -152,15 +152,15 @@ def sizes_drawn(sizes):
 def test_kinds_and_recordings_that_are_called_are_kept(recordings):
     often = (40, 30)
     sizes_drawn([often] * (replay.PLAIN_CALLS + 2))
-    others = [(20 + k, 10) for k in range(2 * replay.MOST_KINDS)]
+    others = [(20 + k, 10) for k in range(2 * replay.MAX_KEYS)]
     for other in others:
         sizes_drawn([other, often])
-    assert [kind.recordings for kind in replay._kinds.values()] == [0] * (replay.MOST_KINDS - 1) + [1]
+    assert [kind.recordings for kind in replay._kinds.values()] == [0] * (replay.MAX_KEYS - 1) + [1]
     made = len(recordings)
-    for other in others[: replay.MOST_RECORDINGS + 1]:
+    for other in others[: replay.MAX_RECORDINGS + 1]:
         sizes_drawn([*[other] * (replay.PLAIN_CALLS + 2), often])
     sizes_drawn([often])
-    assert len(recordings) == made + 2 * (replay.MOST_RECORDINGS + 1)
+    assert len(recordings) == made + 2 * (replay.MAX_RECORDINGS + 1)
 
 
 @pytest.mark.parametrize("num_before", [0, replay.PLAIN_CALLS])
@@ -235,12 +235,12 @@ def test_other_shapes_and_settings_have_recordings_of_their_own(recordings):
 
 
 def test_so_many_recordings_are_kept_and_no_more(recordings):
-    for num in range(20, 20 + 2 * replay.MOST_RECORDINGS):
+    for num in range(20, 20 + 2 * replay.MAX_RECORDINGS):
         for _ in range(replay.PLAIN_CALLS + 2):
             splats = as_leaves(make_splats(num))
             render(splats, make_camera()).joint.image.sum().backward()
         kept = [len(kind.idle) for kind in replay._kinds.values()]
-        assert sum(kept) == sum(kind.recordings for kind in replay._kinds.values()) <= replay.MOST_RECORDINGS
+        assert sum(kept) == sum(kind.recordings for kind in replay._kinds.values()) <= replay.MAX_RECORDINGS
         assert kept[-1] == 1
 
 
@@ -257,16 +257,16 @@ def test_only_the_main_thread_outside_of_inference_mode_replays(monkeypatch):
 
 
 def test_large_work_is_not_replayed(recordings, monkeypatch):
-    monkeypatch.setattr(replay, "LARGEST", 1000)
+    monkeypatch.setattr(replay, "MAX_VALUE", 1000)
     for _ in range(2):
         warm_up()
     assert not recordings
 
 
 def test_only_so_many_kinds_of_calls_are_remembered(recordings):
-    for width in range(1, replay.MOST_KINDS + 10):
+    for width in range(1, replay.MAX_KEYS + 10):
         render(make_splats(3), make_camera(width, 8))
-    assert len(replay._kinds) == replay.MOST_KINDS
+    assert len(replay._kinds) == replay.MAX_KEYS
 
 
 def test_replaying_can_be_switched_off(recordings):

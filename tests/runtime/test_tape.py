@@ -41,7 +41,7 @@ def picture(seed: int) -> list[torch.Tensor]:
 @pytest.fixture
 def shared_out(monkeypatch):
     """Small launches go to all cores, too."""
-    monkeypatch.setattr(tape, "SMALLEST_SHARD", 1)
+    monkeypatch.setattr(tape, "MIN_SHARD", 1)
 
 
 def test_threads_that_render_at_once_draw_what_they_draw_alone(shared_out):

@@ -3,8 +3,8 @@
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from warpgs.training import logger as logbook
-from warpgs.training.logger import Logbook, Status
+from warpgs.training import logger as logger
+from warpgs.training.logger import Status, TrainingLogger
 
 TERMS = {"static": 0.25, "depth": 0.5}
 
@@ -18,7 +18,7 @@ def status(iteration, **changes):
 def clock(monkeypatch):
     """Seconds, to be set."""
     now = [1000.0]
-    monkeypatch.setattr(logbook.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(logger.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -29,7 +29,7 @@ def events(folder):
 
 
 def test_a_look_is_one_line(tmp_path, capsys):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         book.show(status(50))
     said = capsys.readouterr().out
     assert said.count("\n") == 1
@@ -38,7 +38,7 @@ def test_a_look_is_one_line(tmp_path, capsys):
 
 
 def test_speed_and_time_left_are_of_the_iterations_since_the_last_look(tmp_path, capsys, clock):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         clock[0] += 100.0
         book.show(status(100))
         clock[0] += 20.0
@@ -49,7 +49,7 @@ def test_speed_and_time_left_are_of_the_iterations_since_the_last_look(tmp_path,
 
 
 def test_speed_of_a_resumed_run_counts_its_own_iterations(tmp_path, capsys, clock):
-    with Logbook(tmp_path, 500, 400) as book:
+    with TrainingLogger(tmp_path, 500, 400) as book:
         clock[0] += 5.0
         book.show(status(450))
         clock[0] += 20.0
@@ -60,35 +60,35 @@ def test_speed_of_a_resumed_run_counts_its_own_iterations(tmp_path, capsys, cloc
 
 
 def test_lines_are_seconds_apart(tmp_path, capsys, clock):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         for iteration in range(10, 70, 10):
             book.show(status(iteration))
-            clock[0] += logbook.LINE_EVERY / 4
+            clock[0] += logger.LINE_EVERY / 4
     assert [line.split("/")[0] for line in capsys.readouterr().out.splitlines()] == ["10", "60"]
 
 
 def test_the_last_iteration_has_a_line_however_soon_it_comes(tmp_path, capsys, clock):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         book.show(status(499))
         book.show(status(500))
     assert capsys.readouterr().out.splitlines()[-1].startswith("500/500")
 
 
 def test_two_looks_at_one_moment_have_a_speed(tmp_path, capsys, clock):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         book.show(status(500))
     assert "it/s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["[bold]plain[/bold]", "path/[1]/x", "x" * 500])
 def test_what_is_said_is_printed_as_it_is_on_one_line(tmp_path, capsys, text):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         book.say(text)
     assert capsys.readouterr().out == f"{text}\n"
 
 
 def test_events_hold_every_look(tmp_path, clock):
-    with Logbook(tmp_path, 500, 0) as book:
+    with TrainingLogger(tmp_path, 500, 0) as book:
         for iteration in (50, 100):
             clock[0] += 5.0
             book.show(status(iteration, psnr=iteration / 10))
@@ -105,7 +105,7 @@ def test_events_hold_every_look(tmp_path, clock):
 
 def test_events_are_written_when_training_fails(tmp_path):
     def fail():
-        with Logbook(tmp_path, 500, 0) as book:
+        with TrainingLogger(tmp_path, 500, 0) as book:
             book.show(status(50))
             raise ValueError("wrong")
 
@@ -117,7 +117,7 @@ def test_events_are_written_when_training_fails(tmp_path):
 def test_in_a_terminal_there_is_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "200")
-    with Logbook(tmp_path, 500, 100) as book:
+    with TrainingLogger(tmp_path, 500, 100) as book:
         book.show(status(150))
         book.say("a word above the bar")
     said = capsys.readouterr().out

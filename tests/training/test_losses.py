@@ -234,7 +234,7 @@ LOSS = LossConfig(
     depth_end=2.0,  # no decay
 )
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
-SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, relight_from=100)
+SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, appearance_from=100)
 STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
 """The first iteration of each."""
 

@@ -17,7 +17,7 @@ SHORT = Schedule(
     reset_every=20,
     prune_every=30,
     deform_from=25,
-    relight_from=35,
+    appearance_from=35,
     noise_until=40,
     sh_degree_every=12,
 )
@@ -102,7 +102,7 @@ def test_static_gaussians_are_relit_from_their_iteration_of_stage_1_on():
 
 
 def test_static_gaussians_are_relit_in_stage_2_in_any_case():
-    assert iterations_where("relit", schedule={"relight_from": 1000}) == list(range(STAGE2, END))
+    assert iterations_where("relit", schedule={"appearance_from": 1000}) == list(range(STAGE2, END))
 
 
 def test_without_the_appearance_network_stage_2_is_joint_all_the_same():
@@ -182,7 +182,7 @@ def test_a_network_progresses_from_its_first_iteration_to_the_end(name, first):
     assert network_progress(name) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("name", "start"), [("deformation", "deform_from"), ("appearance", "relight_from")])
+@pytest.mark.parametrize(("name", "start"), [("deformation", "deform_from"), ("appearance", "appearance_from")])
 def test_a_network_that_waits_for_stage_2_progresses_from_there(name, start):
     expected = [0.0] * STAGE2 + [k / (END - STAGE2) for k in range(END - STAGE2)]
     assert network_progress(name, **{start: 1000}) == pytest.approx(expected)
@@ -281,7 +281,7 @@ def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule():
     assert after == {name: value // 10 for name, value in before.items()}
 
 
-@pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "relight_from"]])
+@pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])
 @pytest.mark.parametrize("iterations", [5, 50, 1003])
 def test_what_a_schedule_leaves_out_stays_out_when_it_is_scaled(off, iterations):
     schedule = dataclasses.replace(SHORT, **dict.fromkeys(off, 0))

@@ -15,7 +15,7 @@ import pytest
 import train as script
 from tests.prepare import filmed
 from warpgs.config import TrainConfig
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs

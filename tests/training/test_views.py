@@ -8,7 +8,7 @@ import torch
 from tests import tiny
 from tests.data.captures import ids_of, write_capture
 from warpgs.data.capture import Capture
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.data.loaders import load_capture
 from warpgs.training.views import Views
 
 CPU = torch.device("cpu")

@@ -76,32 +76,32 @@ def test_one_camera_stays_where_it_is():
 
 def test_the_filming_path_is_in_the_order_of_time_and_time_runs_over_all_of_it():
     film = capture([0.4, 0.0, 0.2], [1.0, 0.0, 0.5])
-    path = paths.filming(film, 5, smoothing=0.0)
+    path = paths.training_path(film, 5, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-5)
     assert [c.time for c in path] == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
 def test_before_the_first_frame_the_filming_camera_waits():
-    path = paths.filming(capture([0.1, 0.5], [0.5, 1.0]), 3, smoothing=0.0)
+    path = paths.training_path(capture([0.1, 0.5], [0.5, 1.0]), 3, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.1, 0.5], abs=1e-5)
     assert path[0].time == 0.0
 
 
 def test_of_frames_at_one_time_the_first_counts():
-    path = paths.filming(capture([0.1, 0.9, 0.5], [0.0, 0.0, 1.0]), 2, smoothing=0.0)
+    path = paths.training_path(capture([0.1, 0.9, 0.5], [0.0, 0.0, 1.0]), 2, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.5], abs=1e-5)
 
 
 def test_smoothing_takes_shaking_out():
     film = capture([0.05 * (k % 2) for k in range(21)], [k / 20 for k in range(21)])
-    rough, smooth = (positions(paths.filming(film, 21, s))[:, 0] for s in (0.0, 0.1))
+    rough, smooth = (positions(paths.training_path(film, 21, s))[:, 0] for s in (0.0, 0.1))
     assert smooth[3:-3].diff().abs().max() < 0.05 * rough.diff().abs().max()
-    assert is_rigid(paths.filming(film, 21, 0.1))
+    assert is_rigid(paths.training_path(film, 21, 0.1))
 
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_short_paths_are_paths(frames):
-    assert len(paths.filming(capture([0.0, 1.0], [0.0, 1.0]), frames)) == frames
+    assert len(paths.training_path(capture([0.0, 1.0], [0.0, 1.0]), frames)) == frames
 
 
 # Around what moves --------------------------------------------------------------------------------------------------
@@ -125,13 +125,13 @@ def _off(c, point):
 
 
 def test_a_spiral_keeps_its_point_in_the_middle_and_its_reach():
-    path = paths.spiral(camera(), 2.0, 0.3, paths.evenly(40))
+    path = paths.spiral(camera(), 2.0, 0.3, paths.evenly_spaced(40))
     assert max(_off(c, torch.zeros(3)) for c in path) < 1e-3
     distances = (positions(path) - torch.tensor([0.0, 0.0, -2.0])).norm(dim=1)
     assert distances.max() < 0.4
     assert distances.max() > 0.25
     assert is_rigid(path)
-    assert [c.time for c in path] == paths.evenly(40)
+    assert [c.time for c in path] == paths.evenly_spaced(40)
 
 
 def test_a_spiral_closes():

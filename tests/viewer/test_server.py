@@ -16,7 +16,7 @@ from warpgs.viewer import command, server
 from warpgs.viewer.command import View, training_cameras
 from warpgs.viewer.server import Viewer, check_address
 from warpgs.viewer.source import open_source
-from warpgs.viewer.training_cameras import MOST_FRUSTUMS
+from warpgs.viewer.training_cameras import MAX_FRUSTUMS
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_training_cameras_are_in_order_of_time_and_not_too_many(run):
     assert times == sorted(times)
     training.views = training.views * 40
     chosen = training.spread()
-    assert len(chosen) <= MOST_FRUSTUMS
+    assert len(chosen) <= MAX_FRUSTUMS
     assert (chosen[0], chosen[-1]) == (0, len(training.views) - 1)
 
 

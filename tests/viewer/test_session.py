@@ -14,7 +14,7 @@ from warpgs.viewer import path_editor
 from warpgs.viewer.panel import Panel
 from warpgs.viewer.path_editor import PathEditor
 from warpgs.viewer.pose import Pose, camera_of
-from warpgs.viewer.session import LARGEST_CANVAS, MOST_UPRIGHT, Session
+from warpgs.viewer.session import MAX_ASPECT, MAX_CANVAS, Session
 from warpgs.viewer.training_cameras import TrainingCameras
 
 pytestmark = pytest.mark.usefixtures("contracts_off")
@@ -73,15 +73,15 @@ class Scene:
 )
 def test_no_canvas_is_larger_than_a_screen(claimed, canvas):
     assert session(claimed)._canvas() == canvas
-    assert canvas[0] <= LARGEST_CANVAS[0]
-    assert canvas[1] <= LARGEST_CANVAS[1]
+    assert canvas[0] <= MAX_CANVAS[0]
+    assert canvas[1] <= MAX_CANVAS[1]
 
 
 @pytest.mark.parametrize("size", [(1, 10**6), (10**6, 1), (900, 700)])
 def test_a_keyframe_has_a_size_that_can_be_rendered(size):
     camera = session(size, width=10**9, time=0.5)._look()
     assert 1 <= camera.width <= 1920
-    assert 1 <= camera.height <= MOST_UPRIGHT * 1920
+    assert 1 <= camera.height <= MAX_ASPECT * 1920
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_events_wait_for_each_other():
 
 
 def test_a_path_has_a_largest_number_of_keyframes(tmp_path, monkeypatch):
-    monkeypatch.setattr(path_editor, "MOST_KEYFRAMES", 2)
+    monkeypatch.setattr(path_editor, "MAX_KEYFRAMES", 2)
     button = SimpleNamespace(on_click=lambda _: None)
     controls = SimpleNamespace(
         add_keyframe=button, remove_keyframe=button, save_path=button, path_note=SimpleNamespace()

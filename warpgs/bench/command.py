@@ -14,7 +14,7 @@ import torch
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
-from warpgs.evaluation.evaluate import write_json
+from warpgs.files import write_json
 from warpgs.model.splats import Splats
 from warpgs.ops.projection import record_projection
 from warpgs.ops.rows import Rows

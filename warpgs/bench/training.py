@@ -27,10 +27,10 @@ from .report import print_rows
 from .scenes import SEED, in_disc, random_splats
 from .timing import milliseconds
 
-SMALLEST = (480, 270)
+MIN_SIZE = (480, 270)
 STEPS = {
     "cuda": [
-        *((num, SMALLEST) for num in (50_000, 100_000, 133_000, 200_000, 400_000, 800_000, 1_600_000)),
+        *((num, MIN_SIZE) for num in (50_000, 100_000, 133_000, 200_000, 400_000, 800_000, 1_600_000)),
         *((100_000, size) for size in ((960, 540), (1920, 1080), (3840, 2160))),
     ],
     "cpu": [(num, (240, 136)) for num in (5_000, 10_000)],
@@ -90,7 +90,7 @@ def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
 
 def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int) -> dict[str, Any]:
     """Median time [ms] of a step of stage I and of stage II, and the most memory that tensors took meanwhile."""
-    splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / SMALLEST[0], SEED)
+    splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / MIN_SIZE[0], SEED)
     config = dataclasses.replace(PRESETS["paper"], device="cuda" if device == "cuda" else "cpu")
     capture = random_capture(splats, camera)
     views = Views(capture, torch.device(device), config.resident_bytes)

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 
 from warpgs.cameras import Camera
+from warpgs.files import read_json
 
-from .images import LARGEST_SIDE
+from .images import MAX_SIDE
 from .lens import Lens, pinhole_matrix
-from .reading import read_json
 from .units import SceneUnits
 
-MOST_SKEWED = 1e-3
+MAX_ROTATION_ERROR = 1e-3
 """Largest entry of R Rᵀ − 1 of a rotation; the files have six digits and more."""
 
 
@@ -36,7 +36,7 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
     facts = read_json(path, "every frame needs its camera")
     lens = _lens(path, facts, factor)
     rotation, position = _numbers(path, facts, "orientation", (3, 3)), _numbers(path, facts, "position", (3,))
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MOST_SKEWED or np.linalg.det(rotation) < 0:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
         raise ValueError(f"{path}: orientation is not a rotation")
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ units.from_world(position)
@@ -62,7 +62,7 @@ def _lens(path: Path, facts: dict[str, Any], factor: int) -> Lens:
     full = _numbers(path, facts, "image_size", (2,))
     # As Nerfies rounds; the pictures are from the same code.
     width, height = (round(float(side) / factor) for side in full)
-    if not (full > 0).all() or not 0 < min(width, height) <= max(width, height) <= LARGEST_SIDE:
+    if not (full > 0).all() or not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
         raise ValueError(f"{path}: image_size {full.tolist()} is out of range")
     return Lens(
         width=width,

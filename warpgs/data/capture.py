@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 
-SMALLEST_EXTENT = 0.05
+MIN_EXTENT = 0.05
 """Keeps the rates of training above zero where the camera hardly moves; captures are normalised to about [-1, 1]."""
 
 
@@ -73,7 +73,7 @@ class Capture:
         self.points = points
         self.point_colors = point_colors
         positions = torch.stack([cameras[name].position for name in train])
-        self.extent = max(SMALLEST_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+        self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
         self._read = lru_cache(maxsize=cache_frames)(read)
 
     def frame(self, name: str) -> Frame:

@@ -14,32 +14,32 @@ import torch
 
 from warpgs.cameras import Camera
 
-from .capture import SMALLEST_EXTENT, Capture, Frame
+from .capture import MIN_EXTENT, Capture, Frame
 from .depth_alignment import align_to_points
-from .loaders.nerfies import Dataset, load_capture, recognise
+from .loaders import Dataset, load_capture, recognise
 from .motion_check import motion_between
 
 Level = Literal["error", "warning", "note"]
 
-FEWEST_VISIBLE = 0.2
+MIN_VISIBLE_FRACTION = 0.2
 """Median share of the points that a training camera should have in its picture."""
 
-LEAST_ON_TEXTURE = 0.8
+MIN_POINT_CONTRAST = 0.8
 """Contrast at the points over that of the picture: COLMAP's points have 2 to 4, those of a depth sensor about 1."""
 
 NEAREST_POINT = 0.01
 """Points nearer to a camera than this share of the cameras' extent are no surfaces."""
 
-MOST_AT_CAMERAS = 0.01
+MAX_FRACTION_AT_CAMERAS = 0.01
 """Share of such points."""
 
 MUCH_MOVING = 0.4
 """Share of the pixels; more of it is seldom true."""
 
-LARGEST_DEPTH_ERROR = 0.25
+MAX_DEPTH_ERROR = 0.25
 """Median relative error of aligned depth at the points."""
 
-LARGEST_EPIPOLAR = 3.0
+MAX_EPIPOLAR = 3.0
 """Median distance of static pixels' flow from their epipolar lines [px]; more and the cameras are not the pictures'."""
 
 SAMPLES = 12
@@ -174,7 +174,7 @@ def _files(capture: Capture) -> Iterator[Finding]:
 def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
     """Cameras and points against each other and against the pictures."""
     cameras = [capture.cameras[name] for name in capture.train]
-    if capture.extent <= SMALLEST_EXTENT:
+    if capture.extent <= MIN_EXTENT:
         yield Finding("warning", "cameras", "the camera hardly moves: depth can't be learnt from it")
     if len(capture.points) == 0:
         yield Finding("warning", "points", "there are no sparse points: training starts from random ones")
@@ -189,13 +189,13 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
         text = "the cameras do not see the points: orientation, position or scene.json's center and scale are wrong"
         yield Finding("error", "points", text)
         return
-    if median < FEWEST_VISIBLE:
+    if median < MIN_VISIBLE_FRACTION:
         yield Finding("warning", "points", f"a camera sees only {median:.0%} of the points (median)")
     yield from _at_cameras(capture, cameras)
     contrasts = [c for n in names if (c := _contrast_at_points(capture.frame(n), capture.points)) is not None]
     if contrasts:
         ratio = float(np.median(contrasts))
-        low = ratio < LEAST_ON_TEXTURE
+        low = ratio < MIN_POINT_CONTRAST
         text = f"contrast at the points is {ratio:.2f} times that of the pictures"
         hint = ": points and cameras may not belong to the pictures" if low else ""
         yield Finding("warning" if low else "note", "points", text + hint)
@@ -206,7 +206,7 @@ def _at_cameras(capture: Capture, cameras: list[Camera]) -> Iterator[Finding]:
     points = capture.points[:: max(1, len(capture.points) // 20_000)]
     nearest = torch.cat([torch.cdist(part, positions).amin(1) for part in points.split(2000)])
     share = float((nearest < NEAREST_POINT * capture.extent).float().mean())
-    if share > MOST_AT_CAMERAS:
+    if share > MAX_FRACTION_AT_CAMERAS:
         yield Finding("warning", "points", f"{share:.1%} of the points lie at the cameras' places and are no surfaces")
 
 
@@ -252,7 +252,7 @@ def _depth(capture: Capture) -> Iterator[Finding]:
         yield Finding("warning", "depth", f"{text}: it must be inverse depth, larger is nearer")
     if errors:
         median = float(np.median(errors))
-        level: Level = "warning" if median > LARGEST_DEPTH_ERROR else "note"
+        level: Level = "warning" if median > MAX_DEPTH_ERROR else "note"
         yield Finding(level, "depth", f"aligned depth is {median:.1%} off at the points (median)")
 
 
@@ -269,7 +269,7 @@ def _motion(capture: Capture) -> Iterator[Finding]:
     if not outside:
         return
     static = float(np.median(outside))
-    level: Level = "warning" if static > LARGEST_EPIPOLAR else "note"
+    level: Level = "warning" if static > MAX_EPIPOLAR else "note"
     hint = ": the cameras may not belong to the pictures" if level == "warning" else ""
     yield Finding(level, "cameras", f"static pixels move {static:.2f} px off their epipolar lines (median){hint}")
     if len(inside) < 3:

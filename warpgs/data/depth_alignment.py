@@ -5,12 +5,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.kernels.constants import SMALLEST_INVERSE_DEPTH
+from warpgs.kernels.constants import MIN_INVERSE_DEPTH
 
 REWEIGHTINGS = 50
 """Rounds of iteratively reweighted least squares: with 30 % outliers the fit has settled by then."""
 
-FEWEST_SAMPLES = 16
+MIN_SAMPLES = 16
 """Samples under which a frame is not aligned and its depth not used."""
 
 
@@ -24,7 +24,7 @@ def fit_scale_offset(values: Float[Tensor, " S"], targets: Float[Tensor, " S"]) 
         [2]; NaN if there are fewer than 16 samples, they all have one value, or the fit turns depth around (a ≤ 0).
     """
     nothing = values.new_full((2,), torch.nan)
-    if values.shape[0] < FEWEST_SAMPLES:
+    if values.shape[0] < MIN_SAMPLES:
         return nothing
     x, y = values.double(), targets.double()
     weights = torch.ones_like(x)
@@ -69,4 +69,4 @@ def align_to_rendering(
 def metric_depth(inverse_depth: Float[Tensor, "H W"], alignment: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:
     """Depth in scene units of an aligned frame; NaN where unknown, and where the alignment says at or past infinity."""
     aligned = alignment[0] * inverse_depth + alignment[1]
-    return torch.where(aligned > SMALLEST_INVERSE_DEPTH, 1.0 / aligned, torch.nan)
+    return torch.where(aligned > MIN_INVERSE_DEPTH, 1.0 / aligned, torch.nan)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 from .reading import read_array, read_bytes
 
-LARGEST_SIDE = 16_384
+MAX_SIDE = 16_384
 """Pixels; a file that claims more is refused before anything is allocated for it."""
 
 FILL_RADIUS = 3
@@ -35,8 +35,8 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> Shaped[np.ndarray, 
         size = _check_jpeg(path, data)
     else:
         raise ValueError(f"{path} is no PNG or JPEG picture")
-    if not 0 < min(size) <= max(size) <= LARGEST_SIDE:
-        raise ValueError(f"{path} claims {size[0]}×{size[1]} pixels, expected 1 to {LARGEST_SIDE} a side")
+    if not 0 < min(size) <= max(size) <= MAX_SIDE:
+        raise ValueError(f"{path} claims {size[0]}×{size[1]} pixels, expected 1 to {MAX_SIDE} a side")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -138,14 +138,14 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     """
     values: np.ndarray
     if path.suffix == ".npy":
-        values = read_array(path, LARGEST_SIDE**2).astype(np.float32)
+        values = read_array(path, MAX_SIDE**2).astype(np.float32)
         values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
         holed = bool((~np.isfinite(values) | (values == 0)).any())
     else:
         stored = decode(path)
         values = stored.astype(np.float32) / np.iinfo(stored.dtype).max
         holed = False
-    if values.ndim != 2 or not 0 < min(values.shape) <= max(values.shape) <= LARGEST_SIDE:
+    if values.ndim != 2 or not 0 < min(values.shape) <= max(values.shape) <= MAX_SIDE:
         raise ValueError(f"{path}: depth must be one plane of numbers, [H, W], got shape {list(values.shape)}")
     values[~np.isfinite(values)] = np.nan
     if values.shape[1::-1] == size:

@@ -43,7 +43,7 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def is_straight(self) -> bool:
+    def is_pinhole(self) -> bool:
         """Whether it is a pinhole already."""
         return not (any(self.radial) or any(self.tangential))
 
@@ -88,7 +88,7 @@ def filling_zoom(lens: Lens) -> float:
     Raises:
         ValueError: If that takes more than ``STRONGEST_ZOOM``.
     """
-    if lens.is_straight or lens.fills(1.0):
+    if lens.is_pinhole or lens.fills(1.0):
         return 1.0
     low, high = 1.0, STRONGEST_ZOOM
     if not lens.fills(high):
@@ -118,14 +118,14 @@ def _maps(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
 
-def straighten(picture: Shaped[np.ndarray, "H W ..."], lens: Lens) -> Shaped[np.ndarray, "H W ..."]:
+def undistort(picture: Shaped[np.ndarray, "H W ..."], lens: Lens) -> Shaped[np.ndarray, "H W ..."]:
     """What the pinhole of ``pinhole_matrix`` sees; 8-bit pictures are interpolated, masks and depth are not mixed.
 
     Args:
         picture: [H, W, 3] 8-bit, [H, W] bool or [H, W] float as the lens took it.
         lens: Its intrinsics.
     """
-    if lens.is_straight:
+    if lens.is_pinhole:
         return picture
     interpolation = cv2.INTER_LINEAR if picture.ndim == 3 else cv2.INTER_NEAREST
     plane = picture.astype(np.uint8) if picture.dtype == bool else picture

@@ -8,13 +8,13 @@ from jaxtyping import Float
 
 from .capture import Frame
 
-SMALLEST_SIDE, FLATTEST = 16, 16
+MIN_SIDE, FLATTEST = 16, 16
 """Shorter side [px], and largest ratio of the sides: optical flow crashes on less."""
 
 LONGEST_SIDE = 512
 """Pictures are compared at this size [px]."""
 
-FEWEST_PIXELS = 200
+MIN_PIXELS = 200
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     height, width = first.image.shape[:2]
     factor = min(1.0, LONGEST_SIDE / max(height, width))
     size = round(width * factor), round(height * factor)
-    if min(size) < SMALLEST_SIDE:
+    if min(size) < MIN_SIDE:
         return None
     a, b = (_grey(frame, size) for frame in (first, second))
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(a, b, None)
@@ -51,9 +51,9 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
         mask = first.static_mask.numpy().astype(np.uint8)
         static = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
     values = [distance[textured & region] for region in (static, ~static)]
-    if len(values[0]) < FEWEST_PIXELS:
+    if len(values[0]) < MIN_PIXELS:
         return None
-    moving = float(np.median(values[1])) if len(values[1]) >= FEWEST_PIXELS else None
+    moving = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
     return Motion(float(np.median(values[0])), moving)
 
 

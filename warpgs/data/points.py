@@ -10,7 +10,7 @@ from torch import Tensor
 from .reading import read_array
 from .units import SceneUnits
 
-MOST_POINTS = 50_000_000
+MAX_POINTS = 50_000_000
 """More are refused: a header may claim anything."""
 
 
@@ -25,7 +25,7 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
     path, model = root / "points.npy", root / "sparse" / "0"
     colors = None
     if path.exists():
-        points = read_array(path, 3 * MOST_POINTS).astype(np.float64)
+        points = read_array(path, 3 * MAX_POINTS).astype(np.float64)
     elif model.is_dir():
         path = model
         points, colors = _read_colmap(model)

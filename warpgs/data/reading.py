@@ -1,9 +1,7 @@
 """Reading JSON and arrays: damage is told in one line that names the file."""
 
-import json
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
 
 import numpy as np
 
@@ -24,22 +22,6 @@ def read_bytes(path: Path, hint: str = "") -> bytes:
         raise ValueError(f"{path} is missing{': ' + hint if hint else ''}") from error
     except OSError as error:
         raise ValueError(f"{path} can't be read: {error.strerror}") from error
-
-
-def read_json(path: Path, hint: str = "") -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        ValueError: If the file is missing, no JSON, or holds something else than an object.
-    """
-    data = read_bytes(path, hint)
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
-    return value
 
 
 def read_array(path: Path, most: int) -> np.ndarray:

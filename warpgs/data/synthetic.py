@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.files import write_array, write_json, write_png
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
 from warpgs.progress import progress
-
-from .writer import write_array, write_json, write_png
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
 """Scene units are (p − CENTER) · SCALE."""

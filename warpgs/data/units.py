@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from .reading import read_json
+from warpgs.files import read_json
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import math
 import statistics
 import time
@@ -201,9 +200,3 @@ def write_views(path: Path, evaluation: Evaluation) -> None:
     writer.writeheader()
     writer.writerows({k: "" if v is None else v for k, v in asdict(view).items()} for view in evaluation.views)
     write_text(path, text.getvalue())
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Writes a JSON object; what is not finite becomes null, which every reader understands."""
-    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
-    write_text(path, json.dumps(plain, indent=2) + "\n")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpgs.model.splats import Splats
 
-SMALLEST_SCALE = 1e-20
+MIN_SCALE = 1e-20
 """Keeps logarithms of scales finite; such a Gaussian is far thinner than any pixel."""
 
 OPACITY_MARGIN = 1e-6
@@ -51,7 +51,7 @@ class Cloud:
         return Cloud(
             means=_plain(splats.means),
             quats=_plain(torch.nn.functional.normalize(splats.quats, dim=1)),
-            log_scales=_plain(splats.scales.clamp_min(SMALLEST_SCALE).log()),
+            log_scales=_plain(splats.scales.clamp_min(MIN_SCALE).log()),
             logit_opacities=_plain(torch.logit(opacities)),
             sh=_plain(splats.sh[:, :bases]),
             is_dynamic=np.zeros(len(splats.means), bool) if dynamic is None else dynamic.cpu().numpy(),

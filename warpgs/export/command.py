@@ -18,7 +18,7 @@ from .cloud import Cloud
 from .compressed import write_compressed
 from .moments import Moments
 from .opening import find_capture, opening, weighing_cameras
-from .page import MOST_KEYS, Start, check_size, write_page
+from .page import MAX_KEYS, Start, check_size, write_page
 from .standard import write_standard
 
 KEYS, SECONDS, MAX_MEGABYTES = 30, 5.0, 256.0
@@ -103,10 +103,10 @@ def _check(options: Export) -> None:
         raise ValueError("--frames are spread over all of time: leave out --time")
     if options.time is not None and not 0 <= options.time <= 1:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
-    if options.frames is not None and not 1 <= options.frames <= paths.MOST_FRAMES:
-        raise ValueError(f"--frames must be between 1 and {paths.MOST_FRAMES:,}, got {options.frames}")
-    if options.keys is not None and not 1 <= options.keys <= MOST_KEYS:
-        raise ValueError(f"--keys must be between 1 and {MOST_KEYS}, got {options.keys}")
+    if options.frames is not None and not 1 <= options.frames <= paths.MAX_FRAMES:
+        raise ValueError(f"--frames must be between 1 and {paths.MAX_FRAMES:,}, got {options.frames}")
+    if options.keys is not None and not 1 <= options.keys <= MAX_KEYS:
+        raise ValueError(f"--keys must be between 1 and {MAX_KEYS}, got {options.keys}")
     if options.max_gaussians is not None and options.max_gaussians < 1:
         raise ValueError(f"--max-gaussians must be at least 1, got {options.max_gaussians}")
     for name in ("seconds", "max_megabytes"):
@@ -121,7 +121,7 @@ def _option(name: str) -> str:
 
 def _export_files(options: Export, moments: Moments, folder: Path) -> str:
     """One PLY file a moment and a layer."""
-    times = [options.time or 0.0] if options.frames is None else paths.evenly(options.frames)
+    times = [options.time or 0.0] if options.frames is None else paths.evenly_spaced(options.frames)
     names = {"all": ["scene"], "apart": ["static", "dynamic"]}.get(options.layers, [options.layers])
     suffix, write = WRITERS[options.format]
     if options.frames is not None:
@@ -160,7 +160,7 @@ def _check_page(options: Export, moments: Moments) -> None:
 
 def _export_page(options: Export, moments: Moments, start: Start, folder: Path) -> str:
     """One page that plays the scene."""
-    baked = bake(moments.at, progress(paths.evenly(options.keys or KEYS), "baking", options.quiet))
+    baked = bake(moments.at, progress(paths.evenly_spaced(options.keys or KEYS), "baking", options.quiet))
     written = write_page(folder / "scene.html", baked, start, options.quiet)
     num = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
     return f"{folder / 'scene.html'}: {num}, {written / 1e6:.1f} MB"

@@ -32,21 +32,23 @@ def weighing_cameras(moments: Moments, capture: Capture | None) -> list[Camera]:
     """Some of the cameras that filmed, over all of the time; else guessed ones from four sides."""
     if capture is not None:
         names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
-        chosen = [names[round(share * (len(names) - 1))] for share in paths.evenly(min(len(names), WEIGHING_CAMERAS))]
+        chosen = [
+            names[round(share * (len(names) - 1))] for share in paths.evenly_spaced(min(len(names), WEIGHING_CAMERAS))
+        ]
         return [capture.cameras[name] for name in chosen]
-    times = paths.evenly(WEIGHING_CAMERAS)
+    times = paths.evenly_spaced(WEIGHING_CAMERAS)
     scene = paths.Ball.around(_means(moments.at(0.5)))
-    return [paths.guessed(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
+    return [paths.default_camera(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
 
 
 def opening(moments: Moments, capture: Capture | None, keys: int, seconds: float) -> Start:
     """How a page of a run begins."""
     cloud = _finite(moments.at(0.5))
     track: list[Camera] = []
-    camera = paths.guessed(paths.Ball.around(_means(cloud)))
+    camera = paths.default_camera(paths.Ball.around(_means(cloud)))
     if capture is not None:
         names = capture.val or capture.train
-        camera, track = capture.cameras[names[len(names) // 2]], paths.filming(capture, keys)
+        camera, track = capture.cameras[names[len(names) // 2]], paths.training_path(capture, keys)
     K = camera.K.tolist()
     moving = cloud.select(cloud.is_dynamic) if cloud.is_dynamic.any() else cloud
     return Start(

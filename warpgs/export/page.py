@@ -16,17 +16,17 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from warpgs.files import write_whole
+from warpgs.files import write_bytes
 from warpgs.progress import progress
 
 from .baking import Baked, Bounds, Branch
 from .packing import to_planes
 
 VERSION = 1
-MOST_KEYS = 256
+MAX_KEYS = 256
 """Layers of a texture that every browser with WebGL2 has."""
 
-MOST_GAUSSIANS = 1 << 22
+MAX_GAUSSIANS = 1 << 22
 """Texels of 2048 rows of 2048: what every browser with WebGL2 has, a branch."""
 
 ARRAYS = ("geometry", "colors", "rest")
@@ -80,7 +80,7 @@ def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> in
     for name, array in progress(parts, "compressing", quiet):
         packed = gzip.compress(to_planes(getattr(branches[name], array)).tobytes(), 6, mtime=0)
         blocks.append(_block("application/gzip;base64", f"{name}-{array}", base64.b64encode(packed).decode()))
-    return write_whole(path, [_page(start.title, "\n".join(blocks)).encode()])
+    return write_bytes(path, [_page(start.title, "\n".join(blocks)).encode()])
 
 
 def check_size(counts: Mapping[str, int], keys: int) -> None:
@@ -93,11 +93,11 @@ def check_size(counts: Mapping[str, int], keys: int) -> None:
     Raises:
         ValueError: If there are too many.
     """
-    if keys > MOST_KEYS:
-        raise ValueError(f"a page holds at most {MOST_KEYS} key times, got {keys}")
+    if keys > MAX_KEYS:
+        raise ValueError(f"a page holds at most {MAX_KEYS} key times, got {keys}")
     for name, count in counts.items():
-        if count > MOST_GAUSSIANS:
-            raise ValueError(f"a page holds at most {MOST_GAUSSIANS:,} {name} Gaussians, got {count:,}")
+        if count > MAX_GAUSSIANS:
+            raise ValueError(f"a page holds at most {MAX_GAUSSIANS:,} {name} Gaussians, got {count:,}")
 
 
 def _page(title: str, blocks: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.files import read_bounded, write_whole
+from warpgs.files import read_bounded, write_bytes
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4"},
@@ -21,8 +21,8 @@ NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<u4": "uint"}
 """Names of the types that are written."""
 
 LONGEST_HEADER = 1 << 16
-MOST_PROPERTIES = 256
-LARGEST_FILE = 8 << 30
+MAX_PROPERTIES = 256
+MAX_FILE = 8 << 30
 END = b"end_header\n"
 
 
@@ -38,7 +38,7 @@ def write_ply(path: Path, tables: Mapping[str, np.ndarray]) -> int:
         assert table.dtype.names
         lines += [f"property {NAMES[table.dtype[name].str]} {name}" for name in table.dtype.names]
     header = "\n".join(lines).encode("ascii") + b"\n" + END
-    return write_whole(path, [header, *(table.tobytes() for table in tables.values())])
+    return write_bytes(path, [header, *(table.tobytes() for table in tables.values())])
 
 
 def read_ply(path: Path) -> dict[str, np.ndarray]:
@@ -47,7 +47,7 @@ def read_ply(path: Path) -> dict[str, np.ndarray]:
     Raises:
         ValueError: If it is no such file, or damaged; the message names it.
     """
-    data = read_bounded(path, LARGEST_FILE)
+    data = read_bounded(path, MAX_FILE)
     end = data.find(END, 0, LONGEST_HEADER)
     text = data[:LONGEST_HEADER].replace(b"\r\n", b"\n")
     if not text.startswith(b"ply\n"):
@@ -93,8 +93,8 @@ def _elements(path: Path, header: bytes) -> dict[str, tuple[int, np.dtype]]:
 
 def _row(path: Path, element: str, columns: list[tuple[str, str]]) -> np.dtype:
     names = [name for name, _ in columns]
-    if not 0 < len(names) <= MOST_PROPERTIES:
-        raise ValueError(f"{path}: {element} has {len(names)} properties, expected 1 to {MOST_PROPERTIES}")
+    if not 0 < len(names) <= MAX_PROPERTIES:
+        raise ValueError(f"{path}: {element} has {len(names)} properties, expected 1 to {MAX_PROPERTIES}")
     if len(set(names)) < len(names):
         raise ValueError(f"{path}: {element} has two properties of the same name")
     return np.dtype(columns)

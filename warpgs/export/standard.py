@@ -12,12 +12,12 @@ import numpy as np
 from .cloud import Cloud
 from .ply import column, read_ply, write_ply
 
-MOST_REST = 15
+MAX_REST = 15
 """Coefficients a channel beside the constant one, of degrees 1 to 3."""
 
 COLUMNS = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{k}" for k in range(3 * MOST_REST)),
+    *(f"f_rest_{k}" for k in range(3 * MAX_REST)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 ]
 BYTES_PER_GAUSSIAN = 4 * len(COLUMNS)
@@ -30,13 +30,13 @@ def write_standard(path: Path, cloud: Cloud) -> int:
         OSError: If it can't be written; the message names the file.
     """
     N, rest = len(cloud), cloud.sh.shape[1] - 1
-    padded = np.zeros((N, MOST_REST, 3), np.float32)
+    padded = np.zeros((N, MAX_REST, 3), np.float32)
     padded[:, :rest] = cloud.sh[:, 1:]
     values = [
         cloud.means,
         np.zeros((N, 3), np.float32),
         cloud.sh[:, 0],
-        padded.transpose(0, 2, 1).reshape(N, 3 * MOST_REST),
+        padded.transpose(0, 2, 1).reshape(N, 3 * MAX_REST),
         cloud.logit_opacities[:, None],
         cloud.log_scales,
         cloud.quats,

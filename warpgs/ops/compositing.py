@@ -34,7 +34,7 @@ SMALL = 1 << 18
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
-MOST_PIXELS = 1 << 31
+MAX_PIXELS = 1 << 31
 """Pixels that there must be fewer of in all images, because kernels count them with ints."""
 
 
@@ -108,7 +108,7 @@ def record_composite(
     C, num_features = rows.num_channels, rows.num_features
     N = rows.packed.shape[0]
     images = 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
-    if images * height * width >= MOST_PIXELS:
+    if images * height * width >= MAX_PIXELS:
         raise ValueError(f"{images} images of {width} x {height} pixels are too large to be drawn at once")
     image, alpha = run.empty(images, height, width, num_features), run.empty(images, height, width)
     depth = run.empty(images, height, width) if rows.with_depth else None

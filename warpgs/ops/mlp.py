@@ -18,7 +18,7 @@ from torch import Tensor
 from .encoding import ALIGNMENT
 from .relu import num_sums, relu_backward
 
-LARGEST_GRADIENT = 1024.0
+MAX_GRADIENT = 1024.0
 """In half precision gradients are scaled until the largest one at the output has this size: far enough from the largest
 number, 65504, and with 34 bits below it until a gradient becomes zero."""
 
@@ -137,10 +137,10 @@ def _scaled(gradient: Tensor, columns: int) -> tuple[Tensor, Tensor]:
     """The gradient at the output in half precision, with zeros up to ``columns``, and what undoes its scale."""
     # With a row of zeros, because of no rows at all there is no largest.
     largest = torch.linalg.vector_norm(torch.nn.functional.pad(gradient, (0, 0, 0, 1)), torch.inf)
-    largest = largest.clamp_min(torch.finfo(torch.float32).tiny * LARGEST_GRADIENT)
+    largest = largest.clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
     scaled = gradient.new_zeros(len(gradient), columns, dtype=torch.float16)
-    torch.mul(gradient, LARGEST_GRADIENT / largest, out=scaled[:, : gradient.shape[1]])
-    return scaled, largest / LARGEST_GRADIENT
+    torch.mul(gradient, MAX_GRADIENT / largest, out=scaled[:, : gradient.shape[1]])
+    return scaled, largest / MAX_GRADIENT
 
 
 def _in_pieces(matrix: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from warpgs.kernels import relu as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
 from warpgs.runtime.tape import Run
 
-MOST_CHUNKS = 4096
+MAX_CHUNKS = 4096
 """Sums that the rows are divided among: enough threads to keep memory busy, few enough to be quickly added up."""
 
 ROWS_PER_CHUNK = 4
@@ -17,7 +17,7 @@ ROWS_PER_CHUNK = 4
 
 def num_sums(num_rows: int) -> int:
     """Partial sums to divide so many rows among."""
-    return min(MOST_CHUNKS, -(-num_rows // ROWS_PER_CHUNK))
+    return min(MAX_CHUNKS, -(-num_rows // ROWS_PER_CHUNK))
 
 
 def relu_backward(

@@ -111,8 +111,8 @@ def record_tiles(run: Run, splat_rows: Rows, size: tuple[int, int], is_dynamic: 
     tiles_x, tiles_y = num_tiles(*size)
     total = tiles_x * tiles_y
     int32 = torch.int32
-    if is_dynamic is not None and N >= kernels.MOST_WITH_BRANCHES:
-        raise ValueError(f"with branches there must be fewer than {kernels.MOST_WITH_BRANCHES} Gaussians, got {N}")
+    if is_dynamic is not None and N >= kernels.MAX_WITH_BRANCHES:
+        raise ValueError(f"with branches there must be fewer than {kernels.MAX_WITH_BRANCHES} Gaussians, got {N}")
     if N == 0 or total == 0:
         nothing = run.zeros(total, 2, dtype=int32)
         demand = torch.zeros(1, dtype=torch.int64)

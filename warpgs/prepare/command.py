@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.data.check import check_capture
-from warpgs.data.loaders.nerfies import Dataset
+from warpgs.data.loaders import Dataset
 
 from .frames import Selection
 from .options import LensModel, Options

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-MOST_TILES = 30
+MAX_TILES = 30
 COLUMNS = 6
 TILE_WIDTH = 256
 
@@ -21,7 +21,7 @@ def sheet(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequence[str
 
 def spread(count: int) -> list[int]:
     """At most 30 places, evenly spread over ``count``."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_TILES)).round().astype(int)).tolist()
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_TILES)).round().astype(int)).tolist()
 
 
 def with_mask(image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:

@@ -33,20 +33,20 @@ ROUNDS = 5
 FLOW_NOISE = 0.4
 """Standard deviation of good flow [px]."""
 
-LARGEST_ERROR = 100.0
+MAX_ERROR = 100.0
 """Errors are cut off there [px]: points behind a camera have none that means anything."""
 
 CACHED_FLOWS = 200
 """Flows kept, 0.8 MB each at working size."""
 
-FEWEST_SIGHTINGS = 2
+MIN_OBSERVATIONS = 2
 
-FEWEST_IN_FRONT = 1e-2
+MIN_RELATIVE_DEPTH = 1e-2
 """Depth under which a point counts as behind a camera, as a share of its depth in its own frame."""
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Observation:
     """Where another frame sees the pixels of a frame.
 
     Attributes:
@@ -120,7 +120,7 @@ class Flows:
         return x, y, np.hypot(returned[..., 0], returned[..., 1]) < slack
 
 
-class Footage:
+class PosedFrames:
     """Pictures of one lens with their poses.
 
     Attributes:
@@ -185,14 +185,16 @@ class Footage:
                 chosen.append(frame + step * offset)
         return chosen
 
-    def sightings(self, frame: int) -> list[Sighting]:
+    def observations(self, frame: int) -> list[Observation]:
         """Where the frame's neighbours see its pixels, by optical flow."""
         found = []
         for other in self.neighbours(frame):
             x, y, seen = self.flows.places(frame, other)
             rotation, shift = self.relative(frame, other)
             place = cv2.remap(self.rays, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            found.append(Sighting(np.ascontiguousarray(place.transpose(2, 0, 1)), self.turned(rotation), shift, seen))
+            found.append(
+                Observation(np.ascontiguousarray(place.transpose(2, 0, 1)), self.turned(rotation), shift, seen)
+            )
         return found
 
 
@@ -205,42 +207,42 @@ def _rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
     return straight.reshape(lens.height, lens.width, 2).astype(np.float32)
 
 
-def errors(sighting: Sighting, rho: Float[np.ndarray, "H W"], focal: float) -> Float[np.ndarray, "H W"]:
-    """Distance of the sighting's places from those of static points of inverse depth ρ [px]."""
-    depth = np.maximum(sighting.turned[2] + rho * sighting.shift[2], FEWEST_IN_FRONT)
-    dx = (sighting.turned[0] + rho * sighting.shift[0]) / depth - sighting.place[0]
-    dy = (sighting.turned[1] + rho * sighting.shift[1]) / depth - sighting.place[1]
-    return np.minimum(np.float32(focal) * np.sqrt(dx * dx + dy * dy), LARGEST_ERROR)
+def errors(observation: Observation, rho: Float[np.ndarray, "H W"], focal: float) -> Float[np.ndarray, "H W"]:
+    """Distance of the observation's places from those of static points of inverse depth ρ [px]."""
+    depth = np.maximum(observation.turned[2] + rho * observation.shift[2], MIN_RELATIVE_DEPTH)
+    dx = (observation.turned[0] + rho * observation.shift[0]) / depth - observation.place[0]
+    dy = (observation.turned[1] + rho * observation.shift[1]) / depth - observation.place[1]
+    return np.minimum(np.float32(focal) * np.sqrt(dx * dx + dy * dy), MAX_ERROR)
 
 
-def triangulate(sightings: Sequence[Sighting], focal: float) -> LocalGeometry:
+def triangulate(observations: Sequence[Observation], focal: float) -> LocalGeometry:
     """Inverse depth of every pixel of a frame from where other frames see it.
 
     Args:
-        sightings: At least one.
+        observations: At least one.
         focal: Focal length, so that residuals are in pixels.
     """
-    shape = sightings[0].seen.shape
+    shape = observations[0].seen.shape
     rho = np.full(shape, 1e-3, np.float32)
-    weights = [s.seen.astype(np.float32) for s in sightings]
+    weights = [s.seen.astype(np.float32) for s in observations]
     for _ in range(ROUNDS):
         top, bottom = np.zeros(shape, np.float32), np.full(shape, 1e-12, np.float32)
-        for s, weight in zip(sightings, weights, strict=True):
-            depth = np.maximum(s.turned[2] + rho * s.shift[2], FEWEST_IN_FRONT)
+        for s, weight in zip(observations, weights, strict=True):
+            depth = np.maximum(s.turned[2] + rho * s.shift[2], MIN_RELATIVE_DEPTH)
             weight = weight / depth**2
             for axis in range(2):
                 slope = s.place[axis] * s.shift[2] - s.shift[axis]
                 top += weight * slope * (s.turned[axis] - s.place[axis] * s.turned[2])
                 bottom += weight * slope * slope
         rho = np.maximum(top / bottom, 1e-6)
-        distances = [errors(s, rho, focal) for s in sightings]
-        weights = [s.seen / np.maximum(e, FLOW_NOISE) for s, e in zip(sightings, distances, strict=True)]
-    count = np.sum([s.seen for s in sightings], axis=0)
-    residual = np.sum([e * s.seen for s, e in zip(sightings, distances, strict=True)], axis=0) / np.maximum(count, 1)
+        distances = [errors(s, rho, focal) for s in observations]
+        weights = [s.seen / np.maximum(e, FLOW_NOISE) for s, e in zip(observations, distances, strict=True)]
+    count = np.sum([s.seen for s in observations], axis=0)
+    residual = np.sum([e * s.seen for s, e in zip(observations, distances, strict=True)], axis=0) / np.maximum(count, 1)
     noise = np.maximum(residual, FLOW_NOISE)
     # bottom holds slope² / noise, so bottom · noise is the information of unit weights.
     sigma = noise / (focal * np.sqrt(bottom * noise))
-    unknown = count < FEWEST_SIGHTINGS
+    unknown = count < MIN_OBSERVATIONS
     rho[unknown], residual[unknown] = np.nan, np.nan
     return LocalGeometry(rho, sigma.astype(np.float32), residual.astype(np.float32))
 

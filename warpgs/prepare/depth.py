@@ -11,25 +11,25 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.data.writer import write_array
+from warpgs.files import write_array
 
-from .dense import Footage, LocalGeometry, triangulate
+from .dense import LocalGeometry, PosedFrames, triangulate
 from .parallel import each
 
-LARGEST_RESIDUAL = 1.5
+MAX_RESIDUAL = 1.5
 """Mean error of a pixel's places above which its depth is not used [px]."""
 
-LEAST_CERTAIN = 0.08
+MAX_RELATIVE_SIGMA = 0.08
 """Standard deviation of inverse depth above which it is not used, as a share of it."""
 
 AGREEMENT = 0.06
 """Relative difference of inverse depths that confirm each other, beside twice their standard deviations."""
 
-FEWEST_CONFIRMATIONS = 2
+MIN_CONFIRMATIONS = 2
 
 
 def static_depth(
-    footage: Footage, moving: Sequence[Bool[np.ndarray, "H W"]], quiet: bool = True
+    footage: PosedFrames, moving: Sequence[Bool[np.ndarray, "H W"]], quiet: bool = True
 ) -> list[Float[np.ndarray, "H W"]]:
     """[H, W] inverse depth of every frame in the units of the poses; NaN where it moves or is not known well.
 
@@ -42,10 +42,10 @@ def static_depth(
     focal = footage.lens.focal[0]
 
     def local(frame: int) -> LocalGeometry:
-        found = triangulate(footage.sightings(frame), focal)
+        found = triangulate(footage.observations(frame), focal)
         with np.errstate(invalid="ignore"):
-            bad = moving[frame] | ~(found.residual < LARGEST_RESIDUAL)
-            bad |= ~(found.sigma < LEAST_CERTAIN * found.inverse_depth)
+            bad = moving[frame] | ~(found.residual < MAX_RESIDUAL)
+            bad |= ~(found.sigma < MAX_RELATIVE_SIGMA * found.inverse_depth)
         found.inverse_depth[bad] = np.nan
         return found
 
@@ -53,7 +53,7 @@ def static_depth(
     return each(lambda frame: _confirmed(footage, geometry, frame), frames, "depth: cross-checks", quiet)
 
 
-def _confirmed(footage: Footage, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:
+def _confirmed(footage: PosedFrames, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:
     """The inverse depth that at least two neighbours confirm, or all where there are fewer."""
     rho, sigma = geometry[frame].inverse_depth, geometry[frame].sigma
     lens, near = footage.lens, footage.neighbours(frame)
@@ -71,7 +71,7 @@ def _confirmed(footage: Footage, geometry: Sequence[LocalGeometry], frame: int) 
             expected, gain = rho / depth, turned[2] / depth**2
             slack = AGREEMENT * expected + 2.0 * np.hypot(gain * sigma, theirs_sigma)
             votes += seen & (np.abs(theirs - expected) < slack)
-    return np.where(votes >= min(FEWEST_CONFIRMATIONS, len(near)), rho, np.float32(np.nan))
+    return np.where(votes >= min(MIN_CONFIRMATIONS, len(near)), rho, np.float32(np.nan))
 
 
 def _nearest(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -13,19 +13,19 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from warpgs.data.images import LARGEST_SIDE, decode
-from warpgs.data.motion_check import FLATTEST, SMALLEST_SIDE
-from warpgs.data.writer import write_json, write_png
+from warpgs.data.images import MAX_SIDE, decode
+from warpgs.data.motion_check import FLATTEST, MIN_SIDE
+from warpgs.files import write_json, write_png
 from warpgs.progress import progress
 
-FEWEST_FRAMES = 5
-MOST_FRAMES = 1000
+MIN_FRAMES = 5
+MAX_FRAMES = 1000
 """More take more memory than they are worth."""
 
 DEFAULT_FRAMES = 150
 """Taken from a video when neither a rate nor a count is asked for."""
 
-FEWEST_DECODED = 0.95
+MIN_DECODED_FRACTION = 0.95
 """Share of the frames that a video promises, under which its being cut off is told."""
 
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -69,10 +69,10 @@ class Selection:
             raise ValueError("--fps and --count exclude each other")
         if self.fps is not None and not 0.0 < self.fps < math.inf:
             raise ValueError(f"--fps must be positive, got {self.fps}")
-        if self.count is not None and not FEWEST_FRAMES <= self.count <= MOST_FRAMES:
-            raise ValueError(f"--count must be {FEWEST_FRAMES} to {MOST_FRAMES}, got {self.count}")
-        if not 64 <= self.longest_side <= LARGEST_SIDE:
-            raise ValueError(f"--longest-side must be 64 to {LARGEST_SIDE} pixels, got {self.longest_side}")
+        if self.count is not None and not MIN_FRAMES <= self.count <= MAX_FRAMES:
+            raise ValueError(f"--count must be {MIN_FRAMES} to {MAX_FRAMES}, got {self.count}")
+        if not 64 <= self.longest_side <= MAX_SIDE:
+            raise ValueError(f"--longest-side must be 64 to {MAX_SIDE} pixels, got {self.longest_side}")
 
 
 def take_frames(
@@ -106,16 +106,16 @@ def take_frames(
             )
         size = image.shape[1::-1]
         image = _scaled(image, selection.longest_side)
-        if min(image.shape[:2]) < max(SMALLEST_SIDE, max(image.shape[:2]) / FLATTEST):
+        if min(image.shape[:2]) < max(MIN_SIDE, max(image.shape[:2]) / FLATTEST):
             raise ValueError(
                 f"{source}: {origin} of {image.shape[1]}×{image.shape[0]} pixels is too flat: the shorter side must "
-                f"have at least {SMALLEST_SIDE} pixels and 1/{FLATTEST} of the longer one"
+                f"have at least {MIN_SIDE} pixels and 1/{FLATTEST} of the longer one"
             )
         taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step))
         write_png(folder / f"{taken[-1].name}.png", image)
-    if len(taken) < FEWEST_FRAMES:
+    if len(taken) < MIN_FRAMES:
         raise ValueError(
-            f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {FEWEST_FRAMES} are needed"
+            f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {MIN_FRAMES} are needed"
         )
     write_json(folder / "frames.json", [asdict(frame) for frame in taken])
     return taken
@@ -149,8 +149,8 @@ def _of_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[tupl
     if not paths:
         raise ValueError(f"{source} holds no {', '.join(PICTURES)} pictures")
     count = min(selection.count or len(paths), len(paths))
-    if count > MOST_FRAMES:
-        raise ValueError(f"{source} holds {count} pictures, at most {MOST_FRAMES} are taken: choose with --count")
+    if count > MAX_FRAMES:
+        raise ValueError(f"{source} holds {count} pictures, at most {MAX_FRAMES} are taken: choose with --count")
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
         best = max(((k, _picture(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
@@ -181,8 +181,8 @@ def _of_video(
         wanted = selection.count or DEFAULT_FRAMES
         interval = rate / selection.fps if selection.fps is not None else total / wanted
         interval = max(1.0, interval)
-        if total / interval > MOST_FRAMES:
-            raise ValueError(f"{source} gives {int(total / interval)} frames, at most {MOST_FRAMES} are taken")
+        if total / interval > MAX_FRAMES:
+            raise ValueError(f"{source} gives {int(total / interval)} frames, at most {MAX_FRAMES} are taken")
         yield from _sharpest(source, video, total, interval, quiet, notes)
     finally:
         video.release()
@@ -197,7 +197,7 @@ def _sharpest(
     for step in progress(range(total), "frames", quiet):
         whole, image = video.read()
         if not whole:
-            if step < FEWEST_DECODED * total:  # containers often count a few more than there are
+            if step < MIN_DECODED_FRACTION * total:  # containers often count a few more than there are
                 notes.append(f"{source} promises {total} frames, only {step} could be decoded: is it cut off?")
             break
         if int(step / interval) != current and best is not None:
@@ -222,9 +222,9 @@ def _open(source: Path) -> cv2.VideoCapture:
     if not video.isOpened():
         raise ValueError(f"{source} is no video that can be decoded, and no folder of pictures")
     size = [video.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-    if not 0 < min(size) <= max(size) <= LARGEST_SIDE:
+    if not 0 < min(size) <= max(size) <= MAX_SIDE:
         video.release()
-        raise ValueError(f"{source} claims frames of {size[0]:.0f}×{size[1]:.0f} pixels, at most {LARGEST_SIDE} a side")
+        raise ValueError(f"{source} claims frames of {size[0]:.0f}×{size[1]:.0f} pixels, at most {MAX_SIDE} a side")
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # phones store upright videos lying, with a tag
     return video
 

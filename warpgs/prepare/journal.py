@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from warpgs.data.writer import write_json
+from warpgs.files import write_json
 
 REPORT = "prepare.json"
 """Beside the capture: options, results and seconds of every step, notes."""
@@ -22,7 +22,7 @@ STATE = "state.json"
 """In the work folder: options, the steps that are done, and notes."""
 
 
-class Attempt:
+class Journal:
     """The steps that are done.
 
     Attributes:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from .dense import Footage, filled
+from .dense import PosedFrames, filled
 from .parallel import each
 from .revisits import NUM_AGREEING, Revisits
 from .segments import Graph, Segments, segment
@@ -19,10 +19,10 @@ from .segments import Graph, Segments, segment
 MIDDLE_GREY = 0.45
 """Median lightness that dark footage is lifted to, so that dark cloth has texture."""
 
-SMALLEST_PART = 0.002
+MIN_PART = 0.002
 """Share of the picture that a moving part must have; smaller ones are noise."""
 
-SMALLEST_HOLE = 0.003
+MIN_HOLE = 0.003
 """Share of the picture; smaller holes in a moving part are filled."""
 
 CERTAIN, LIKELY, POSSIBLE = 0.85, 0.5, 0.15
@@ -45,7 +45,7 @@ def lift(images: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[UInt8[np.ndarray,
 
 @dataclass(frozen=True)
 class _Finder:
-    footage: Footage
+    footage: PosedFrames
     labs: list[np.ndarray]
     revisits: Revisits
 
@@ -78,7 +78,7 @@ def _texture(lab: np.ndarray) -> Float[np.ndarray, "H W"]:
 
 
 def find_moving(
-    images: Sequence[UInt8[np.ndarray, "H W 3"]], footage: Footage, quiet: bool = True
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], footage: PosedFrames, quiet: bool = True
 ) -> list[Bool[np.ndarray, "H W"]]:
     """[H, W] true where each picture moves.
 
@@ -152,8 +152,8 @@ def outline(image: UInt8[np.ndarray, "H W 3"], share: Float[np.ndarray, "H W"]) 
 def tidy(moving: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """The region without specks and pinholes, and grown by the width of soft outlines."""
     area, width = moving.size, moving.shape[1]
-    moving = _without_small(moving, SMALLEST_PART * area)
-    moving = ~_without_small(~moving, SMALLEST_HOLE * area)
+    moving = _without_small(moving, MIN_PART * area)
+    moving = ~_without_small(~moving, MIN_HOLE * area)
     radius = round(OUTLINE_WIDTH * width)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return cv2.dilate(moving.astype(np.uint8), disc) > 0

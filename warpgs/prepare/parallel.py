@@ -9,7 +9,7 @@ import cv2
 
 from warpgs.progress import progress
 
-MOST_THREADS = 8
+MAX_THREADS = 8
 """More than that are limited by memory."""
 
 Item = TypeVar("Item")
@@ -24,7 +24,7 @@ def each(job: Callable[[Item], Result], items: Sequence[Item], label: str, quiet
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MOST_THREADS))
+    pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))
     try:
         futures = [pool.submit(job, item) for item in items]
         return [future.result() for future in progress(futures, label, quiet)]

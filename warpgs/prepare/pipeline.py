@@ -15,20 +15,20 @@ import cv2
 import numpy as np
 
 from warpgs.data.images import decode, read_mask
-from warpgs.data.lens import straighten
-from warpgs.data.writer import write_png
+from warpgs.data.lens import undistort
+from warpgs.files import write_png
 
 from . import contact_sheet, depth_anything, sam2
 from .contact_sheet import sheet, spread
-from .dense import Footage
+from .dense import PosedFrames
 from .depth import static_depth, write_depth
 from .frames import SourceFrame, list_frames, take_frames
 from .given_masks import find_masks, read_moving
-from .journal import REPORT, Attempt
+from .journal import REPORT, Journal
 from .motion_masks import find_moving, lift
 from .networks import DEPTH_ANYTHING, SAM2, find_weights
 from .options import Options
-from .scene import resized_lens, static_points, straight_lens, write_facts, write_frames
+from .scene import pinhole_lens, resized_lens, static_points, write_facts, write_frames
 from .sfm import Cameras, NoCamerasError, recover_cameras
 
 WORKING_SIDE = 512
@@ -38,10 +38,10 @@ superpixels and outlines count in pixels (256×192 of the hand: intersection ove
 MISLED = 0.7
 """Reprojection error of the second pass over that of the first, under which the masks are made again."""
 
-DOUBTFUL_MOVING, MOST_MOVING = 0.4, 0.6
+DOUBTFUL_MOVING, MAX_MOVING = 0.4, 0.6
 """Shares of the pixels with more of which the cameras are tried again, and taken for wrong."""
 
-FEWEST_FOR_MOTION = 10
+MIN_FOR_MOTION = 10
 """Frames under which some lack three others far enough off in time to compare with (``revisits``)."""
 
 WEAK = "weak-features"
@@ -80,7 +80,7 @@ class Preparation:
                 raise ValueError(f"{root} holds the {what} {path}: choose a folder of its own for the capture")
         self.root, self.options, self.quiet = root, options, quiet
         plain = json.loads(json.dumps(asdict(options), default=lambda path: str(Path(path).resolve())))
-        self.attempt = Attempt(root, plain, force, quiet)
+        self.attempt = Journal(root, plain, force, quiet)
         self.work = self.attempt.work
 
     def run(self) -> dict[str, Any]:
@@ -126,9 +126,9 @@ class Preparation:
         return f"{len(frames)} of {width}×{height}"
 
     def _check_motion(self, count: int) -> None:
-        if self.options.finds_motion and count < FEWEST_FOR_MOTION:
+        if self.options.finds_motion and count < MIN_FOR_MOTION:
             raise ValueError(
-                f"{count} frames are too few to find what moves, at least {FEWEST_FOR_MOTION} are needed: take more "
+                f"{count} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take more "
                 "(--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
             )
 
@@ -166,7 +166,7 @@ class Preparation:
             if self._moving_share() > DOUBTFUL_MOVING:
                 first_again()
                 text = self._find_masks(self._load("first"))
-        if (share := self._moving_share()) > MOST_MOVING:
+        if (share := self._moving_share()) > MAX_MOVING:
             raise ValueError(
                 f"{share:.0%} of the pixels seem to move: the cameras that were found fit little of the pictures; take "
                 "more frames (--fps, --count), film more of what stands still and has texture, or give masks of what "
@@ -201,7 +201,7 @@ class Preparation:
         size = cameras.lens.width, cameras.lens.height
         images = [_scaled(image, side or WORKING_SIDE) for image in _pictures(self.work / "frames", cameras.names)]
         lifted, (height, width) = lift(images), images[0].shape[:2]
-        footage = Footage(lifted, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
+        footage = PosedFrames(lifted, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
         moving = find_moving(lifted, footage, self.quiet)
         if self.options.masks == "sam2":
             moving = sam2.follow(images, moving, find_weights(SAM2, self.options.weights), self.quiet)
@@ -276,7 +276,7 @@ class Preparation:
         return f"{len(placed)} frames, {len(left_out)} left out, {len(cameras.points)} static points"
 
     def _without_moving_points(self, cameras: Cameras, moving: list[np.ndarray]) -> Cameras:
-        keep = static_points(dataclasses.replace(cameras, lens=straight_lens(cameras.lens)), moving)
+        keep = static_points(dataclasses.replace(cameras, lens=pinhole_lens(cameras.lens)), moving)
         if keep.sum() < 50:
             raise ValueError(
                 f"only {int(keep.sum())} static points are left: nearly everything moves, or the masks are turned "
@@ -307,8 +307,8 @@ class Preparation:
         size = images[0].shape[1::-1]
         masks = self._straight_masks(cameras)
         moving = [cv2.resize(m.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0 for m in masks]
-        lens = resized_lens(straight_lens(cameras.lens), *size)
-        return static_depth(Footage(lift(images), lens, cameras.poses, cameras.points), moving, self.quiet)
+        lens = resized_lens(pinhole_lens(cameras.lens), *size)
+        return static_depth(PosedFrames(lift(images), lens, cameras.poses, cameras.points), moving, self.quiet)
 
     def _listed(self) -> list[SourceFrame]:
         return list_frames(self.work / "frames")
@@ -329,7 +329,7 @@ class Preparation:
                 yield np.zeros((lens.height, lens.width), bool)
             else:
                 moving = ~read_mask(self.work / f"masks/{name}.png.png", (lens.width, lens.height))
-                yield moving if are_straight else straighten(moving, lens)
+                yield moving if are_straight else undistort(moving, lens)
 
 
 def _pictures(folder: Path, names: Iterable[str]) -> Iterator[np.ndarray]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from .dense import Footage, Sighting, errors, filled, triangulate
+from .dense import Observation, PosedFrames, errors, filled, triangulate
 
 NUM_FAR = 6
 """Far frames to compare with."""
@@ -55,7 +55,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class _Revisit:
-    sighting: Sighting
+    observation: Observation
     inside: Bool[np.ndarray, "H W"]
     correlation: Float[np.ndarray, "H W"]
 
@@ -67,7 +67,7 @@ class Revisits:
         footage: The frames.
     """
 
-    def __init__(self, footage: Footage, grey: list[UInt8[np.ndarray, "H W"]]) -> None:
+    def __init__(self, footage: PosedFrames, grey: list[UInt8[np.ndarray, "H W"]]) -> None:
         """Takes the grey picture of every frame of the footage."""
         self.footage = footage
         self._grey = [cv2.GaussianBlur(plane, (0, 0), 1.0).astype(np.float32) for plane in grey]
@@ -91,17 +91,17 @@ class Revisits:
     def evidence(self, frame: int) -> Evidence:
         """What the neighbours and the far frames say of a frame."""
         focal = self.footage.lens.focal[0]
-        near = self.footage.sightings(frame)
+        near = self.footage.observations(frame)
         local = triangulate(near, focal)
         rho = filled(local.inverse_depth)
         revisits = [self._revisit(frame, other, rho) for other in self.far_frames(frame, float(np.median(rho)))]
         if not revisits:
             nothing = np.zeros_like(rho)
             return Evidence(local.residual, nothing, nothing.astype(np.uint8), local.inverse_depth)
-        solved = triangulate([*near, *(r.sighting for r in revisits)], focal).inverse_depth
+        solved = triangulate([*near, *(r.observation for r in revisits)], focal).inverse_depth
         scores = []
         for r in revisits:
-            fit = np.exp(-((errors(r.sighting, solved, focal) / TOLERANCE) ** 2))
+            fit = np.exp(-((errors(r.observation, solved, focal) / TOLERANCE) ** 2))
             scores.append(np.nan_to_num(fit * np.clip((r.correlation - 0.3) / 0.5, 0.0, 1.0) * r.inside))
         best = np.partition(scores, -min(NUM_AGREEING, len(scores)), axis=0)[-NUM_AGREEING:]
         witnesses = np.sum([r.inside for r in revisits], axis=0).astype(np.uint8)
@@ -125,7 +125,7 @@ class Revisits:
         place = np.stack([_sample(x, to_column, to_row), _sample(y, to_column, to_row)])
         found = _sample(_sample(self._grey[other], column, row), to_column, to_row)
         correlation = _correlation(self._grey[frame], found)
-        return _Revisit(Sighting(place, turned, shift, inside & (correlation > 0.5)), inside, correlation)
+        return _Revisit(Observation(place, turned, shift, inside & (correlation > 0.5)), inside, correlation)
 
 
 def _sample(plane: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from warpgs.data.images import decode
-from warpgs.data.lens import Lens, pinhole_matrix, straighten
-from warpgs.data.writer import write_array, write_json, write_png
+from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.files import write_array, write_json, write_png
 
 from .frames import SourceFrame
 from .sfm import Cameras
@@ -21,12 +21,12 @@ KEPT_SHARE = 0.02
 FACTORS = (1, 2)
 """Downscalings that pictures and masks are written in; training takes the second with ``--factor 2``."""
 
-MOST_MOVING = 0.5
+MAX_MOVING = 0.5
 """Share of the frames that see a point where something moves, above which the point is left out."""
 
 
-def straight_lens(lens: Lens) -> Lens:
-    """The pinhole whose pictures ``straighten`` makes of the lens's."""
+def pinhole_lens(lens: Lens) -> Lens:
+    """The pinhole whose pictures ``undistort`` makes of the lens's."""
     K = pinhole_matrix(lens)
     return Lens(lens.width, lens.height, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
 
@@ -55,7 +55,7 @@ def static_points(cameras: Cameras, moving: Sequence[Bool[np.ndarray, "H W"]]) -
         inside = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
         looks += inside
         hits[inside] += mask[row[inside], column[inside]]
-    return hits <= MOST_MOVING * np.maximum(looks, 1)
+    return hits <= MAX_MOVING * np.maximum(looks, 1)
 
 
 def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> tuple[np.ndarray, float]:
@@ -83,10 +83,10 @@ def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequ
         ValueError: If a frame was damaged since it was taken.
         OSError: If a file can't be written; the message names it.
     """
-    straight = straight_lens(cameras.lens)
+    straight = pinhole_lens(cameras.lens)
     for name, pose, mask in zip(cameras.names, cameras.poses, moving, strict=True):
         image = cv2.cvtColor(decode(frames_folder / f"{name}.png"), cv2.COLOR_BGR2RGB)
-        image, moving_here = straighten(image, cameras.lens), mask.astype(np.uint8)
+        image, moving_here = undistort(image, cameras.lens), mask.astype(np.uint8)
         for factor in FACTORS:
             size = round(straight.width / factor), round(straight.height / factor)
             write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -44,7 +44,7 @@ PRIOR = 0.02
 COLOR_TRUST = 0.05
 """Evidence a pixel by colour, per unit of log odds."""
 
-LARGEST_LOG_ODDS = 2.5
+MAX_LOG_ODDS = 2.5
 
 COLOR_ROUNDS = 2
 
@@ -190,4 +190,4 @@ class Graph:
             histogram = np.zeros((BINS,) * 3)
             np.add.at(histogram, cells, certain * self._sizes)
             counts.append(gaussian_filter(histogram, 1.0, mode="nearest")[cells] + 5.0)
-        return np.clip(np.log(counts[0] / counts[1]), -LARGEST_LOG_ODDS, LARGEST_LOG_ODDS)
+        return np.clip(np.log(counts[0] / counts[1]), -MAX_LOG_ODDS, MAX_LOG_ODDS)

@@ -26,25 +26,25 @@ FALLBACK_FRAMES = 250
 OVERLAP = 10
 """Frames after each frame that it is matched with; beyond, powers of two."""
 
-MOST_FEATURES = 4096
+MAX_FEATURES = 4096
 """Features a frame; matching takes time with their square."""
 
 WEAK_PEAK = 0.002
 """Contrast that weak features must have at least; COLMAP's default is 0.0067."""
 
-FEWEST_FEATURES = 60
+MIN_FEATURES = 60
 """Features a frame under which pictures count as without texture."""
 
-LEAST_REGISTERED = 0.5
+MIN_REGISTERED = 0.5
 """Share of the frames that must get a camera."""
 
-LEAST_ANGLE = 1.0
+MIN_ANGLE = 1.0
 """Median angle under which points are seen [degrees]; less leaves depth undetermined."""
 
-FEWEST_POINTS = 100
+MIN_POINTS = 100
 """Points under which a reconstruction is chance: a camera that only turns gives some."""
 
-LARGEST_ERROR = 2.0
+MAX_ERROR = 2.0
 """Points with a larger mean reprojection error are left out [px]."""
 
 
@@ -142,7 +142,7 @@ def _readers(model: str, masks: Path | None, weak: bool) -> tuple[Any, Any]:
     reading.camera_model = model
     if masks is not None:
         reading.mask_path = masks
-    extraction.sift.max_num_features = MOST_FEATURES
+    extraction.sift.max_num_features = MAX_FEATURES
     if weak:
         extraction.sift.peak_threshold = WEAK_PEAK
     return reading, extraction
@@ -174,10 +174,10 @@ def _check_features(database: Path, count: int) -> None:
         features = opened.num_keypoints() / count
     finally:
         opened.close()
-    if features < FEWEST_FEATURES:
+    if features < MIN_FEATURES:
         raise NoCamerasError(
             f"the pictures have hardly any texture where nothing moves: {features:.0f} features a frame, at least "
-            f"{FEWEST_FEATURES} are needed; film textured things, in more light, or check the masks"
+            f"{MIN_FEATURES} are needed; film textured things, in more light, or check the masks"
         )
 
 
@@ -196,14 +196,14 @@ def _matched(folder: Path, work: Path, name: str, exhaustive: bool) -> Any:
 
 def _result(model: Any, names: list[str]) -> Cameras:
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
-    if len(images) < max(LEAST_REGISTERED * len(names), 3):
+    if len(images) < max(MIN_REGISTERED * len(names), 3):
         raise NoCamerasError(
             f"only {len(images)} of {len(names)} frames could be placed: too much moves, the camera moves too fast, "
             "or the pictures have too little texture; try more frames (--fps, --count), a slower part of the video, "
             "or masks of what moves (--masks FOLDER)"
         )
     poses = np.array([i.cam_from_world().matrix() for i in images])
-    points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= LARGEST_ERROR]
+    points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= MAX_ERROR]
     found = Cameras(
         [Path(i.name).stem for i in images],
         _lens(images[0].camera),
@@ -212,10 +212,10 @@ def _result(model: Any, names: list[str]) -> Cameras:
         float(model.compute_mean_reprojection_error()),
         _angle(model, points),
     )
-    if found.angle < LEAST_ANGLE or len(points) < FEWEST_POINTS:
+    if found.angle < MIN_ANGLE or len(points) < MIN_POINTS:
         raise NoCamerasError(
             f"the camera hardly changes its place: {len(points)} points could be placed, seen under "
-            f"{found.angle:.1f}°; at least {FEWEST_POINTS} and {LEAST_ANGLE}° are needed; walk around the scene "
+            f"{found.angle:.1f}°; at least {MIN_POINTS} and {MIN_ANGLE}° are needed; walk around the scene "
             "instead of turning in one place"
         )
     return found

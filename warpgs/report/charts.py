@@ -8,7 +8,7 @@ from typing import NamedTuple
 COLORS = ("#3b82f6", "#f97316", "#10b981", "#e11d48", "#8b5cf6", "#ca8a04", "#06b6d4", "#6b7280")
 WIDTH, HEIGHT = 460, 230
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 30
-MOST_POINTS = 300
+MAX_POINTS = 300
 """Of a curve; more are averaged."""
 
 
@@ -57,7 +57,7 @@ def chart(title: str, x_name: str, series: Sequence[Series], dots: bool = False)
 
 def _thinned(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     """Means of neighbours, where there are more points than can be seen."""
-    size = math.ceil(len(points) / MOST_POINTS)
+    size = math.ceil(len(points) / MAX_POINTS)
     groups = [points[k : k + size] for k in range(0, len(points), size)]
     return [(sum(x for x, _ in g) / len(g), sum(y for _, y in g) / len(g)) for g in groups]
 

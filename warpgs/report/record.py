@@ -19,10 +19,10 @@ from warpgs.runs import run as runs
 Curve = list[tuple[float, float]]
 """(iteration, value), in order."""
 
-LARGEST_FILE = 64 << 20
+MAX_FILE = 64 << 20
 """Of metrics.json and of views.csv [bytes]."""
 
-LARGEST = 1e18
+MAX_VALUE = 1e18
 """Of their numbers; bytes are the largest."""
 
 NEEDED = ("name", "time", "psnr")
@@ -91,7 +91,7 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
     if not isinstance(values, dict) or any(isinstance(v, dict | list) for v in values.values()):
         raise ValueError(f"{path} is damaged: expected an object of numbers and texts")
     for name, value in values.items():
-        if isinstance(value, int | float) and not abs(value) <= LARGEST:
+        if isinstance(value, int | float) and not abs(value) <= MAX_VALUE:
             raise ValueError(f"{path} is damaged: {reprlib.repr(name)} can't be {reprlib.repr(value)}")
     return values
 
@@ -100,7 +100,7 @@ def _of_evaluation(path: Path) -> bytes:
     """A file that the evaluation leaves in a run folder."""
     if not path.exists():
         raise ValueError(f"{path.parent} has no {path.name}: evaluate it with warpgs eval {path.parent}")
-    return read_bounded(path, LARGEST_FILE)
+    return read_bounded(path, MAX_FILE)
 
 
 def _read_views(path: Path) -> list[View]:
@@ -135,7 +135,7 @@ def _figure(name: str, text: str) -> float | None:
         raise ValueError(f"{name} can't be {reprlib.repr(text)}") from error
     if math.isnan(value):
         return None
-    if value != math.inf and not abs(value) <= LARGEST:
+    if value != math.inf and not abs(value) <= MAX_VALUE:
         raise ValueError(f"{name} can't be {reprlib.repr(text)}")
     return value
 
@@ -151,4 +151,4 @@ def _read_curves(folder: Path) -> dict[str, Curve]:
     except Exception as error:  # of a damaged file it raises whatever its parser does
         raise ValueError(f"{folder} is damaged: {error}") from error
     curves = {tag: [(float(e.step), float(e.value)) for e in events.Scalars(tag)] for tag in events.Tags()[SCALARS]}
-    return {tag: [(x, y) for x, y in curve if abs(y) <= LARGEST] for tag, curve in curves.items()}
+    return {tag: [(x, y) for x, y in curve if abs(y) <= MAX_VALUE] for tag, curve in curves.items()}

@@ -72,7 +72,7 @@ def rendered(record: Record, names: Sequence[str], device: Literal["cuda", "cpu"
         frame = capture.frame(name)
         truth = frame.image.to(target).float() / 255.0
         ours = render_at(frame.camera.to(target), False).joint.image.clamp(0, 1)
-        images = pictures.to_bytes(truth), pictures.to_bytes(ours), pictures.error_picture(ours, truth)
+        images = pictures.to_bytes(truth), pictures.to_bytes(ours), pictures.error_image(ours, truth)
         strips[name] = Strip(*map(data_uri, images))
     evaluated, newest = record.metrics.get("iterations"), facts["iteration"]
     note = "" if evaluated == newest else f"pictures are of iteration {newest}, figures of iteration {evaluated}"

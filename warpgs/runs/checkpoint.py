@@ -4,7 +4,7 @@ import json
 import os
 import reprlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from warpgs.config import LARGEST, ModelConfig
-from warpgs.files import beside
+from warpgs.config import MAX_VALUE, ModelConfig
+from warpgs.files import atomic_path
 from warpgs.model.scene import SplitScene
 
 VERSION = 2
@@ -22,166 +22,175 @@ FOLDER = "checkpoints"
 
 
 @dataclass(frozen=True)
-class Checkpoint:
-    """What is read back.
+class Metadata:
+    """What a checkpoint says about itself beside its tensors.
 
     Attributes:
-        path: Where it was read from.
+        iteration: Iterations done.
+        use_deformation: Whether the deformation network moves the dynamic Gaussians.
+        use_appearance: Whether the appearance network changes the static Gaussians.
+        sh_degree: Highest degree of spherical harmonics in use.
+        train_seconds: Training time so far [s].
+        peak_bytes: Peak memory of tensors on the GPU [bytes]; None on CPU.
+        rollbacks: Returns to a checkpoint after a loss that was not finite.
+        views: Ids of the training frames.
+    """
+
+    iteration: int
+    use_deformation: bool
+    use_appearance: bool
+    sh_degree: int
+    train_seconds: float = 0.0
+    peak_bytes: int | None = None
+    rollbacks: int = 0
+    views: tuple[str, ...] = ()
+
+
+FILE_KEYS = {"use_deformation": "moving", "use_appearance": "relit"}
+"""Names of fields of ``Metadata`` in the file where they differ: the format is that of version 2."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was read.
+
+    Attributes:
+        path: The file.
         tensors: By name, on the CPU; those of the scene begin with "scene.".
-        facts: Iteration and other plain values.
+        metadata: Iteration and other plain values.
     """
 
     path: Path
     tensors: dict[str, Tensor]
-    facts: dict[str, Any]
+    metadata: Metadata
 
     def tensor(self, name: str, shape: Sequence[int]) -> Tensor:
-        """A tensor of numbers in single precision.
+        """A tensor of single-precision numbers.
 
         Raises:
-            ValueError: If it is missing or of another shape or type.
+            ValueError: If it is missing or has another shape or type.
         """
+        if name not in self.tensors:
+            raise ValueError(f"{self.path} is damaged: it has no {name}")
         tensor = self.tensors[name]
         if tensor.shape != torch.Size(shape) or tensor.dtype != torch.float32:
             raise ValueError(
-                f"{self.path} is damaged: expected {name} as {list(shape)} numbers in single precision, "
+                f"{self.path} is damaged: expected {name} as {list(shape)} single-precision numbers, "
                 f"got {list(tensor.shape)} {tensor.dtype}"
             )
         return tensor
 
-    def number(self, name: str) -> int | float:
-        """A fact that is a number, 0 or more.
 
-        Raises:
-            ValueError: If it is missing or something else.
-        """
-        value = self.facts[name]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= LARGEST:
-            raise ValueError(f"{self.path} is damaged: {name} can't be {reprlib.repr(value)}")
-        return value
-
-    def flag(self, name: str) -> bool:
-        """A fact that is true or false.
-
-        Raises:
-            ValueError: If it is missing or something else.
-        """
-        value = self.facts[name]
-        if not isinstance(value, bool):
-            raise ValueError(f"{self.path} is damaged: {name} can't be {value!r}")
-        return value
-
-    def check_stage(self, sh_degree: int) -> None:
-        """Checks the facts that say how the scene is shown.
-
-        Args:
-            sh_degree: Highest degree that the scene has.
-
-        Raises:
-            ValueError: If one is missing or something else.
-        """
-        self.flag("moving")
-        self.flag("relit")
-        self.number("iteration")
-        if self.number("sh_degree") not in range(sh_degree + 1):
-            raise ValueError(f"{self.path} is damaged: sh_degree can't be {self.facts['sh_degree']!r}")
-
-
-def save(path: Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Writes a checkpoint beside its place and moves it there, so that no half-written file ever has its name.
+def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
+    """Writes a checkpoint to a temporary file and renames it, so that no half-written file ever has its name.
 
     Raises:
-        OSError: If it can't be written; the message names the file.
+        OSError: If it cannot be written; the message names the file.
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    metadata = {"format": "warpgs", "version": str(VERSION), "facts": json.dumps(facts)}
-    with beside(path) as partial:
+    values = {FILE_KEYS.get(name, name): value for name, value in asdict(metadata).items()}
+    header = {"format": "warpgs", "version": str(VERSION), "facts": json.dumps(values)}
+    with atomic_path(path) as partial:
         partial.touch()
         mode = partial.stat().st_mode
         try:
-            save_file(plain, partial, metadata=metadata)
+            save_file(plain, partial, metadata=header)
         except SafetensorError as error:
             raise OSError(str(error)) from error
-        partial.chmod(mode)  # safetensors lets nobody but the owner read it, unlike all else in a run
+        partial.chmod(mode)  # safetensors lets only the owner read it, unlike every other file of a run
         with open(partial, "rb+") as file:
             os.fsync(file.fileno())
 
 
 def load(path: Path) -> Checkpoint:
-    """Reads a checkpoint; never executes anything of it.
+    """Reads a checkpoint; never executes anything from it.
 
     Raises:
-        ValueError: If it is missing, damaged or not one of ours; the message names the file.
+        ValueError: If it is missing, damaged or not a checkpoint of this program; the message names the file.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != "warpgs":
+            header = file.metadata() or {}
+            if header.get("format") != "warpgs":
                 raise ValueError(f"{path} is not a checkpoint of warpgs")
-            if metadata.get("version") != str(VERSION):
-                raise ValueError(f"{path} has version {metadata.get('version')}, this program reads {VERSION}")
+            if header.get("version") != str(VERSION):
+                raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Checkpoint(path, _Parts(path, tensors), _Parts(path, _facts(path, metadata["facts"])))
+            return Checkpoint(path, tensors, _parse_metadata(path, header["facts"]))
     except FileNotFoundError as error:
         raise ValueError(f"{path} does not exist") from error
     except (SafetensorError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def _facts(path: Path, text: str) -> dict[str, Any]:
+def _parse_metadata(path: Path, text: str) -> Metadata:
     try:
-        return json.loads(text)
+        values = json.loads(text)
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
+    parsed: dict[str, Any] = {}
+    for field in fields(Metadata):
+        key = FILE_KEYS.get(field.name, field.name)
+        if key not in values:
+            raise ValueError(f"{path} is damaged: it has no {key}")
+        value = tuple(values[key]) if field.name == "views" else values[key]
+        if not _is_valid(field.name, value):
+            raise ValueError(f"{path} is damaged: {key} cannot be {reprlib.repr(value)}")
+        parsed[field.name] = value
+    return Metadata(**parsed)
 
 
-class _Parts(dict[str, Any]):
-    """Parts of a file by name; one that it lacks is an error that names the file."""
-
-    def __init__(self, path: Path, parts: dict[str, Any]) -> None:
-        super().__init__(**parts)
-        self._path = path
-
-    def __missing__(self, name: str) -> Any:
-        raise ValueError(f"{self._path} is damaged: it has no {name}")
+def _is_valid(name: str, value: Any) -> bool:
+    if name == "views":
+        return all(isinstance(view, str) for view in value)
+    if name in ("use_deformation", "use_appearance"):
+        return isinstance(value, bool)
+    if name == "peak_bytes" and value is None:
+        return True
+    is_number = isinstance(value, int) or (name == "train_seconds" and isinstance(value, float))
+    return is_number and not isinstance(value, bool) and 0 <= value <= MAX_VALUE
 
 
 def path_of(run: Path, iteration: int) -> Path:
-    """Where a run keeps the checkpoint of an iteration."""
+    """The file of the checkpoint of an iteration."""
     return run / FOLDER / f"{iteration:07d}.safetensors"
 
 
-def saved(run: Path) -> list[Path]:
+def list_checkpoints(run: Path) -> list[Path]:
     """The checkpoints of a run folder, oldest first."""
     return sorted((run / FOLDER).glob("*.safetensors"))
 
 
 def keep_newest(run: Path, count: int) -> None:
-    """Deletes all but the ``count`` newest checkpoints, and what a killed program left half-written."""
-    for path in [*saved(run)[: -max(1, count)], *(run / FOLDER).glob("*.partial")]:
+    """Deletes all but the ``count`` newest checkpoints, and half-written files of a killed program."""
+    for path in [*list_checkpoints(run)[: -max(1, count)], *(run / FOLDER).glob("*.partial")]:
         path.unlink()
 
 
-def load_scene(checkpoint: Checkpoint, config: ModelConfig, origin: Path) -> SplitScene:
-    """The scene of a checkpoint.
+def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
+    """The scene of a checkpoint, on the CPU.
 
     Raises:
-        ValueError: If tensors are missing or of other shapes than the config says; the message names ``origin``.
+        ValueError: If tensors are missing, not finite, or of other shapes than the config says; the message names the
+            file.
     """
     state = {
         name.removeprefix("scene."): tensor for name, tensor in checkpoint.tensors.items() if name.startswith("scene.")
     }
+    path = checkpoint.path
     try:
         # Rows of three: the size of the file bounds their number, whatever shape it claims.
         static, dynamic = state["static.means"].view(-1, 3), state["dynamic.means"].view(-1, 3)
         sizes = len(static), len(dynamic), config
-        with torch.device("meta"):  # where a config that claims too much takes no memory
+        with torch.device("meta"):  # a config that claims too much takes no memory there
             SplitScene.empty(*sizes).load_state_dict(state, assign=True)
         scene = SplitScene.empty(*sizes)
         scene.load_state_dict(state)
     except (KeyError, RuntimeError) as error:
         reason = str(error).splitlines()[:2][-1].strip()  # torch has the first detail on the second line
-        raise ValueError(f"{origin} does not hold a scene of this run's config: {reason}") from error
+        raise ValueError(f"{path} does not hold a scene of this run's config: {reason}") from error
     if not all(bool(torch.isfinite(tensor).all()) for tensor in state.values()):
-        raise ValueError(f"{origin} holds values that are not finite")
+        raise ValueError(f"{path} holds values that are not finite")
+    if checkpoint.metadata.sh_degree > config.sh_degree:
+        raise ValueError(f"{path} is damaged: sh_degree cannot be {checkpoint.metadata.sh_degree}")
     return scene

@@ -1,261 +1,155 @@
-"""Run folders: config.json, checkpoints/, metrics.json, views.csv, events/, pictures/."""
+"""Run folders: config.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
 
 import dataclasses
 import fcntl
-import json
-import reprlib
-import subprocess
-import sys
-import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
-from . import checkpoint
-from warpgs import visualize as pictures
-from warpgs.config import TrainConfig, validate
-from warpgs.data.capture import Capture, Frame
-from warpgs.data.loaders.nerfies import load_capture
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
-from warpgs.data.writer import write_png
-from warpgs.evaluation.evaluate import Evaluation, RenderAt, evaluate, write_json, write_views
-from warpgs.files import read_bounded, write_text
-from warpgs.evaluation.lpips import find, locate
-from .trained import Player
-from warpgs.progress import progress
-from warpgs.render import Rendering
-from warpgs.model.scene import SplitScene
 
-PICTURES = 6
-"""Evaluation views to draw, spread over the capture."""
-
-LARGEST_CONFIG = 1 << 20
-"""Of config.json [bytes]."""
+from . import checkpoint
+from .config_file import read_config, write_config
+from .trained import TrainedScene
 
 LOCK = ".lock"
-"""File in a run folder that whoever trains there holds."""
+"""File in a run folder that the process which trains there keeps locked."""
 
-VIDEO_FRAMES = 120
-"""Frames of the video over time, at most."""
+Device = Literal["cuda", "cpu"]
 
 
-def resolve(config: TrainConfig) -> TrainConfig:
-    """The config with its device chosen.
+def choose_device(asked: Device | None = None) -> Device:
+    """The device that was asked for; CUDA if none was and there is a GPU, else the CPU.
 
     Raises:
-        ValueError: If CUDA is asked for and there is none, or the weights of LPIPS are not where they should be.
+        ValueError: If CUDA was asked for and torch finds no GPU.
     """
-    locate(config.lpips)
-    if config.device == "cuda" and not torch.cuda.is_available():
+    if asked == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
-    return dataclasses.replace(config, device=config.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    return asked or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
-    """The capture of a config; without one, the built-in scene, made if need be."""
+    """The capture of a config; without one the built-in scene, which is rendered on the first call.
+
+    Raises:
+        ValueError: If a file of the capture is missing or damaged; the message names it.
+        OSError: If the built-in scene cannot be written.
+    """
     root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     return load_capture(root, config.dataset, factor=config.factor, perturbation=config.masks)
 
 
 def new_folder(config: TrainConfig, capture: Capture) -> Path:
-    """Where a new run goes; nothing is made yet.
+    """The folder of a new run; nothing is created yet.
 
     Raises:
-        ValueError: If the folder asked for exists already and holds something.
+        ValueError: If ``config.out`` exists already and is not an empty folder.
     """
     folder = config.out
     if folder is None:
         stem = Path("runs") / f"{capture.name}-{config.preset}"
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not empty: go on with --resume {folder}, or choose another --out")
+        raise ValueError(f"{folder} exists and is not empty: continue it with --resume {folder}, or choose another --out")
     return folder
 
 
-def create(folder: Path, config: TrainConfig) -> None:
-    """Makes a run folder and writes its config.json.
+@dataclass(frozen=True)
+class Run:
+    """A run folder with its config, opened for reading.
 
-    Raises:
-        OSError: If it can't be written.
+    Attributes:
+        folder: The run folder.
+        config: Its config; ``device`` is the one that the scene is opened on.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
-    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
-    write_text(folder / "config.json", json.dumps(plain, indent=2, default=str) + "\n")
+
+    folder: Path
+    config: TrainConfig
+
+    @staticmethod
+    def open(folder: Path, device: Device | None = None, data: Path | None = None) -> "Run":
+        """Opens a run folder.
+
+        Args:
+            folder: With config.json.
+            device: Device for the scene; CUDA if None and there is a GPU.
+            data: Current folder of the capture, if it was moved.
+
+        Raises:
+            ValueError: If the folder is not a run folder, its config is damaged, or there is no such device.
+        """
+        config = read_config(folder)
+        return Run(folder, dataclasses.replace(config, device=choose_device(device), data=data or config.data))
+
+    @staticmethod
+    def create(folder: Path, config: TrainConfig) -> "Run":
+        """Creates a run folder and writes its config.json.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(folder, config)
+        return Run(folder, config)
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device(self.config.device or "cpu")
+
+    def open_capture(self, quiet: bool = False) -> Capture:
+        """The capture that the run was trained on; raises as ``open_capture``."""
+        return open_capture(self.config, quiet)
+
+    def newest_checkpoint(self) -> Path | None:
+        """The checkpoint of the last saved iteration; None if there is none yet."""
+        saved = checkpoint.list_checkpoints(self.folder)
+        return saved[-1] if saved else None
+
+    def trained_scene(self) -> TrainedScene:
+        """The scene of the newest checkpoint, on the run's device.
+
+        Raises:
+            ValueError: If there is no checkpoint, or it is damaged or does not fit the config.
+        """
+        path = self.newest_checkpoint()
+        if path is None:
+            raise ValueError(f"{self.folder} has no checkpoint yet")
+        loaded = checkpoint.load(path)
+        scene = checkpoint.load_scene(loaded, self.config.model)
+        return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Locks the folder against other training processes; the lock ends with the process at the latest.
+
+        Raises:
+            ValueError: If another process holds the lock.
+            OSError: If the lock file cannot be written.
+        """
+        with open(self.folder / LOCK, "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ValueError(f"{self.folder} is being trained by another process") from error
+            yield
 
 
-@contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Holds a run folder while it is trained in, so that no other process does; ends with the process at the latest.
-
-    Raises:
-        ValueError: If another process holds it.
-        OSError: If it can't be written in.
-    """
-    with open(folder / LOCK, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"{folder} is being trained by another process") from error
-        yield
-
-
-def load_config(folder: Path) -> TrainConfig:
-    """The config of a run.
-
-    Raises:
-        ValueError: If the folder is no run, or its config has unknown or ill-typed fields.
-    """
-    path = folder / "config.json"
-    if not path.exists():
-        raise ValueError(f"{folder} is no run folder: it has no config.json")
-    data = read_bounded(path, LARGEST_CONFIG)
-    try:
-        values = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    config = dataclasses.replace(_from_plain(TrainConfig, values, path), out=folder)
-    try:
-        validate(config)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    return config
-
-
-def _from_plain(kind: Any, values: Any, path: Path) -> Any:
-    """A (nested) dataclass of what JSON kept of it."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected an object for {kind.__name__}, got {values!r}")
-    hints = typing.get_type_hints(kind)
-    if unknown := sorted(set(values) - set(hints)):
-        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}")
-    parts = {}
-    for name, value in values.items():
-        hint = hints[name]
-        if dataclasses.is_dataclass(hint):
-            value = _from_plain(hint, value, path)
-        elif Path in typing.get_args(hint) and isinstance(value, str):
-            value = Path(value)
-        elif not _fits(value, hint):
-            raise ValueError(f"{path}: {name} can't be {reprlib.repr(value)}")
-        parts[name] = float(value) if hint is float else value
-    return kind(**parts)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    if typing.get_origin(hint) is typing.Literal:
-        return value in typing.get_args(hint)
-    if choices := typing.get_args(hint):
-        return any(_fits(value, choice) for choice in choices)
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-    return type(value) is hint
-
-
-def newest_scene(folder: Path, config: TrainConfig) -> tuple[SplitScene, dict[str, Any]]:
-    """The scene of a run's newest checkpoint, and what the checkpoint says of itself.
-
-    Raises:
-        ValueError: If there is no checkpoint or it is damaged.
-    """
-    saved = checkpoint.saved(folder)
-    if not saved:
-        raise ValueError(f"{folder} has no checkpoint yet")
-    loaded = checkpoint.load(saved[-1])
-    loaded.check_stage(config.model.sh_degree)
-    return checkpoint.load_scene(loaded, config.model, saved[-1]), loaded.facts
-
-
-def evaluate_run(
-    folder: Path,
-    capture: Capture | None = None,
-    lpips: Path | None = None,
-    device: Literal["cuda", "cpu"] | None = None,
-    quiet: bool = False,
-) -> str:
-    """Evaluates the last iterate of a run: metrics.json, views.csv, pictures and a video; returns a text for people.
+def open_run(folder: Path | str, device: Device | None = None) -> TrainedScene:
+    """The trained scene of a run folder: ``open_run("runs/builtin-quick").render(camera)``.
 
     Args:
-        folder: Of the run.
-        capture: Its capture, if that is open already.
-        lpips: Folder with the weights of LPIPS; that of the config if None.
-        device: Where to render; CUDA if there is a GPU.
-        quiet: Whether to show no progress bars.
+        folder: Run folder.
+        device: Device to render on; CUDA if None and there is a GPU.
 
     Raises:
-        ValueError: If the run, its capture or the weights of LPIPS can't be used.
-        OSError: If something can't be written.
+        ValueError: If the folder is not a run folder, has no checkpoint or is damaged.
     """
-    config = resolve(dataclasses.replace(load_config(folder), device=device))
-    target = torch.device(config.device or "cpu")
-    capture = capture or open_capture(config, quiet)
-    scene, facts = newest_scene(folder, config)
-    render_at = Player(scene.to(target), config, facts)
-    network = find(lpips or config.lpips)
-    chosen = {round(k * (len(capture.val) - 1) / max(1, PICTURES - 1)) for k in range(PICTURES)}
-
-    def draw(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
-        if index in chosen:
-            path = folder / "pictures" / f"{frame.name}.png"
-            write_png(path, pictures.comparison(truth, rendering))
-
-    evaluation = evaluate(render_at, capture, target, network and network.to(target), draw, render_at.play, quiet)
-    counts = {"num_static": len(scene.static), "num_dynamic": len(scene.dynamic)}
-    run = {name: facts[name] for name in ("iteration", "train_seconds", "peak_bytes")}
-    totals = {"iterations": run.pop("iteration"), **run, **counts, "commit": _commit()}
-    write_json(folder / "metrics.json", {**evaluation.summary(), **totals})
-    write_views(folder / "views.csv", evaluation)
-    _write_video(folder / "time.mp4", render_at, capture, target, quiet)  # last: figures need no FFmpeg
-    return _report(evaluation, counts)
-
-
-def _write_video(path: Path, render_at: RenderAt, capture: Capture, device: torch.device, quiet: bool) -> None:
-    """The middle evaluation camera (else training camera) over time: joint | static | dynamic."""
-    names = capture.val or capture.train
-    camera = capture.cameras[names[len(names) // 2]].to(device)
-    with pictures.Video(path) as video:
-        for k in progress(range(VIDEO_FRAMES), "video over time", quiet):
-            rendering = render_at(dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1)), True)
-            layers = (rendering.joint, rendering.static, rendering.dynamic)
-            images = [layer.image for layer in layers if layer is not None]
-            video.add(pictures.to_bytes(torch.cat(images, 1)))
-
-
-def _report(evaluation: Evaluation, counts: dict[str, int]) -> str:
-    values = evaluation.summary()
-
-    def show(name: str, digits: int) -> str:
-        value = values[name]
-        return "not measured" if value is None else f"{value:.{digits}f}"
-
-    last_line = f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians"
-    if not evaluation.views:
-        quality = "the capture has no frames to evaluate on: PSNR, SSIM and LPIPS not measured"
-        return f"{quality}\nflicker {show('flicker', 5)}, {show('fps', 1)} frames/s\n{last_line}"
-    lpips = f"LPIPS ({evaluation.lpips_net}) {show('lpips', 4)}"
-    if evaluation.lpips_net is None:
-        lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
-    lines = [
-        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
-        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, "
-        f"flicker {show('flicker', 5)}, {show('fps', 1)} frames/s",
-        last_line,
-    ]
-    if values["masked_psnr"] is not None:
-        lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")
-    return "\n".join(lines)
-
-
-def _commit() -> str | None:
-    """The commit of the program where it runs from a checkout, not that of a checkout which it is installed in."""
-    source = Path(__file__).parents[1]
-    if not (source.parent / ".git").exists():
-        return None
-    try:
-        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=source, capture_output=True, text=True)
-    except OSError:
-        return None
-    return done.stdout.strip() or None
+    return Run.open(Path(folder), device).trained_scene()

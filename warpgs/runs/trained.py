@@ -1,7 +1,6 @@
-"""Playing a trained scene: one frame after another, both networks evaluated for each."""
+"""A trained scene: splats at any time, rendered images, and fast playback."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -9,84 +8,94 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
-from warpgs.runtime.graphs import capture
-from warpgs.render import Rendering, render
-from warpgs.model.splats import Splats
 from warpgs.model.scene import SplitScene
+from warpgs.model.splats import Splats
+from warpgs.render import Rendering, render
+from warpgs.runtime.graphs import GraphCache
 
-MOST_RECORDINGS = 4
-"""Sizes of images whose frames are kept recorded: a few browsers may watch one scene."""
+from .checkpoint import Metadata
+
+MAX_GRAPHS = 4
+"""Image sizes whose frames stay captured: several browsers may watch one scene."""
 
 
-class _Recording(NamedTuple):
-    """A frame in a CUDA graph, which reads the camera and the time from where they were when it was recorded."""
+class _Inputs(NamedTuple):
+    """What a captured frame reads, at addresses that stay the same."""
 
-    camera: Camera
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
     time: Float[Tensor, "1"]
-    replay: Callable[[], tuple[Tensor, ...]]
 
 
-class Player:
-    """Renders a scene as the stage that it was trained to does.
-
-    On CUDA, ``play`` records a frame in a CUDA graph and replays it for every camera of the same size: Python takes
-    longer to launch a frame's kernels than the GPU to run them.
+class TrainedScene:
+    """The scene of a checkpoint, rendered as the stage of training that wrote it does.
 
     Args:
-        scene: On its device.
-        config: Of its run.
-        facts: Of its checkpoint.
+        scene: Gaussians and networks, on the device to render on.
+        config: Config of the run.
+        metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
     """
 
-    def __init__(self, scene: SplitScene, config: TrainConfig, facts: dict[str, Any]) -> None:
-        self.scene, self.config, self.facts = scene, config, facts
-        self._moving, self._relit, self._degree = bool(facts["moving"]), bool(facts["relit"]), int(facts["sh_degree"])
-        self._recordings: dict[tuple[int, int], _Recording] = {}
+    def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:
+        self.scene, self.config, self.metadata = scene, config, metadata
+        self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS)
+        self._inputs: _Inputs | None = None
 
     @property
     def device(self) -> torch.device:
         return self.scene.static.means.device
 
     @property
-    def records(self) -> bool:
-        """Whether ``play`` replays a CUDA graph."""
+    def uses_graphs(self) -> bool:
+        """Whether ``play`` replays CUDA graphs."""
         return self.device.type == "cuda" and self.config.graph
 
-    def is_recorded(self, size: tuple[int, int]) -> bool:
-        """Whether a frame of this size is recorded already; else the next one takes longer."""
-        return size in self._recordings
+    def is_captured(self, size: tuple[int, int]) -> bool:
+        """Whether frames of this (width, height) replay already; until then a frame takes longer."""
+        return self._graphs.is_captured(size)
 
     @torch.no_grad()
-    def splats(self, moment: float, residual: bool = True) -> Splats:
-        """The scene at a moment in [0, 1], with or without the appearance residual."""
-        time = torch.tensor([moment], device=self.device)
-        return self.scene.splats(time, self._moving, self._relit and residual, self._degree)
+    def splats(self, time: float, residual: bool = True) -> Splats:
+        """The Gaussians at a time in [0, 1], static ones first.
 
-    def __call__(self, camera: Camera, branches: bool) -> Rendering:
-        """Renders through a camera at the camera's time, with or without the images of the branches."""
-        return self._render(camera, torch.tensor([camera.time], device=camera.viewmat.device), branches)
+        Args:
+            time: Time in [0, 1].
+            residual: Whether the appearance network changes the static Gaussians (paper Eq. 8).
+        """
+        flags = self.metadata.use_deformation, self.metadata.use_appearance and residual
+        return self.scene.splats(torch.tensor([time], device=self.device), *flags, self.metadata.sh_degree)
+
+    def render(self, camera: Camera, time: float | None = None, branches: bool = False) -> Rendering:
+        """Renders the scene through a camera on its device.
+
+        Args:
+            camera: The camera.
+            time: Time in [0, 1]; ``camera.time`` if None.
+            branches: Whether to render the static and the dynamic image as well.
+        """
+        time = camera.time if time is None else time
+        return self._render(camera, torch.tensor([time], device=camera.viewmat.device), branches)
 
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """The joint image; on CUDA the same tensor every time, with new values."""
-        if not self.records:
-            return self(camera, False).joint.image
-        recording = self._recordings.get(camera.size) or self._record(camera)
-        recording.camera.viewmat.copy_(camera.viewmat)
-        recording.camera.K.copy_(camera.K)
-        recording.time.fill_(camera.time)
-        return recording.replay()[0]
+        """The joint image at the camera's time, as fast as possible.
 
-    def _record(self, camera: Camera) -> _Recording:
-        while len(self._recordings) >= MOST_RECORDINGS:
-            del self._recordings[next(iter(self._recordings))]
-        seen = Camera(camera.viewmat.clone(), camera.K.clone(), *camera.size)
-        time = torch.tensor([camera.time], device=camera.viewmat.device)
-        replay = capture(lambda: (self._render(seen, time, False).joint.image,))
-        recording = self._recordings[camera.size] = _Recording(seen, time, replay)
-        return recording
+        On CUDA the frame is captured in a CUDA graph and replayed for every camera of the same size; the image is then
+        the same tensor in every call, with new values.
+        """
+        if not self.uses_graphs:
+            return self.render(camera).joint.image
+        if self._inputs is None:
+            self._inputs = _Inputs(camera.viewmat.clone(), camera.K.clone(), camera.viewmat.new_zeros(1))
+        inputs = self._inputs
+        inputs.viewmat.copy_(camera.viewmat)
+        inputs.K.copy_(camera.K)
+        inputs.time.fill_(camera.time)
+        seen = Camera(inputs.viewmat, inputs.K, *camera.size)
+        return self._graphs.run(camera.size, lambda: (self._render(seen, inputs.time, False).joint.image,))[0]
 
     @torch.no_grad()
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
         settings = RenderSettings(branches=branches, antialias=self.config.antialias)
-        splats = self.scene.splats(time, self._moving, self._relit, self._degree, late_sh=True)
+        flags = self.metadata.use_deformation, self.metadata.use_appearance
+        splats = self.scene.splats(time, *flags, self.metadata.sh_degree, late_sh=True)
         return render(splats, camera, settings=settings)

@@ -28,16 +28,16 @@ PLAIN_CALLS = 8
 """Calls of one kind before one is recorded. They load kernels, find out how many intersections to expect, and show that
 the calls do repeat: recording takes as long as some of them."""
 
-LARGEST = 1 << 25
+MAX_VALUE = 1 << 25
 """Bytes of inputs and outputs above which nothing is replayed: launching is not what takes time there, copying is."""
 
-MOST_KINDS = 16
+MAX_KEYS = 16
 """Kinds of calls that are remembered."""
 
-MOST_RECORDINGS = 4
+MAX_RECORDINGS = 4
 """Of all kinds together: so many renders may wait for their ways back at a time."""
 
-MOST_WAYS_BACK = 4
+MAX_BACKWARDS = 4
 """Sets of outputs that cotangents arrive at, of one recording; the way back from others is gone plainly."""
 
 
@@ -139,7 +139,7 @@ class Recording:
         else:
             # The first time plainly: it loads kernels, which a capture could not.
             gradients = self.go_back(cotangents)
-            if len(self._ways_back) < MOST_WAYS_BACK:
+            if len(self._ways_back) < MAX_BACKWARDS:
                 self._ways_back[arrived] = None
         for output, k in zip(filled, self.filled, strict=True):
             output.copy_(self._outputs.tensors[k])
@@ -200,7 +200,7 @@ class _Kind:
 
     def lease(self, op: Op, tensors: Sequence[Tensor | None], wants: bool) -> _Lease | None:
         """A recording for this call, if there is one or it is time to make one."""
-        if self.calls < PLAIN_CALLS or self.bytes > LARGEST:
+        if self.calls < PLAIN_CALLS or self.bytes > MAX_VALUE:
             return None
         if self.idle:
             recording = self.idle.pop()
@@ -224,7 +224,7 @@ atexit.register(_kinds.clear)  # graphs go before CUDA does
 
 def _kind(key: Hashable) -> _Kind:
     kind = _kinds.pop(key, None) or _Kind()
-    if len(_kinds) == MOST_KINDS:
+    if len(_kinds) == MAX_KEYS:
         del _kinds[next(iter(_kinds))]
     _kinds[key] = kind
     return kind
@@ -232,7 +232,7 @@ def _kind(key: Hashable) -> _Kind:
 
 def _make_room() -> bool:
     """Whether another recording may be made; drops one of the least recent kind that has one to spare."""
-    if sum(kind.recordings for kind in _kinds.values()) < MOST_RECORDINGS:
+    if sum(kind.recordings for kind in _kinds.values()) < MAX_RECORDINGS:
         return True
     for kind in _kinds.values():
         if kind.idle:

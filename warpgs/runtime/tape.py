@@ -28,7 +28,7 @@ wp.init()
 CHUNKS_PER_SHARD = 16
 """Pieces a core that a CPU launch is cut into and that are dealt out in turn, so that cores get like shares."""
 
-SMALLEST_SHARD = 16384
+MIN_SHARD = 16384
 """Threads below which a CPU launch is not worth another core."""
 
 LITTLE_WORK = 1 / 16
@@ -164,7 +164,7 @@ class Run:
         if self.is_cuda:
             command_for(kernel, self.device, block_dim)(dim, 0, arguments, self.stream)
             return
-        shards = self.num_shards if dim * work >= SMALLEST_SHARD else 1
+        shards = self.num_shards if dim * work >= MIN_SHARD else 1
         chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
         def run_shard(shard: int) -> None:

@@ -22,7 +22,7 @@ COLOR_VIEWS = 12
 LIFTED_SHARE = 8
 """Moving pixels that are lifted, for each dynamic Gaussian to begin with, at most."""
 
-LEAST_KNOWN = 0.1
+MIN_KNOWN_FRACTION = 0.1
 """Share of the moving pixels that depth must be known of; depth from motion knows that of what stands still only."""
 
 NEAREST_POINTS = 8
@@ -31,13 +31,13 @@ NEAREST_POINTS = 8
 BEFORE = 0.9
 """Its depth over that of the nearest of them."""
 
-MOST_POINTS = 2_000
+MAX_POINTS = 2_000
 """Points of a picture that are looked at for it."""
 
 PIXELS_AT_ONCE = 8_192
 """Keeps the table of their distances from the points under 100 MB."""
 
-LARGEST_SHARE = 0.5
+MAX_FRACTION = 0.5
 """Largest first Gaussian of unknown place, as a share of the size at which densification removes it."""
 
 
@@ -94,7 +94,7 @@ def dynamic_gaussians(
     share = min(1.0, LIFTED_SHARE * most / num_moving)
     planes = (depth.metric_depth(views[k].inverse_depth, alignments[k]) for k in range(len(views)))
     positions, colors = _lift(views, planes, share, generator)
-    if len(positions) >= LEAST_KNOWN * share * num_moving:
+    if len(positions) >= MIN_KNOWN_FRACTION * share * num_moving:
         chosen = init.subsample(positions, most, generator)
         return init.from_points(positions[chosen], colors[chosen], degree)
     points = capture.points.to(views.device)
@@ -105,7 +105,7 @@ def dynamic_gaussians(
         positions = _anywhere(trunk.center.cpu(), trunk.half_size.cpu(), most, generator)
         colors = torch.full_like(positions, 0.5)
     chosen = init.subsample(positions, most, generator)
-    largest = LARGEST_SHARE * config.densify.max_size * capture.extent
+    largest = MAX_FRACTION * config.densify.max_size * capture.extent
     return init.from_points(positions[chosen], colors[chosen], degree, largest)
 
 
@@ -144,7 +144,7 @@ def _before_points(view: View, points: Float[Tensor, "P 3"], generator: torch.Ge
     plane = torch.full(view.static_mask.shape, torch.nan, device=points.device)
     row, column, z, inside = view.camera.project(points)
     seen = inside.nonzero()[:, 0]
-    seen = seen[init.subsample(seen, MOST_POINTS, generator).to(seen.device)]
+    seen = seen[init.subsample(seen, MAX_POINTS, generator).to(seen.device)]
     moving = (~view.static_mask).nonzero()
     if len(seen) == 0:
         return plane

@@ -35,7 +35,7 @@ class Status(NamedTuple):
     num_dynamic: int
 
 
-class Logbook:
+class TrainingLogger:
     """A context that shows progress and writes TensorBoard events into ``folder``."""
 
     def __init__(self, folder: Path, num_iterations: int, first_iteration: int) -> None:
@@ -58,7 +58,7 @@ class Logbook:
             )
             self._task = self._bar.add_task("starting", total=num_iterations, completed=first_iteration, facts="")
 
-    def __enter__(self) -> "Logbook":
+    def __enter__(self) -> "TrainingLogger":
         if self._bar is not None:
             self._bar.start()
         return self

@@ -83,7 +83,7 @@ class Protocol:
         self.stage2 = Stage("stage2", pretrain + stage1, pretrain + stage1 + stage2)
         self.num_iterations = self.stage2.end
         # Iterations of stage I from which the networks are in use; in stage II they always are.
-        starts = {"deformation": schedule.deform_from, "appearance": schedule.relight_from}
+        starts = {"deformation": schedule.deform_from, "appearance": schedule.appearance_from}
         self._begin = {name: min(start, stage1) for name, start in starts.items()}
 
     def stage_at(self, iteration: int) -> Stage:

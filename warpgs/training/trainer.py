@@ -15,7 +15,7 @@ from warpgs.runs import checkpoint
 from . import initialize
 from .densify import densify, reset_opacities
 from .interrupt import Interrupt
-from .logger import Logbook, Status
+from .logger import Status, TrainingLogger
 from .prune import prune_invisible
 from .schedule import Moment, Protocol
 from .step import TERMS, Draw, Step
@@ -24,7 +24,7 @@ from .views import Views
 LOOK_EVERY = 50
 """Iterations between looks at the loss: reading it waits for the device."""
 
-MOST_ROLLBACKS = 3
+MAX_ROLLBACKS = 3
 """Returns to the last checkpoint because of a loss that is not finite, before giving up."""
 
 
@@ -67,7 +67,7 @@ class Trainer:
 
     # The algorithm ----------------------------------------------------------------------------------------------------
 
-    def train(self, logbook: Logbook, interrupt: Interrupt | None = None) -> bool:
+    def train(self, logger: TrainingLogger, interrupt: Interrupt | None = None) -> bool:
         """Trains to the end of the protocol, from wherever it stands, and leaves a checkpoint of where it stops.
 
         Returns:
@@ -83,21 +83,21 @@ class Trainer:
                 self._add_dynamic()
             moment = self.protocol.at(self.iteration)
             self.step(moment, self._draw(moment))
-            self._adapt(moment, logbook)
+            self._adapt(moment, logger)
             self.iteration += 1
             at_checkpoint = self.iteration % self.config.checkpoint_every == 0
             at_checkpoint |= self.iteration == self.protocol.num_iterations
             stop = interrupt is not None and interrupt.wanted
             if at_checkpoint or stop or self.iteration % LOOK_EVERY == 0:
-                if not self._look(moment, logbook):
-                    self._roll_back(logbook)
+                if not self._look(moment, logger):
+                    self._roll_back(logger)
                 elif at_checkpoint or stop:
                     self.save()
             if stop:
                 return False
         return True
 
-    def _adapt(self, moment: Moment, logbook: Logbook) -> None:
+    def _adapt(self, moment: Moment, logger: TrainingLogger) -> None:
         """Changes depth alignment and the set of Gaussians where the schedule says so."""
         scene, config = self.scene, self.config.densify
         if moment.realign:
@@ -118,7 +118,7 @@ class Trainer:
             cameras = [self.capture.cameras[name].to(self.device) for name in self.capture.train]
             settings = (moment.sh_degree, config.visibility, self.config.antialias)
             removed = prune_invisible(scene, self.step.optimizer, cameras, *settings)
-            logbook.say(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
+            logger.say(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
         if moment.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
@@ -157,7 +157,7 @@ class Trainer:
 
     # Looking, saving, going back --------------------------------------------------------------------------------------
 
-    def _look(self, moment: Moment, logbook: Logbook) -> bool:
+    def _look(self, moment: Moment, logger: TrainingLogger) -> bool:
         """Shows the means since the last look; false if the loss or a parameter was not finite.
 
         Gaussians that are not finite are not drawn: the loss alone would not tell.
@@ -170,23 +170,23 @@ class Trainer:
         if not math.isfinite(loss) or not bool(finite):
             return False
         num_static, num_dynamic = len(self.scene.static), len(self.scene.dynamic)
-        logbook.show(Status(self.iteration, moment.stage.name, loss, psnr / steps, means, num_static, num_dynamic))
+        logger.show(Status(self.iteration, moment.stage.name, loss, psnr / steps, means, num_static, num_dynamic))
         return True
 
-    def _roll_back(self, logbook: Logbook) -> None:
+    def _roll_back(self, logger: TrainingLogger) -> None:
         """Returns to the newest checkpoint; what follows is random in another way."""
         newest = checkpoint.saved(self.run)[-1]
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
-        if rollbacks > MOST_ROLLBACKS:
+        if rollbacks > MAX_ROLLBACKS:
             raise ValueError(
                 f"the loss or a parameter is not finite after iteration {failed_at}, and was not after "
-                f"{MOST_ROLLBACKS} returns to a checkpoint; {newest} holds the last good state"
+                f"{MAX_ROLLBACKS} returns to a checkpoint; {newest} holds the last good state"
             )
         self.restore(newest)
         self.rollbacks = rollbacks
-        logbook.say(
+        logger.say(
             f"the loss or a parameter is not finite after iteration {failed_at}: back to iteration {self.iteration}, "
-            f"with views and noise in another order ({rollbacks} of at most {MOST_ROLLBACKS} times)"
+            f"with views and noise in another order ({rollbacks} of at most {MAX_ROLLBACKS} times)"
         )
 
     def save(self) -> None:

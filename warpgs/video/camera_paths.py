@@ -19,7 +19,7 @@ from warpgs.data.capture import Capture
 SMOOTHING = 0.02
 """Standard deviation by which a filming camera's path is smoothed, as a share of the film."""
 
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 """Of a path."""
 
 UP = (0.0, -1.0, 0.0)
@@ -38,7 +38,7 @@ FARTHEST = 4.0
 RADIUS_QUANTILE = 0.98
 """Share of a scene's Gaussians within its radius: a few always lie far away."""
 
-MOST_MEANS = 100_000
+MAX_MEANS = 100_000
 SPIRAL_TURNS = 2
 BULLET_ARC = math.radians(15.0)
 """How far bullet time goes to either side: one camera has not seen what lies further around."""
@@ -66,7 +66,7 @@ class Ball:
         points = points[torch.isfinite(points).all(1)]
         if not len(points):
             raise ValueError("the scene has no Gaussians")
-        some = points[:: max(1, len(points) // MOST_MEANS)]
+        some = points[:: max(1, len(points) // MAX_MEANS)]
         center = some.median(0).values
         radius = float((some - center).norm(dim=1).quantile(RADIUS_QUANTILE))
         if also is not None and len(also):
@@ -95,7 +95,7 @@ def upward(capture: Capture) -> Float[Tensor, "3"]:
     return up if float(up.norm()) > 1e-3 else torch.tensor(UP)
 
 
-def guessed(ball: Ball, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
+def default_camera(ball: Ball, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
     """A camera that sees most of a scene from one side, a direction of x and z, with y pointing down."""
     position = ball.center + GUESSED_DISTANCE * ball.radius * torch.tensor([side[0], 0.0, side[1]])
     focal = GUESSED_FOCAL * GUESSED_SIZE[1]
@@ -107,12 +107,12 @@ def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:
     return [dataclasses.replace(camera, time=time) for time in times]
 
 
-def evenly(frames: int) -> list[float]:
+def evenly_spaced(frames: int) -> list[float]:
     """So many times over [0, 1]."""
     return [k / max(1, frames - 1) for k in range(frames)]
 
 
-def filming(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list[Camera]:
+def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list[Camera]:
     """The training cameras in the order of their times, smoothed, with time running over [0, 1].
 
     Where several were filmed at one time, the first of them counts.
@@ -121,7 +121,7 @@ def filming(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list
     for name in capture.train:
         by_time.setdefault(capture.cameras[name].time, capture.cameras[name])
     times = sorted(by_time)
-    moments = evenly(frames)
+    moments = evenly_spaced(frames)
     inside = np.clip(moments, times[0], times[-1]).tolist()
     path = interpolated([by_time[time] for time in times], times, inside)
     path = _smoothed(path, smoothing * max(1, frames - 1)) if smoothing > 0 and frames > 2 else path

@@ -17,9 +17,8 @@ from torch import Tensor
 from warpgs import visualize as pictures
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
-from warpgs.data.writer import write_png
 from warpgs.evaluation.evaluate import RenderAt
-from warpgs.files import remove_numbered
+from warpgs.files import remove_numbered, write_png
 from warpgs.progress import progress
 from warpgs.render import Rendering
 from warpgs.runs import run as runs
@@ -41,7 +40,7 @@ MEANT_FOR = {
 }
 """Options that only some paths have."""
 
-LARGEST_SUPERSAMPLING = 8
+MAX_SUPERSAMPLING = 8
 REACH = 0.3
 """Radius of the spiral, as a share of the radius of the filming camera's own path."""
 
@@ -123,10 +122,10 @@ def _check(options: Render) -> None:
         value = getattr(options, name)
         if value is not None and value is not False and options.kind not in kinds:
             raise ValueError(f"--{name} is for {' and '.join(kinds)}, not for {options.kind}")
-    if options.frames is not None and not 1 <= options.frames <= paths.MOST_FRAMES:
-        raise ValueError(f"--frames must be between 1 and {paths.MOST_FRAMES:,}, got {options.frames}")
-    if not 1 <= options.supersample <= LARGEST_SUPERSAMPLING:
-        raise ValueError(f"--supersample must be between 1 and {LARGEST_SUPERSAMPLING}, got {options.supersample}")
+    if options.frames is not None and not 1 <= options.frames <= paths.MAX_FRAMES:
+        raise ValueError(f"--frames must be between 1 and {paths.MAX_FRAMES:,}, got {options.frames}")
+    if not 1 <= options.supersample <= MAX_SUPERSAMPLING:
+        raise ValueError(f"--supersample must be between 1 and {MAX_SUPERSAMPLING}, got {options.supersample}")
     if options.time is not None and not 0 <= options.time <= 1:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
     if not (math.isfinite(options.scale) and options.scale > 0):
@@ -146,15 +145,15 @@ def _cameras(options: Render, capture: Capture, moving: Tensor, means: Tensor) -
             raise ValueError(f"{capture.name} has no evaluation views; choose another --path")
         return [capture.cameras[name] for name in capture.val], list(capture.val)
     if options.path in ("frozen", "moving"):
-        path = paths.filming(capture, frames)
+        path = paths.training_path(capture, frames)
         frozen = [dataclasses.replace(camera, time=moment) for camera in path]
         return _numbered(path if options.path == "moving" else frozen)
     camera = _view(options, capture)
     if options.path == "fixed":
-        return _numbered(paths.at_times(camera, paths.evenly(frames)))
+        return _numbered(paths.at_times(camera, paths.evenly_spaced(frames)))
     distance = paths.focus(camera, moving if len(moving) else means)
     if options.path == "spiral":
-        times = paths.evenly(frames) if options.time is None else [options.time] * frames
+        times = paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
         return _numbered(paths.spiral(camera, distance, REACH * capture.extent, times))
     return _numbered(paths.bullet(camera, distance, moment, frames))
 

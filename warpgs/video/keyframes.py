@@ -34,9 +34,9 @@ KEYS = {*POSES, "target", "K", "width", "height", "time", "focal", "at"}
 RIGID = 1e-3
 """How far a rotation times its transpose may be from the identity."""
 
-LARGEST_FILE = 1 << 20
-LARGEST_SIDE = 32768
-LARGEST = 1e9
+MAX_FILE = 1 << 20
+MAX_SIDE = 32768
+MAX_VALUE = 1e9
 """Of all numbers."""
 
 SHORTEST = 1e-3
@@ -61,12 +61,12 @@ def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
         size = cameras[0].size if cameras else None
         cameras.append(_keyframe(f"{path}: keyframe {k}", value, capture, up, size))
     places = _places(path, keyframes)
-    at = [places[0] + (places[-1] - places[0]) * share for share in paths.evenly(frames)]
+    at = [places[0] + (places[-1] - places[0]) * share for share in paths.evenly_spaced(frames)]
     return paths.interpolated(cameras, places, at, smooth=True)
 
 
 def _load(path: Path) -> dict[str, Any]:
-    data = read_bounded(path, LARGEST_FILE)
+    data = read_bounded(path, MAX_FILE)
     try:
         values = json.loads(data.decode())
     except (ValueError, RecursionError) as error:
@@ -132,8 +132,8 @@ def _saved(name: str, value: dict[str, Any], first: Camera) -> Camera:
     if not (K[0, 1] == K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
         raise ValueError(f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
     width, height = value["width"], value["height"]
-    if any(type(side) is not int or not 0 < side <= LARGEST_SIDE for side in (width, height)):
-        raise ValueError(f"{name}: expected a width and a height of 1 to {LARGEST_SIDE}, got {width!r} and {height!r}")
+    if any(type(side) is not int or not 0 < side <= MAX_SIDE for side in (width, height)):
+        raise ValueError(f"{name}: expected a width and a height of 1 to {MAX_SIDE}, got {width!r} and {height!r}")
     return Camera(viewmat, K, width, height)
 
 
@@ -160,7 +160,7 @@ def _places(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_VALUE:
         raise ValueError(f"{name} must be a number, got {reprlib.repr(value)}")
     return float(value)
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import viser
 
-from warpgs.video.camera_paths import UP, Ball, guessed
+from warpgs.video.camera_paths import UP, Ball, default_camera
 
 from .pose import pose_of
 from .source import Source
@@ -52,7 +52,7 @@ def first_look(source: Source, training: TrainingCameras | None) -> Look:
     if player is not None:
         means = torch.cat([player.scene.static.means, player.scene.dynamic.means]).detach().cpu()
         ball = Ball.around(means) if len(means) else ball
-    camera = guessed(ball)
+    camera = default_camera(ball)
     position, target = camera.position.double().numpy(), ball.center.double().numpy()
     return Look(position, target, np.array(UP), pose_of(camera).fov)
 

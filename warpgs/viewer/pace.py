@@ -11,7 +11,7 @@ MOVING_SECONDS = 1 / 12
 FORGET = 0.8
 """Weight of everything measured so far against the newest image."""
 
-MOST_FIXED = 1.5
+MAX_FIXED = 1.5
 """What an image may take while moving, as a multiple of the part that pixels do not change: less would only blur it."""
 
 
@@ -51,7 +51,7 @@ class Pace:
     def while_moving(self, pixels: int) -> float:
         """The scale to draw at while something moves, for an image that has ``pixels`` as a whole."""
         fixed, slope = self.cost()
-        allowed = max(self._moving_seconds, MOST_FIXED * fixed)
+        allowed = max(self._moving_seconds, MAX_FIXED * fixed)
         fits = [scale for scale in SCALES if fixed + slope * pixels * scale**2 * 1e-6 <= allowed]
         return fits[0] if fits else SCALES[-1]
 

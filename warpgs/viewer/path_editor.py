@@ -13,7 +13,7 @@ from .frustums import ORANGE, add_frustum
 from .panel import Panel, plain
 from .pose import camera_of, pose_of
 
-MOST_KEYFRAMES = 1000
+MAX_KEYFRAMES = 1000
 
 
 class PathEditor:
@@ -42,8 +42,8 @@ class PathEditor:
         pose = pose_of(seen)
         even = (max(2, seen.width & ~1), max(2, seen.height & ~1))  # video codecs want even sizes
         with self._changing:
-            if len(self.cameras) >= MOST_KEYFRAMES:
-                self._panel.path_note.content = f"a path has at most {MOST_KEYFRAMES} keyframes"
+            if len(self.cameras) >= MAX_KEYFRAMES:
+                self._panel.path_note.content = f"a path has at most {MAX_KEYFRAMES} keyframes"
                 return
             size = self.cameras[0].size if self.cameras else even  # a film has one
             self.cameras.append(camera_of(pose, size, seen.time))

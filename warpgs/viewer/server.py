@@ -23,7 +23,7 @@ class _Server(viser.ViserServer):
         return None
 
 
-LARGEST_PORT = 65535
+MAX_PORT = 65535
 
 
 def check_address(host: str, port: int) -> None:
@@ -32,8 +32,8 @@ def check_address(host: str, port: int) -> None:
     Raises:
         OSError: If the port is in use or the host is not of this machine; the message names both.
     """
-    if not 0 <= port <= LARGEST_PORT:  # else only its last 16 bits would be tried here, and viser would hang
-        raise OSError(f"can't listen on port {port}: choose a --port from 0 to {LARGEST_PORT}")
+    if not 0 <= port <= MAX_PORT:  # else only its last 16 bits would be tried here, and viser would hang
+        raise OSError(f"can't listen on port {port}: choose a --port from 0 to {MAX_PORT}")
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.create_server(address[:2], family=family):

@@ -41,17 +41,17 @@ QUALITY, QUALITY_AT_REST = 80, 92
 RATE_SECONDS = 2.0
 """Pictures of the last seconds that count for frames a second; at rest it is what the last one would allow."""
 
-LARGEST_CANVAS = (4096, 2160)
+MAX_CANVAS = (4096, 2160)
 """Width and height to draw for [px]."""
 
-MOST_UPRIGHT = 4
+MAX_ASPECT = 4
 """Height over width of a keyframe, at most."""
 
 KEYFRAME_SCALE = 0.1
 """Size to draw keyframes at where there are no training cameras [scene units]."""
 
 
-class Wish(NamedTuple):
+class RenderRequest(NamedTuple):
     """Everything that a picture depends on, but its resolution."""
 
     player: Player
@@ -93,10 +93,10 @@ class Session:
         self._pace, self._clock = Pace(), Clock()
         self._stopped, self._wake = threading.Event(), threading.Event()
         self._changing = threading.Lock()  # every event of the panel comes on a thread of its own
-        self._wished: Wish | None = None
+        self._wished: RenderRequest | None = None
         self._changed = 0.0
-        self._shown: tuple[Wish, float] | None = None
-        self._splats: tuple[Wish, Splats] | None = None
+        self._shown: tuple[RenderRequest, float] | None = None
+        self._splats: tuple[RenderRequest, Splats] | None = None
         self._sent: deque[float] = deque(maxlen=200)
         self._cost = ("", 0.0)
         self._note = self._problem = ""
@@ -204,14 +204,14 @@ class Session:
             return 0.0
         return rest if rest > 0 and shown < 1 else IDLE_SECONDS
 
-    def _wish(self) -> Wish | None:
+    def _wish(self) -> RenderRequest | None:
         player, panel = self._source.current(), self.panel
         if player is None:
             return None
         looks = (panel.layer.value, bool(panel.residual.value), panel.moment)
-        return Wish(player, self._pose(), self._canvas(), panel.across, *looks)
+        return RenderRequest(player, self._pose(), self._canvas(), panel.across, *looks)
 
-    def _draw(self, wish: Wish, scale: float, size: tuple[int, int]) -> None:
+    def _draw(self, wish: RenderRequest, scale: float, size: tuple[int, int]) -> None:
         replays = scale == 1 and wish.layer == "joint" and wish.residual and wish.player.records
         is_first = replays and not wish.player.is_recorded(size)
         with self._rendering:
@@ -228,14 +228,14 @@ class Session:
         self._sent.append(now)
         self._cost = (f"{size[0]} × {size[1]} rendered in {(drawn - start) * 1e3:.1f} ms", 1.0 / (now - start))
 
-    def _replayed(self, wish: Wish, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    def _replayed(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
         """A whole joint picture on CUDA, faster than its kernels could be launched."""
         return to_bytes(wish.player.play(camera.to(wish.player.device)))
 
-    def _rendered(self, wish: Wish, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    def _rendered(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
         return picture(self._splats_of(wish), camera, wish.layer, wish.player.config.antialias)
 
-    def _splats_of(self, wish: Wish) -> Splats:
+    def _splats_of(self, wish: RenderRequest) -> Splats:
         """The scene at the moment; the last one is kept, so that the networks rest while only the camera moves."""
         kept = self._splats
         if kept is None or any(getattr(kept[0], n) != getattr(wish, n) for n in ("player", "moment", "residual")):
@@ -250,14 +250,14 @@ class Session:
         """Size of the canvas, no larger than any screen: the browser may claim what it likes."""
         camera = self._client.camera
         width, height = max(1, camera.image_width), max(1, camera.image_height)
-        factor = min(1.0, LARGEST_CANVAS[0] / width, LARGEST_CANVAS[1] / height)
+        factor = min(1.0, MAX_CANVAS[0] / width, MAX_CANVAS[1] / height)
         return max(1, round(width * factor)), max(1, round(height * factor))
 
     def _look(self) -> Camera:
         """What is seen, as wide as the slider says: the browser changes the size of its canvas as it likes."""
         width, height = self._canvas()
         across = self.panel.across
-        high = min(max(1, round(height * across / width)), MOST_UPRIGHT * across)
+        high = min(max(1, round(height * across / width)), MAX_ASPECT * across)
         return camera_of(self._pose(), (across, high), self.panel.moment)
 
     def _say(self) -> None:

@@ -13,7 +13,7 @@ from warpgs.video.camera_paths import focus, upward
 from .pose import Pose, pose_of
 
 PICTURE_WIDTH = 320
-MOST_FRUSTUMS = 48
+MAX_FRUSTUMS = 48
 """Cameras to draw into the scene, at most; the slider has them all."""
 
 FRUSTUM_SCALE = 0.08
@@ -63,7 +63,7 @@ class TrainingCameras:
     def spread(self) -> list[int]:
         """Numbers of the views to draw into the scene."""
         last = len(self.views) - 1
-        count = min(MOST_FRUSTUMS, len(self.views))
+        count = min(MAX_FRUSTUMS, len(self.views))
         return sorted({round(k * last / max(1, count - 1)) for k in range(count)})
 
     def _picture(self, number: int) -> UInt8[np.ndarray, "H W 3"] | None:

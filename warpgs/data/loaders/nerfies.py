@@ -19,11 +19,11 @@ from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.lens import Lens, straighten
+from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import check_perturbation, perturb
 from warpgs.data.points import read_points
-from warpgs.data.reading import read_json
 from warpgs.data.units import read_units
+from warpgs.files import read_json
 
 Dataset = Literal["nerfds", "hypernerf", "iphone"]
 
@@ -209,15 +209,15 @@ class _Reader:
 
     def read(self, name: str) -> Frame:
         files, lens, size = self.files[name], self.lenses[name], self.cameras[name].size
-        mask = None if files.mask is None else straighten(images.read_mask(files.mask, size), lens)
+        mask = None if files.mask is None else undistort(images.read_mask(files.mask, size), lens)
         if mask is not None and name in self.train:
             mask = perturb(mask, self.perturbation, name)
-        depth = None if files.depth is None else straighten(self._inverse_depth(files.depth, size), lens)
-        covisible = None if files.covisible is None else straighten(images.read_mask(files.covisible, size), lens)
+        depth = None if files.depth is None else undistort(self._inverse_depth(files.depth, size), lens)
+        covisible = None if files.covisible is None else undistort(images.read_mask(files.covisible, size), lens)
         return Frame(
             name,
             self.cameras[name],
-            torch.from_numpy(straighten(images.read_image(files.image, size), lens)),
+            torch.from_numpy(undistort(images.read_image(files.image, size), lens)),
             None if mask is None else torch.from_numpy(mask),
             None if depth is None else torch.from_numpy(depth),
             None if covisible is None else torch.from_numpy(covisible),
