@@ -17,9 +17,12 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.files import write_array, write_json, write_png
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
 from warpgs.progress import progress
+
+from . import writer
+from .lens import Lens
+from .units import SceneUnits
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
 """Scene units are (p − CENTER) · SCALE."""
@@ -170,41 +173,25 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
     num_static = len(_static_bodies())
     jobs = [("left", k, 0.0) for k in range(scene.num_frames)]
     jobs += [("right", k, BASELINE) for k in range(0, scene.num_frames, 2)]
-    metadata, points = {}, []
-    for side, k, shift in progress(jobs, "making the built-in scene", quiet):
-        name = f"{side}_{k:06d}"
+    times, points = {f"{side}_{k:06d}": k for side, k, _ in jobs}, []
+    for name, (side, k, shift) in zip(times, progress(jobs, "making the built-in scene", quiet), strict=True):
         shot, camera = picture(k / (scene.num_frames - 1), shift, scene, device)
-        static = (shot.bodies < num_static).cpu()
-        metadata[name] = {"time_id": k, "warp_id": k, "appearance_id": k, "camera_id": int(side == "right")}
-        write_png(folder / f"rgb/1x/{name}.png", (shot.image.cpu().clamp(0, 1) * 255).round().byte().numpy())
-        write_png(folder / f"resized_mask/1x/{name}.png.png", static.byte().numpy() * 255)
-        write_json(folder / f"camera/{name}.json", _camera_facts(camera.to("cpu")))
+        camera, depth, static = camera.to("cpu"), shot.depth.cpu(), (shot.bodies < num_static).cpu()
+        writer.write_image(folder, name, (shot.image.cpu().clamp(0, 1) * 255).round().byte().numpy())
+        writer.write_mask(folder, name, static.numpy())
+        writer.write_camera(folder, name, _lens(camera), camera.viewmat[:3, :3].numpy(), camera.position.numpy())
         if side == "left":
-            write_png(folder / f"depth/1x/{name}.png", _monocular(shot.depth.cpu(), k / scene.num_frames))
-            points.append(_surface_points(shot.depth.cpu(), static, camera.to("cpu"), k, scene))
-    write_json(folder / "metadata.json", metadata)
-    left, right = ([n for n in metadata if n.startswith(side)] for side in ("left", "right"))
-    dataset = {"count": len(metadata), "num_exemplars": len(left), "ids": [*metadata], "train_ids": left}
-    write_json(folder / "dataset.json", {**dataset, "val_ids": right})
-    write_json(
-        folder / "scene.json",
-        {"center": CENTER, "scale": SCALE, "bbox": [[-1, -1, -1], [1, 1, 1]], "near": 0.05, "far": 4.0},
-    )
-    write_array(folder / "points.npy", torch.cat(points)[: scene.num_points].numpy())
+            writer.write_depth(folder, name, _monocular(depth, k / scene.num_frames))
+            points.append(_surface_points(depth, static, camera, k, scene))
+    units = SceneUnits(np.array(CENTER), SCALE)
+    writer.write_scene(folder, units, torch.cat(points)[: scene.num_points].numpy(), near=0.05, far=4.0)
+    right = {name: int(name.startswith("right")) for name in times}
+    writer.write_index(folder, times, [name for name in times if right[name]], right)
 
 
-def _camera_facts(camera: Camera) -> dict[str, object]:
-    return {
-        "orientation": camera.viewmat[:3, :3].tolist(),
-        "position": camera.position.tolist(),
-        "focal_length": camera.K[0, 0].item(),
-        "principal_point": camera.K[:2, 2].tolist(),
-        "skew": 0.0,
-        "pixel_aspect_ratio": 1.0,
-        "radial_distortion": [0.0, 0.0, 0.0],
-        "tangential_distortion": [0.0, 0.0],
-        "image_size": list(camera.size),
-    }
+def _lens(camera: Camera) -> Lens:
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    return Lens(camera.width, camera.height, (fx, fy), (cx, cy))
 
 
 def _monocular(depth: Tensor, phase: float) -> np.ndarray:
