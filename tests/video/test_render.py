@@ -11,13 +11,14 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.test_visualize import frames_of
+from tests.video.test_mp4 import frames_of
 from warpgs import visualize as pictures
 from warpgs.cli import main
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
 from warpgs.runs.trained import Player
 from warpgs.video import command as film
+from warpgs.video import mp4
 from warpgs.video.command import Render, render_run
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -241,11 +242,11 @@ def test_views_of_a_capture_without_any_are_refused(run, capture, tmp_path, monk
 
 
 def test_without_an_encoder_the_way_out_is_told(run, tmp_path, monkeypatch):
-    class Video(pictures.Video):
+    class Video(mp4.Video):
         def add(self, image):
             raise OSError(f"{self.path} could not be opened as a video")
 
-    monkeypatch.setattr(pictures, "Video", Video)
+    monkeypatch.setattr(mp4, "Video", Video)
     with pytest.raises(OSError, match=r"video\.mp4 could not be opened as a video; --write png needs no encoder"):
         render(run, tmp_path, path="fixed")
     render(run, tmp_path, path="fixed", write="png")
