@@ -17,7 +17,7 @@ ORDER = [
     "ops",
     "cameras",
     "model",
-    "render",
+    "rendering",
     "visualize",
     "data",
     "runs video evaluation",

@@ -12,7 +12,7 @@ import torch
 
 from warpgs import visualize as pictures
 from warpgs.files import write_png
-from warpgs.render import Layer, Rendering
+from warpgs.rendering import Layer, Rendering
 
 H, W = 20, 32
 
@@ -107,7 +107,7 @@ def frames_of(path):
 
 
 def test_a_video_has_every_frame_in_order(tmp_path):
-    with pictures.Video(tmp_path / "a.mp4") as video:
+    with Video(tmp_path / "a.mp4") as video:
         for value in (20, 120, 220):
             video.add(np.full((H, W, 3), value, np.uint8))
     assert [frame.mean() for frame in frames_of(tmp_path / "a.mp4")] == pytest.approx([20, 120, 220], abs=6)
@@ -116,7 +116,7 @@ def test_a_video_has_every_frame_in_order(tmp_path):
 def test_a_video_keeps_red_red(tmp_path):
     red = np.zeros((H, W, 3), np.uint8)
     red[..., 0] = 255
-    with pictures.Video(tmp_path / "a.mp4") as video:
+    with Video(tmp_path / "a.mp4") as video:
         video.add(red)
     blue, green, red_again = frames_of(tmp_path / "a.mp4")[0].mean((0, 1))
     assert red_again > 200
@@ -124,7 +124,7 @@ def test_a_video_keeps_red_red(tmp_path):
 
 
 def test_a_video_of_odd_size_loses_its_last_row_and_column(tmp_path):
-    with pictures.Video(tmp_path / "a.mp4") as video:
+    with Video(tmp_path / "a.mp4") as video:
         video.add(np.zeros((21, 33, 3), np.uint8))
     assert frames_of(tmp_path / "a.mp4")[0].shape == (20, 32, 3)
 
@@ -132,7 +132,7 @@ def test_a_video_of_odd_size_loses_its_last_row_and_column(tmp_path):
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_a_video_that_was_not_finished_is_no_file(tmp_path, error):
     def fail():
-        with pictures.Video(tmp_path / "a.mp4") as video:
+        with Video(tmp_path / "a.mp4") as video:
             video.add(np.zeros((H, W, 3), np.uint8))
             raise error
 
@@ -143,13 +143,13 @@ def test_a_video_that_was_not_finished_is_no_file(tmp_path, error):
 
 def test_an_error_before_the_first_frame_leaves_the_old_video_alone(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"old")
-    with pytest.raises(ValueError, match="wrong"), pictures.Video(tmp_path / "a.mp4"):
+    with pytest.raises(ValueError, match="wrong"), Video(tmp_path / "a.mp4"):
         raise ValueError("wrong")
     assert (tmp_path / "a.mp4").read_bytes() == b"old"
 
 
 def test_a_video_without_frames_is_no_file(tmp_path):
-    with pictures.Video(tmp_path / "a.mp4"):
+    with Video(tmp_path / "a.mp4"):
         pass
     assert list(tmp_path.iterdir()) == []
 
@@ -158,7 +158,7 @@ def test_a_video_that_can_not_be_opened_is_named(tmp_path):
     (tmp_path / "a.mp4").mkdir()
     with (
         pytest.raises(OSError, match=r"a\.mp4 could not be written: Is a directory"),
-        pictures.Video(tmp_path / "a.mp4") as v,
+        Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
 
@@ -168,7 +168,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_no_video(tmp_path):
     (tmp_path / "a.mp4.partial").symlink_to("/dev/full")
     with (
         pytest.raises(OSError, match=r"a\.mp4 could not be written: No space left on device"),
-        pictures.Video(tmp_path / "a.mp4") as v,
+        Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
     assert list(tmp_path.iterdir()) == []
@@ -176,7 +176,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_no_video(tmp_path):
 
 def test_browsers_play_what_is_written(tmp_path):
     """H.264 with half as many colours a side, the index in front."""
-    with pictures.Video(tmp_path / "a.mp4") as video:
+    with Video(tmp_path / "a.mp4") as video:
         video.add(np.zeros((H, W, 3), np.uint8))
     data = (tmp_path / "a.mp4").read_bytes()
     with av.open(str(tmp_path / "a.mp4")) as file:
@@ -185,7 +185,7 @@ def test_browsers_play_what_is_written(tmp_path):
 
 
 def test_a_video_has_the_rate_asked_for(tmp_path):
-    with pictures.Video(tmp_path / "a.mp4", 29.97) as video:
+    with Video(tmp_path / "a.mp4", 29.97) as video:
         for _ in range(3):
             video.add(np.zeros((H, W, 3), np.uint8))
     with av.open(str(tmp_path / "a.mp4")) as file:
@@ -196,7 +196,7 @@ def test_a_video_has_the_rate_asked_for(tmp_path):
 def test_a_picture_too_small_for_a_video_is_refused(tmp_path, shape):
     with (
         pytest.raises(ValueError, match="a video needs two pixels a side"),
-        pictures.Video(tmp_path / "a.mp4") as video,
+        Video(tmp_path / "a.mp4") as video,
     ):
         video.add(np.zeros(shape, np.uint8))
     assert list(tmp_path.iterdir()) == []
@@ -204,7 +204,7 @@ def test_a_picture_too_small_for_a_video_is_refused(tmp_path, shape):
 
 def test_a_video_has_its_name_only_when_it_is_whole(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"old")
-    with pictures.Video(tmp_path / "a.mp4") as video:
+    with Video(tmp_path / "a.mp4") as video:
         video.add(np.zeros((H, W, 3), np.uint8))
         assert (tmp_path / "a.mp4").read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
@@ -215,7 +215,7 @@ def test_without_ffmpeg_a_line_says_where_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with (
         pytest.raises(OSError, match="a video needs FFmpeg, which comes with PyAV: pip install av"),
-        pictures.Video(tmp_path / "a.mp4") as v,
+        Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
 
@@ -224,7 +224,7 @@ def test_without_an_encoder_for_h264_a_line_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(av, "codecs_available", {"mpeg4"})
     with (
         pytest.raises(OSError, match=r"a\.mp4 can't be written: the FFmpeg .* has no libx264"),
-        pictures.Video(tmp_path / "a.mp4") as v,
+        Video(tmp_path / "a.mp4") as v,
     ):
         v.add(np.zeros((H, W, 3), np.uint8))
     assert list(tmp_path.iterdir()) == []

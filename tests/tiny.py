@@ -14,7 +14,6 @@ from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, Trai
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
-from warpgs.runs import run as runs
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.trainer import Trainer
@@ -87,7 +86,7 @@ def finished(folder: Path) -> Path:
     """A run that went through all stages; its capture is beside it."""
     data = write(folder / "capture")
     config = dataclasses.replace(CONFIG, data=data, out=folder / "run")
-    runs.create(folder / "run", config)
+    Run.create(folder / "run", config)
     with in_haste():
         train(trainer(data, folder / "run", config))
     return folder / "run"
@@ -106,7 +105,7 @@ class StopWhen(Interrupt):
 
 def state(run: Path) -> dict[str, Tensor]:
     """All tensors of a run's newest checkpoint: parameters, moments, statistics."""
-    return checkpoint.load(checkpoint.saved(run)[-1]).tensors
+    return checkpoint.load(checkpoint.list_checkpoints(run)[-1]).tensors
 
 
 def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-import train as script
 from tests import tiny
 from tests.data.captures import write_png
 from tests.tiny import quickly  # noqa: F401  # a fixture
@@ -25,8 +24,9 @@ from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips
-from warpgs.render import Layer, Rendering
+from warpgs.rendering import Layer, Rendering
 from warpgs.runs import run as runs
+from warpgs.training import train as script
 
 H, W = 12, 16
 CPU = torch.device("cpu")
@@ -281,9 +281,9 @@ def run(quickly, tmp_path_factory):  # noqa: F811  # the fixture
     """A run of train.py with its evaluation."""
     data = tiny.write(tmp_path_factory.mktemp("cache"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs, "VIDEO_FRAMES", 2)
+        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
         config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path_factory.mktemp("runs") / "run")
-        assert script.main(config) == 0
+        assert script.train(config) == 0
     return config.out
 
 
@@ -337,12 +337,12 @@ def test_a_perfect_picture_of_one_view_is_no_number_in_json_but_one_in_the_table
 
 def test_evaluating_a_capture_whose_pictures_were_changed_measures_the_new_ones(run, tmp_path, monkeypatch):
     """Pictures are read, not remembered."""
-    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     data, copy = tiny.write(tmp_path), shutil.copytree(run, tmp_path / "copy")
     before = json.loads((run / "metrics.json").read_text())["psnr"]
     for path in (data / "rgb/1x").iterdir():
         write_png(path, np.zeros((tiny.SCENE.height, tiny.SCENE.width, 3), np.uint8))
-    runs.evaluate_run(copy, runs.open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
+    evaluate_run.evaluate_run(copy, runs.open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
     assert json.loads((copy / "metrics.json").read_text())["psnr"] != pytest.approx(before)
 
 
@@ -352,6 +352,6 @@ def test_figures_are_kept_where_no_video_can_be_written(finished_run, tmp_path, 
         (run / name).unlink(missing_ok=True)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(OSError, match="pip install av"):
-        runs.evaluate_run(run, load_capture(tiny.write(tmp_path)), quiet=True)
+        evaluate_run.evaluate_run(run, load_capture(tiny.write(tmp_path)), quiet=True)
     assert json.loads((run / "metrics.json").read_text())["psnr"] > 0
     assert len((run / "views.csv").read_text().splitlines()) > 1

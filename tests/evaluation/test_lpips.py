@@ -9,10 +9,11 @@ import pytest
 import torch
 from torch import nn
 
-import train as script
 from tests import tiny
 from warpgs.config import TrainConfig
 from warpgs.evaluation import lpips
+from warpgs.training import command
+from warpgs.training import train as script
 
 NETS = ["squeeze", "alex", "vgg"]
 FILES = {"squeeze": "squeezenet1_1_features.pth", "alex": "alexnet-owt.pth", "vgg": "vgg16-397923af.pth"}
@@ -290,4 +291,4 @@ def test_resuming_with_a_folder_that_is_gone_is_refused_before_any_work(tmp_path
     run = script.start(dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights)).run
     shutil.rmtree(weights)
     with pytest.raises(ValueError, match=f"{weights} holds no weights of LPIPS"):
-        script.start(script.parse(["--resume", str(run)]))
+        script.start(command.parse(["--resume", str(run)]))

@@ -6,11 +6,10 @@ from tests import tiny
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.export.cloud import Cloud
-from warpgs.export.moments import Moments
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.render import render
+from warpgs.rendering import render
 
 FACTS = {"moving": True, "relit": True, "sh_degree": 1, "iteration": 32}
 

@@ -85,11 +85,11 @@ def test_an_empty_branch_is_read_back(tmp_path, counts):
 def test_checkpoints_are_listed_oldest_first(tmp_path):
     for iteration in (10_000, 20, 3):
         checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
-    assert checkpoint.saved(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in (3, 20, 10_000)]
+    assert checkpoint.list_checkpoints(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in (3, 20, 10_000)]
 
 
 def test_a_folder_without_checkpoints_has_none(tmp_path):
-    assert checkpoint.saved(tmp_path) == []
+    assert checkpoint.list_checkpoints(tmp_path) == []
 
 
 @pytest.mark.parametrize(("count", "left"), [(2, [4, 5]), (1, [5]), (0, [5]), (9, [1, 2, 3, 4, 5])])
@@ -97,13 +97,13 @@ def test_the_newest_checkpoints_are_kept(tmp_path, count, left):
     for iteration in range(1, 6):
         checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
     checkpoint.keep_newest(tmp_path, count)
-    assert checkpoint.saved(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in left]
+    assert checkpoint.list_checkpoints(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in left]
 
 
 def test_what_a_killed_program_left_half_written_is_no_checkpoint_and_goes(path):
     partial = path.with_name("0000009.partial")
     partial.write_bytes(path.read_bytes()[:50])
-    assert checkpoint.saved(path.parent.parent) == [path]
+    assert checkpoint.list_checkpoints(path.parent.parent) == [path]
     checkpoint.keep_newest(path.parent.parent, 2)
     assert list(path.parent.iterdir()) == [path]
 
@@ -218,7 +218,7 @@ def test_facts_that_are_no_object_are_damage(tmp_path, facts):
 
 def test_a_fact_that_is_missing_is_named_with_the_file(path):
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no sh_degree"):
-        checkpoint.load(path).facts["sh_degree"]
+        checkpoint.load(path).metadata.sh_degree
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ UNUSUAL = dataclasses.replace(
 
 def create(config, capture):
     folder = runs.new_folder(config, capture)
-    runs.create(folder, config)
+    Run.create(folder, config)
     return folder
 
 
@@ -57,18 +57,18 @@ def edit(run, change):
 @pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["fast"]), UNUSUAL, tiny.CONFIG])
 def test_a_config_comes_back_as_it_was(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
-    assert runs.load_config(create(config, capture)) == config
+    assert read_config(create(config, capture)) == config
 
 
 def test_a_run_that_was_moved_is_where_it_is_now(run, tmp_path):
     moved = run.rename(tmp_path / "elsewhere")
-    assert runs.load_config(moved).out == moved
+    assert read_config(moved).out == moved
 
 
 def test_folders_are_kept_in_full_so_that_a_run_goes_on_from_anywhere(tmp_path, capture, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = dataclasses.replace(tiny.CONFIG, out=Path("run"), data=Path("capture"), lpips=Path("weights"))
-    kept = runs.load_config(create(config, capture))
+    kept = read_config(create(config, capture))
     assert kept.data == tmp_path / "capture"
     assert kept.lpips == tmp_path / "weights"
 
@@ -77,7 +77,7 @@ def test_folders_are_kept_in_full_so_that_a_run_goes_on_from_anywhere(tmp_path, 
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))
     with pytest.raises(ValueError, match=r"config\.json has fields of another version: future$"):
-        runs.load_config(run)
+        read_config(run)
 
 
 @pytest.mark.parametrize(
@@ -99,45 +99,45 @@ def test_an_unknown_field_is_refused_by_its_name(run, part):
 def test_a_field_of_another_type_is_refused_by_its_name(run, name, value):
     edit(run, lambda values: values.update({name: value}))
     with pytest.raises(ValueError, match=rf"config\.json: {name} can't be "):
-        runs.load_config(run)
+        read_config(run)
 
 
 @pytest.mark.parametrize("value", ["0.5", None, True, [1.0]])
 def test_a_rate_that_is_no_number_is_refused(run, value):
     edit(run, lambda values: values["optim"].update(means=value))
     with pytest.raises(ValueError, match=r"config\.json: means can't be "):
-        runs.load_config(run)
+        read_config(run)
 
 
 def test_a_rate_may_be_a_whole_number(run):
     edit(run, lambda values: values["optim"].update(means=1))
-    assert runs.load_config(run).optim.means == 1.0
+    assert read_config(run).optim.means == 1.0
 
 
 def test_a_part_that_is_no_object_is_refused(run):
     edit(run, lambda values: values.update(model=3))
     with pytest.raises(ValueError, match=r"config\.json: expected an object for ModelConfig, got 3"):
-        runs.load_config(run)
+        read_config(run)
 
 
 @pytest.mark.parametrize("text", ["", "{", "nonsense", '{"seed": 1'])
 def test_a_damaged_config_is_named(run, text):
     (run / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config\.json is damaged"):
-        runs.load_config(run)
+        read_config(run)
 
 
 def test_a_config_that_is_no_text_is_damaged(run):
     (run / "config.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"config\.json is damaged"):
-        runs.load_config(run)
+        read_config(run)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null"])
 def test_a_config_that_is_no_object_is_refused(run, text):
     (run / "config.json").write_text(text)
     with pytest.raises(ValueError, match="expected an object for TrainConfig"):
-        runs.load_config(run)
+        read_config(run)
 
 
 # Folders ------------------------------------------------------------------------------------------------------------
@@ -145,13 +145,13 @@ def test_a_config_that_is_no_object_is_refused(run, text):
 
 def test_a_folder_without_a_config_is_no_run(tmp_path):
     with pytest.raises(ValueError, match=f"{tmp_path} is no run folder"):
-        runs.load_config(tmp_path)
+        read_config(tmp_path)
 
 
 def test_a_file_is_no_run(tmp_path):
     (tmp_path / "file").write_text("{}")
     with pytest.raises(ValueError, match="is no run folder"):
-        runs.load_config(tmp_path / "file")
+        read_config(tmp_path / "file")
 
 
 def test_a_folder_that_holds_something_is_not_trained_into(tmp_path, capture):
@@ -218,10 +218,10 @@ def test_a_scene_is_not_read_with_the_config_of_another_run(run, data):
 
 @pytest.mark.parametrize("lacking", ["moving", "train_seconds"])
 def test_a_checkpoint_that_lacks_a_fact_is_named(run, data, lacking, monkeypatch):
-    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     tiny.trainer(data, run).save()
-    path = checkpoint.saved(run)[-1]
+    path = checkpoint.list_checkpoints(run)[-1]
     loaded = checkpoint.load(path)
     checkpoint.save(path, loaded.tensors, {k: v for k, v in loaded.facts.items() if k != lacking})
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no {lacking}"):
-        runs.evaluate_run(run, load_capture(data), quiet=True)
+        evaluate_run.evaluate_run(run, load_capture(data), quiet=True)

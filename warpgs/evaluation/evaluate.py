@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,13 +18,25 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.files import write_text
 from warpgs.progress import progress
-from warpgs.render import Rendering
+from warpgs.rendering import Rendering
 
 from . import metrics
 from .lpips import Lpips
 
-RenderAt = Callable[[Camera, bool], Rendering]
-"""Renders the scene through a camera at the camera's time, with or without the images of the branches."""
+
+class Renderer(Protocol):
+    """What is evaluated: ``TrainedScene`` is one."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device to render on."""
+
+    def render(self, camera: Camera, *, branches: bool = False) -> Rendering:
+        """Renders through a camera at the camera's time, with or without the static and the dynamic image."""
+
+    def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
+        """The joint image, as fast as possible."""
+
 
 STATIC_ALPHA = 0.05
 """A pixel counts as static for the flicker score where the dynamic image is fainter than this in both frames."""
@@ -93,39 +105,36 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 @torch.no_grad()
 def evaluate(
-    render_at: RenderAt,
+    scene: Renderer,
     capture: Capture,
-    device: torch.device,
     lpips: Lpips | None = None,
     on_view: Callable[[int, Frame, Float[Tensor, "H W 3"], Rendering], None] | None = None,
-    play: Callable[[Camera], object] | None = None,
     quiet: bool = False,
 ) -> Evaluation:
-    """Compares the scene with every evaluation frame of a capture.
+    """Compares a scene with every evaluation frame of a capture.
 
-    Without any, flicker and frames a second are measured through its training cameras, and nothing else is.
+    For a capture without evaluation frames only flicker and frames per second are measured, through its training
+    cameras.
 
     Args:
-        render_at: The scene.
+        scene: The scene to render.
         capture: Where the frames come from.
-        device: Where the scene is rendered.
-        lpips: On ``device``; not measured if None.
-        on_view: Called with each view's number, frame, truth in [0, 1] and rendering.
-        play: Renders a joint image where speed matters; ``render_at`` by default.
-        quiet: Whether to show no progress bar.
+        lpips: On the scene's device; LPIPS is not measured if None.
+        on_view: Called with the index, frame, ground truth in [0, 1] and rendering of each view.
+        quiet: Whether to hide the progress bar.
     """
-    play = play or (lambda camera: render_at(camera, False))
+    device = scene.device
     views = []
     for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
         frame = capture.frame(name)
         truth = frame.image.to(device).float() / 255.0
-        rendering = render_at(frame.camera.to(device), True)
+        rendering = scene.render(frame.camera.to(device), branches=True)
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
     return Evaluation(
-        views, _flicker(render_at, cameras, quiet), frame_rate(play, cameras), lpips.net if lpips else None
+        views, _flicker(scene, cameras, quiet), frame_rate(scene.play, cameras), lpips.net if lpips else None
     )
 
 
@@ -158,11 +167,11 @@ def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> list[Came
     return [Camera(camera.viewmat, camera.K, camera.width, camera.height, moment) for moment in times[:most]]
 
 
-def _flicker(render_at: RenderAt, cameras: Sequence[Camera], quiet: bool) -> float | None:
+def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | None:
     changes = []
     before: Rendering | None = None
     for camera in progress(_at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES), "flicker", quiet):
-        after = render_at(camera, True)
+        after = scene.render(camera, branches=True)
         if before is not None:
             assert before.dynamic is not None
             assert after.dynamic is not None
