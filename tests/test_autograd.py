@@ -10,7 +10,7 @@ from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_
 from warpgs.config import RenderSettings
 from warpgs.ops.projection import project
 from warpgs.ops.sh import spherical_harmonics
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runtime import tape
 
 CAMERA = make_camera()

@@ -10,7 +10,7 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.ops.ssim import ssim
-from warpgs.render import render
+from warpgs.rendering import render
 
 pytestmark = pytest.mark.usefixtures("contracts_off")
 CAMERA = make_camera()

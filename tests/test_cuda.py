@@ -13,7 +13,7 @@ from warpgs.config import RenderSettings
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import forget_budgets
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runtime import replay
 from warpgs.runtime.replay import PLAIN_CALLS
 

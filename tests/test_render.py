@@ -25,7 +25,7 @@ from tests.scenes import (
     relative_error,
 )
 from warpgs.config import RenderSettings
-from warpgs.render import render
+from warpgs.rendering import render
 
 CAMERA = make_camera()
 EVERYTHING = RenderSettings(branches=True, statistics=True)

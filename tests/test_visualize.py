@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from warpgs import visualize
-from warpgs.render import Layer, Rendering
+from warpgs.rendering import Layer, Rendering
 
 H, W = 20, 32
 

@@ -3,40 +3,31 @@
 import importlib.metadata
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Any, Protocol, runtime_checkable
 
 import tyro
 
 from .bench.command import Bench
+from .config import TrainConfig
 from .errors import is_out_of_memory, one_line, out_of_memory
+from .evaluation.command import Eval
 from .export.command import Export
 from .prepare.command import Check, Prepare
 from .report.command import Report
-from .runs import run as runs
+from .training import command as training
 from .video.command import Render
 from .viewer.command import View
 
 
-@dataclass(frozen=True)
-class Eval:
-    """Evaluates a run's last iterate; writes metrics.json, views.csv, pictures and a video into its folder."""
-
-    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
-    """Run folder."""
-    lpips: Path | None = None
-    """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
-    device: Literal["cuda", "cpu"] | None = None
-    """Where to render; CUDA if there is a GPU."""
-    quiet: bool = False
-    """Show no progress."""
+@runtime_checkable
+class Command(Protocol):
+    """A dataclass of options with a method ``run``."""
 
     def run(self) -> None:
-        print(runs.evaluate_run(self.run_folder, lpips=self.lpips, device=self.device, quiet=self.quiet))
+        """Does what the options ask for."""
 
 
-COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Export | Prepare | Render | Report | View]] = {
+COMMANDS: dict[str, Callable[..., Command]] = {
     "bench": Bench,
     "check": Check,
     "eval": Eval,
@@ -46,23 +37,27 @@ COMMANDS: dict[str, Callable[..., Bench | Check | Eval | Export | Prepare | Rend
     "report": Report,
     "view": View,
 }
-"""Each command is a dataclass of its options with a method ``run``."""
-
+"""Every command but ``train``, whose defaults depend on its preset."""
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 
-
-ADVICE = "free some, or ask for less: smaller pictures, fewer Gaussians; --device cpu where a GPU has too little"
+ADVICE = "free some, or ask for less: smaller images, fewer Gaussians; --device cpu where a GPU has too little"
 """What to do without enough memory."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
-    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments == ["--version"]:
         print(f"warpgs {importlib.metadata.version('warpgs')}")
         return 0
-    command = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="warpgs", description=__doc__, args=arguments)
+    if arguments[:1] == ["train"]:
+        return training.main(arguments[1:], "warpgs train")
+    commands: dict[str, Callable[..., Any]] = {**COMMANDS, "train": TrainConfig}
+    command: Command = tyro.extras.subcommand_cli_from_dict(
+        commands, prog="warpgs", description=__doc__, args=arguments
+    )
     try:
         command.run()
     except (ValueError, ImportError, OSError) as error:

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .render import Rendering
+from .rendering import Rendering
 
 ERROR_RANGE = 0.25
 """Mean absolute error that has the brightest colour."""

@@ -10,7 +10,6 @@ from warpgs.bench.command import STAGES, Bench, bench, time_in_turn
 from warpgs.bench.scenes import SCENES, Scene, random_splats
 from warpgs.bench.training import measure_steps, random_scene
 from warpgs.cli import main
-from warpgs.runs import run as runs
 
 TINY = Scene("tiny", 48, 32, 100, 3.0)
 OPTIONS = Bench(device="cpu", repeats=2)
@@ -153,7 +152,7 @@ def test_the_scene_to_time_steps_of_has_both_branches_and_the_papers_networks():
 def test_frames_a_second_of_a_run_are_written(tmp_path, capsys):
     data, run = tiny.write(tmp_path), tmp_path / "run"
     trainer = tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, data=data))
-    runs.create(run, trainer.config)
+    Run.create(run, trainer.config)
     trainer.save()
     assert main(["bench", "--device", "cpu", "--fps", str(run), "--json", str(tmp_path / "out.json")]) == 0
     figures = json.loads((tmp_path / "out.json").read_text())["fps"]

@@ -16,7 +16,6 @@ from warpgs.export import command as command_module
 from warpgs.export import opening, page
 from warpgs.export.command import Export, export_run
 from warpgs.export.compressed import read_compressed
-from warpgs.export.moments import Moments
 from warpgs.export.standard import read_standard
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
@@ -34,7 +33,7 @@ def run(finished_run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(run):
-    return runs.load_config(run).data
+    return read_config(run).data
 
 
 def export(run, tmp_path, **options):
@@ -51,7 +50,7 @@ def view(data, time):
 
 
 def truth(run, camera):
-    config = runs.load_config(run)
+    config = read_config(run)
     scene, facts = runs.newest_scene(run, config)
     return Player(scene, config, facts)(camera, False).joint.image.clamp(0, 1)
 
@@ -161,7 +160,7 @@ def stranded(run, tmp_path):
     """A run whose capture is not where it was."""
     folder = tmp_path / "stranded"
     (folder / "checkpoints").mkdir(parents=True)
-    newest = checkpoint.saved(run)[-1]
+    newest = checkpoint.list_checkpoints(run)[-1]
     (folder / "checkpoints" / newest.name).write_bytes(newest.read_bytes())
     values = json.loads((run / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**values, "data": str(tmp_path / "gone")}))
@@ -245,7 +244,7 @@ def test_a_run_without_a_checkpoint_ends_the_command_with_a_line(stranded, capsy
 
 
 def test_a_damaged_checkpoint_ends_the_command_with_a_line(stranded, capsys):
-    path = checkpoint.saved(stranded)[-1]
+    path = checkpoint.list_checkpoints(stranded)[-1]
     path.write_bytes(path.read_bytes()[:1000])
     code, said = command(stranded, capsys)
     assert code == 2
@@ -254,7 +253,7 @@ def test_a_damaged_checkpoint_ends_the_command_with_a_line(stranded, capsys):
 
 
 def test_a_checkpoint_that_lacks_a_fact_ends_the_command_with_a_line(stranded, capsys):
-    path = checkpoint.saved(stranded)[-1]
+    path = checkpoint.list_checkpoints(stranded)[-1]
     loaded = checkpoint.load(path)
     checkpoint.save(path, loaded.tensors, {k: v for k, v in loaded.facts.items() if k != "relit"})
     assert command(stranded, capsys) == (2, f"warpgs: {path} is damaged: it has no relit\n")

@@ -9,7 +9,7 @@ from warpgs.config import ModelConfig, RenderSettings
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.render import render
+from warpgs.rendering import render
 
 NUM_STATIC, NUM_DYNAMIC = 7, 5
 TIME = torch.tensor([0.3])

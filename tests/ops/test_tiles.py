@@ -9,7 +9,7 @@ from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection, project
 from warpgs.ops.rows import Rows
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runtime.tape import Run
 
 NUM = 120

@@ -21,7 +21,6 @@ from warpgs.report.command import Report, extremes
 from warpgs.report.figures import config_rows, in_words
 from warpgs.report.record import read_records
 from warpgs.report.strips import WIDEST, available, data_uri
-from warpgs.runs import run as runs
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -33,8 +32,8 @@ def made(finished_run, tmp_path_factory, quickly):  # noqa: F811
     """A run that was evaluated, too."""
     run = shutil.copytree(finished_run, tmp_path_factory.mktemp("made") / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs, "VIDEO_FRAMES", 2)
-        runs.evaluate_run(run, device="cpu", quiet=True)
+        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+        evaluate_run.evaluate_run(run, device="cpu", quiet=True)
     return run
 
 

@@ -10,7 +10,7 @@ import torch.utils.checkpoint
 
 from tests.scenes import as_leaves, gradients, make_camera, make_splats, pulled, random_like
 from warpgs.config import RenderSettings
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runtime import replay
 
 SETTINGS = [RenderSettings(), RenderSettings(branches=True, depth=True, statistics=True, absgrad=True)]

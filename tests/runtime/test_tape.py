@@ -7,7 +7,7 @@ import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs.kernels.covariance import covariance as kernel
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runtime import tape
 from warpgs.runtime.profiling import profile
 from warpgs.runtime.tape import Run

@@ -8,7 +8,7 @@ import torch
 from tests import tiny
 from tests.scenes import generator, relative_error
 from warpgs.ops.mlp import num_values, perceptron, split
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.runs.trained import Player
 from warpgs.runtime.graphs import capture
 from warpgs.training.step import WARM_UPS

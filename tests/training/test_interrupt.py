@@ -6,9 +6,10 @@ import threading
 
 import pytest
 
-import train as script
 from tests import tiny
 from warpgs.runs import checkpoint
+from warpgs.training import command
+from warpgs.training import train as script
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.step import Step
 
@@ -107,8 +108,8 @@ def pressing_in_step(monkeypatch, number, presses):
 
 def test_after_ctrl_c_the_iteration_in_progress_ends_and_is_saved(config, monkeypatch, capsys):
     pressing_in_step(monkeypatch, number=5, presses=1)
-    assert script.main(config) == 130
-    assert checkpoint.load(checkpoint.saved(config.out)[-1]).facts["iteration"] == 5
+    assert script.train(config) == 130
+    assert checkpoint.load(checkpoint.list_checkpoints(config.out)[-1]).metadata.iteration == 5
     said = capsys.readouterr().err
     assert f"stopped after iteration 5 of {tiny.LENGTH}; go on with --resume {config.out}" in said
 
@@ -116,9 +117,9 @@ def test_after_ctrl_c_the_iteration_in_progress_ends_and_is_saved(config, monkey
 def test_a_second_ctrl_c_stops_at_once_and_leaves_whole_checkpoints(config, monkeypatch):
     pressing_in_step(monkeypatch, number=10, presses=2)
     with pytest.raises(KeyboardInterrupt):
-        script.main(config)
-    assert [checkpoint.load(path).facts["iteration"] for path in checkpoint.saved(config.out)] == [0, 7]
-    assert script.start(script.parse(["--resume", str(config.out)])).iteration == 7
+        script.train(config)
+    assert [checkpoint.load(path).metadata.iteration for path in checkpoint.list_checkpoints(config.out)] == [0, 7]
+    assert script.start(command.parse(["--resume", str(config.out)])).iteration == 7
 
 
 def test_a_second_ctrl_c_while_the_checkpoint_is_written_leaves_whole_checkpoints(config, monkeypatch):
@@ -127,19 +128,19 @@ def test_a_second_ctrl_c_while_the_checkpoint_is_written_leaves_whole_checkpoint
 
     def fsync_and_press(file):
         fsync(file)
-        if len(checkpoint.saved(config.out)) == 2:
+        if len(checkpoint.list_checkpoints(config.out)) == 2:
             press()
 
     monkeypatch.setattr(checkpoint.os, "fsync", fsync_and_press)
     with pytest.raises(KeyboardInterrupt):
-        script.main(config)
-    assert [checkpoint.load(path).facts["iteration"] for path in checkpoint.saved(config.out)] == [0, 7]
+        script.train(config)
+    assert [checkpoint.load(path).metadata.iteration for path in checkpoint.list_checkpoints(config.out)] == [0, 7]
     assert list((config.out / "checkpoints").glob("*.partial")) == []
 
 
 def test_ctrl_c_works_after_a_stopped_training(config, monkeypatch):
     pressing_in_step(monkeypatch, number=3, presses=1)
-    script.main(config)
+    script.train(config)
     with pytest.raises(KeyboardInterrupt):
         press()
 

@@ -12,7 +12,7 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.ops.depth_error import depth_error
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.training.losses import dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import TERMS, Draw, Step

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-import train as script
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.runs import checkpoint
-from warpgs.runs import run as runs
+from warpgs.training import command
+from warpgs.training import train as script
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -59,7 +59,7 @@ def resumed(data, run):
 
 
 def test_the_tiny_run_grows_and_prunes(whole):
-    counts = [len(checkpoint.load(path).tensors["scene.static.means"]) for path in checkpoint.saved(whole)]
+    counts = [len(checkpoint.load(path).tensors["scene.static.means"]) for path in checkpoint.list_checkpoints(whole)]
     assert max(counts) > counts[0]
     assert 10 < counts[-1] < max(counts)
 
@@ -106,10 +106,10 @@ def test_another_seed_is_another_run(data, whole, tmp_path):
 
 
 def test_resuming_a_finished_run_changes_nothing(data, whole):
-    before = {path: path.read_bytes() for path in checkpoint.saved(whole)}
+    before = {path: path.read_bytes() for path in checkpoint.list_checkpoints(whole)}
     trainer = resumed(data, whole)
     assert trainer.iteration == tiny.LENGTH
-    assert {path: path.read_bytes() for path in checkpoint.saved(whole)} == before
+    assert {path: path.read_bytes() for path in checkpoint.list_checkpoints(whole)} == before
 
 
 def test_training_time_adds_up_over_sessions(data, tmp_path):
@@ -117,7 +117,7 @@ def test_training_time_adds_up_over_sessions(data, tmp_path):
     first.seconds = 1000.0
     tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 5))
     resumed(data, tmp_path)
-    seconds = checkpoint.load(checkpoint.saved(tmp_path)[-1]).facts["train_seconds"]
+    seconds = checkpoint.load(checkpoint.list_checkpoints(tmp_path)[-1]).metadata.train_seconds
     assert 1000.0 < seconds < 1100.0
 
 
@@ -132,15 +132,15 @@ def stopped(data, tmp_path):
 
 @pytest.mark.parametrize("kept", [0, 4, 100, -1])
 def test_a_truncated_newest_checkpoint_is_named_and_not_gone_on_from(stopped, kept):
-    newest = checkpoint.saved(stopped)[-1]
+    newest = checkpoint.list_checkpoints(stopped)[-1]
     newest.write_bytes(newest.read_bytes()[:kept])
     with pytest.raises(ValueError, match=f"{newest} is damaged"):
-        script.start(script.parse(["--resume", str(stopped)]))
+        script.start(command.parse(["--resume", str(stopped)]))
 
 
 def test_without_its_damaged_newest_checkpoint_a_run_goes_on_from_the_one_before(stopped, whole):
-    checkpoint.saved(stopped)[-1].unlink()
-    trainer = script.start(script.parse(["--resume", str(stopped)]))
+    checkpoint.list_checkpoints(stopped)[-1].unlink()
+    trainer = script.start(command.parse(["--resume", str(stopped)]))
     assert trainer.iteration == 7
     tiny.train(trainer)
     assert tiny.differences(tiny.state(stopped), tiny.state(whole)) == []
@@ -157,19 +157,19 @@ def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tm
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     with subprocess.Popen([sys.executable, SCRIPT, *options, str(killed)], stdout=subprocess.DEVNULL) as run:
         try:
-            while len(checkpoint.saved(killed)) < 3:
+            while len(checkpoint.list_checkpoints(killed)) < 3:
                 assert run.poll() is None
                 time.sleep(0.005)
         finally:
             run.kill()
     assert run.returncode == -signal.SIGKILL
-    last = checkpoint.load(checkpoint.saved(killed)[-1]).facts["iteration"]
+    last = checkpoint.load(checkpoint.list_checkpoints(killed)[-1]).metadata.iteration
     assert 30 <= last < 120
 
-    reference = script.start(script.parse([*options, str(whole)]))
+    reference = script.start(command.parse([*options, str(whole)]))
     tiny.train(reference)
-    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
-    assert script.main(script.parse(["--resume", str(killed)])) == 0
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+    assert script.train(command.parse(["--resume", str(killed)])) == 0
     assert tiny.differences(tiny.state(killed), tiny.state(whole)) == []
     assert (killed / "metrics.json").is_file()
 
@@ -179,7 +179,7 @@ def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tm
 
 def rewritten(run, change):
     """The newest checkpoint with its tensors and facts changed."""
-    path = checkpoint.saved(run)[-1]
+    path = checkpoint.list_checkpoints(run)[-1]
     loaded = checkpoint.load(path)
     tensors, facts = dict(loaded.tensors), dict(loaded.facts)
     change(tensors, facts)

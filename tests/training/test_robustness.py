@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-import train as script
 from tests import tiny
 from tests.data.captures import edit_json, write_png
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.evaluation import evaluate
 from warpgs.runs import checkpoint
-from warpgs.runs import run as runs
-from warpgs.training import losses
+from warpgs.training import command, losses
+from warpgs.training import train as script
 from warpgs.training.step import Step
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -47,14 +46,14 @@ def is_finite(run):
 
 def end_to_end(data, run, monkeypatch, capsys, **changes):
     """What ``train.py`` says and measures."""
-    monkeypatch.setattr(runs, "VIDEO_FRAMES", 2)
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     monkeypatch.setattr(evaluate, "TIMED_FRAMES", 2)
     # Without a reset of opacities, after which what is large goes: where little is known, Gaussians start large.
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=tiny.LENGTH)
     config = dataclasses.replace(tiny.CONFIG, data=data, out=run, schedule=schedule, **changes)
-    assert script.main(config) == 0
+    assert script.train(config) == 0
     assert is_finite(run)
-    assert checkpoint.load(checkpoint.saved(run)[-1]).facts["iteration"] == tiny.LENGTH
+    assert checkpoint.load(checkpoint.list_checkpoints(run)[-1]).metadata.iteration == tiny.LENGTH
     return capsys.readouterr().out, json.loads((run / "metrics.json").read_text())
 
 
@@ -86,7 +85,7 @@ def test_after_a_loss_that_is_not_finite_training_goes_back_and_says_so(spoilt_o
 
 def test_a_loss_that_was_not_finite_once_leaves_a_finite_scene_at_the_end(spoilt_once, run):
     tiny.train(spoilt_once)
-    assert checkpoint.load(checkpoint.saved(run)[-1]).facts["iteration"] == tiny.LENGTH
+    assert checkpoint.load(checkpoint.list_checkpoints(run)[-1]).metadata.iteration == tiny.LENGTH
     assert is_finite(run)
 
 
@@ -267,7 +266,7 @@ def test_an_empty_branch_resumes(data, run, assume):
     config = dataclasses.replace(tiny.CONFIG, data=data, out=run, assume=assume)
     first = script.start(config)
     tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 24))
-    again = script.start(script.parse(["--resume", str(run)]))
+    again = script.start(command.parse(["--resume", str(run)]))
     assert again.iteration == 24
     assert tiny.train(again)
 

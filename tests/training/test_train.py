@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-import train as script
 from tests.prepare import filmed
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
+from warpgs.training import train as script
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
 SMALL = BuiltinScene(width=64, height=36, num_frames=6, num_samples=2, num_points=400)
@@ -189,7 +189,7 @@ def test_ctrl_c_keeps_what_was_done_and_says_how_to_go_on(data, tmp_path):
     folder = tmp_path / "run"
     options = ["--data", str(data), *QUICK, "--iterations", "100000", "--out", str(folder)]
     with subprocess.Popen([sys.executable, "-c", program, SCRIPT, *options], stderr=subprocess.PIPE, text=True) as run:
-        while not checkpoint.saved(folder):
+        while not checkpoint.list_checkpoints(folder):
             assert run.poll() is None
             time.sleep(0.05)
         time.sleep(2.0)
@@ -201,5 +201,5 @@ def test_ctrl_c_keeps_what_was_done_and_says_how_to_go_on(data, tmp_path):
     assert run.returncode == 130
     assert "Traceback" not in stderr
     assert f"--resume {folder}" in stderr
-    facts = checkpoint.load(checkpoint.saved(folder)[-1]).facts
+    facts = checkpoint.load(checkpoint.list_checkpoints(folder)[-1]).facts
     assert facts["iteration"] > 0

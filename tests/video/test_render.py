@@ -32,12 +32,12 @@ def run(finished_run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def capture(run):
-    return runs.open_capture(runs.load_config(run))
+    return runs.open_capture(read_config(run))
 
 
 @pytest.fixture(scope="module")
 def render_at(run):
-    config = runs.load_config(run)
+    config = read_config(run)
     scene, facts = runs.newest_scene(run, config)
     return Player(scene, config, facts)
 
@@ -278,7 +278,7 @@ def test_a_run_without_a_checkpoint_ends_the_command_with_a_line(stranded, capsy
 
 
 def test_a_damaged_checkpoint_ends_the_command_with_a_line(stranded, capsys):
-    path = checkpoint.saved(stranded)[-1]
+    path = checkpoint.list_checkpoints(stranded)[-1]
     path.write_bytes(path.read_bytes()[:1000])
     assert f"warpgs: {path} is damaged" in line(capsys, stranded)
 

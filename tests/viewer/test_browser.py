@@ -301,7 +301,7 @@ def test_counts_and_speed_are_shown(page, session):
 
 def test_training_is_followed(page, session, run):
     before = seen(page, session)
-    iteration = session._shown[0].player.facts["iteration"]
+    iteration = session._shown[0].player.metadata.iteration
     watched.advance(run, 7)
     page.get_by_text(f"iteration {iteration + 7}").wait_for(timeout=20_000)
     assert np.abs(seen(page, session) - before).max() > 0

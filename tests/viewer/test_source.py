@@ -28,8 +28,8 @@ def at_once(monkeypatch):
 
 def test_a_run_is_shown_as_its_newest_checkpoint_has_it(run):
     player = open_source(run, "cpu", False).current()
-    assert player.facts["iteration"] == 32
-    newest = checkpoint.load(checkpoint.saved(run)[-1]).tensors
+    assert player.metadata.iteration == 32
+    newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1]).tensors
     assert watched.same(player.scene.static.means, newest["scene.static.means"])
 
 
@@ -42,9 +42,9 @@ def test_a_finished_run_is_not_looked_at_again(run, at_once):
 
 def test_a_newer_checkpoint_is_followed(run, at_once):
     source = open_source(run, "cpu", True)
-    assert source.current().facts["iteration"] == 32
+    assert source.current().metadata.iteration == 32
     watched.advance(run)
-    assert source.current().facts["iteration"] == 33
+    assert source.current().metadata.iteration == 33
 
 
 def test_a_checkpoint_that_did_not_change_is_not_read_again(run, at_once):
@@ -55,7 +55,7 @@ def test_a_checkpoint_that_did_not_change_is_not_read_again(run, at_once):
 def test_a_checkpoint_written_again_is_read_again(run, at_once):
     source = open_source(run, "cpu", True)
     before = source.current()
-    path = checkpoint.saved(run)[-1]
+    path = checkpoint.list_checkpoints(run)[-1]
     loaded = checkpoint.load(path)
     checkpoint.save(path, loaded.tensors, dict(loaded.facts))
     assert source.current() is not before
@@ -82,7 +82,7 @@ def test_a_followed_run_may_be_without_a_checkpoint_yet(run, at_once):
     assert source.current() is None
     assert source.note == "waiting for the first checkpoint"
     shutil.move(run / "away", run / "checkpoints")
-    assert source.current().facts["iteration"] == 32
+    assert source.current().metadata.iteration == 32
     assert source.note == ""
 
 

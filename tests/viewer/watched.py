@@ -19,7 +19,7 @@ def copy(finished: Path, folder: Path) -> Path:
 
 def _brighten(run: Path) -> None:
     """So short a training leaves a dark scene that hardly changes."""
-    newest = checkpoint.load(checkpoint.saved(run)[-1])
+    newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1])
     tensors = dict(newest.tensors)
     for branch in ("static", "dynamic"):
         tensors[f"scene.{branch}.logit_opacities"] = tensors[f"scene.{branch}.logit_opacities"] * 0 + 2.0
@@ -33,8 +33,8 @@ def _brighten(run: Path) -> None:
 
 def advance(run: Path, by: int = 1) -> Path:
     """Writes a checkpoint as if training had gone on; its scene is another one."""
-    newest = checkpoint.load(checkpoint.saved(run)[-1])
-    iteration = newest.facts["iteration"] + by
+    newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1])
+    iteration = newest.metadata.iteration + by
     tensors = {n: t + 0.01 if n.startswith("scene.static.means") else t for n, t in newest.tensors.items()}
     path = checkpoint.path_of(run, iteration)
     checkpoint.save(path, tensors, {**newest.facts, "iteration": iteration})

@@ -1,4 +1,4 @@
-"""``warpgs bench --steps`` and ``--fps``: whole training steps, and frames a second of a trained scene."""
+"""``warpgs bench --steps`` and ``--fps``: whole training steps, and frames per second of a trained scene."""
 
 import dataclasses
 import statistics
@@ -16,8 +16,7 @@ from warpgs.evaluation.evaluate import frame_rate
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.runs import run as runs
-from warpgs.runs.trained import Player
+from warpgs.runs.run import Run
 from warpgs.training import point_cloud as init
 from warpgs.training.schedule import Moment, Protocol
 from warpgs.training.step import WARM_UPS, Draw, Step
@@ -119,21 +118,19 @@ def _times(step: Step, moment: Moment, device: str, repeats: int) -> Iterable[fl
 
 
 def bench_fps(folder: Path, device: str) -> dict[str, Any]:
-    """Frames a second of a run's newest checkpoint through its evaluation cameras; prints and returns the figures."""
-    config = runs.resolve(dataclasses.replace(runs.load_config(folder), device="cuda" if device == "cuda" else "cpu"))
-    capture = runs.open_capture(config)
-    scene, facts = runs.newest_scene(folder, config)
-    cameras = [capture.cameras[name].to(torch.device(device)) for name in capture.val or capture.train]
-    player = Player(scene.to(device), config, facts)
+    """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the figures."""
+    run = Run.open(folder, "cuda" if device == "cuda" else "cpu")
+    capture, scene = run.open_capture(), run.trained_scene()
+    cameras = [capture.cameras[name].to(scene.device) for name in capture.val or capture.train]
     result = {
         "run": str(folder),
         "width": cameras[0].width,
         "height": cameras[0].height,
-        "static": len(scene.static),
-        "dynamic": len(scene.dynamic),
-        "frames_per_second": frame_rate(player.play, cameras),
+        "static": len(scene.scene.static),
+        "dynamic": len(scene.scene.dynamic),
+        "frames_per_second": frame_rate(scene.play, cameras),
     }
     if device == "cuda":  # on CPU nothing is replayed
-        result["eager_frames_per_second"] = frame_rate(lambda camera: player(camera, False), cameras)
-    print_rows("frames a second, both networks evaluated for every frame", [result])
+        result["eager_frames_per_second"] = frame_rate(scene.render, cameras)
+    print_rows("frames per second, both networks evaluated for every frame", [result])
     return result

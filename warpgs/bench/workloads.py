@@ -9,7 +9,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.render import render
+from warpgs.rendering import render
 
 from .scenes import SEED
 

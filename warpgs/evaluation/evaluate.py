@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,26 +18,39 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.files import write_text
 from warpgs.progress import progress
-from warpgs.render import Rendering
+from warpgs.rendering import Rendering
 
 from . import metrics
 from .lpips import Lpips
 
-RenderAt = Callable[[Camera, bool], Rendering]
-"""Renders the scene through a camera at the camera's time, with or without the images of the branches."""
+
+@runtime_checkable
+class Renderer(Protocol):
+    """What is evaluated: ``TrainedScene`` is one."""
+
+    @property
+    def device(self) -> torch.device:
+        """Device to render on."""
+
+    def render(self, camera: Camera, *, branches: bool = False) -> Rendering:
+        """Renders through a camera at the camera's time, with or without the static and the dynamic image."""
+
+    def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
+        """The joint image, as fast as possible."""
+
 
 STATIC_ALPHA = 0.05
-"""A pixel counts as static for the flicker score where the dynamic image is fainter than this in both frames."""
+"""A pixel counts as static for the flicker score where the dynamic image's alpha is lower than this in both frames."""
 
 FLICKER_FRAMES = 30
 TIMED_FRAMES = 30
 TIMED_SECONDS = 0.5
-"""Frames are timed in rounds of so many, for so long."""
+"""Frames are timed in rounds of ``TIMED_FRAMES``, for at least ``TIMED_SECONDS`` [s]."""
 
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """One view's figures; None where they could not be measured.
+    """Metrics of one view; None where they could not be measured.
 
     Images are clamped to [0, 1] and not rounded to 8 bits. ``_static`` and ``_dynamic`` are over the pixels of that
     region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures.
@@ -58,14 +71,14 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures of all views and of the whole.
+    """Metrics of all views, and of the scene as a whole.
 
     Attributes:
-        views: One entry a view.
+        views: One entry per view.
         flicker: Mean absolute change between consecutive renderings of the static region through the middle camera of
-            the evaluation, held fixed; None with fewer than two moments. There is no truth of a fixed camera in a
+            the evaluation, held fixed; None with fewer than two times. There is no ground truth of a fixed camera in a
             capture of a moving one, so changes that are real (shadows) count too.
-        fps: Joint images a second, everything that depends on time included.
+        fps: Joint images per second, including everything that depends on time.
         lpips_net: Network of LPIPS; None when it was not measured.
     """
 
@@ -75,7 +88,7 @@ class Evaluation:
     lpips_net: str | None
 
     def summary(self) -> dict[str, Any]:
-        """Means over the views that have a figure; None where none has."""
+        """Means over the views that have a value; None where none has."""
         means = {f.name: _mean([getattr(v, f.name) for v in self.views]) for f in fields(ViewMetrics)[2:]}
         return {
             **means,
@@ -93,39 +106,36 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 @torch.no_grad()
 def evaluate(
-    render_at: RenderAt,
+    scene: Renderer,
     capture: Capture,
-    device: torch.device,
     lpips: Lpips | None = None,
     on_view: Callable[[int, Frame, Float[Tensor, "H W 3"], Rendering], None] | None = None,
-    play: Callable[[Camera], object] | None = None,
     quiet: bool = False,
 ) -> Evaluation:
-    """Compares the scene with every evaluation frame of a capture.
+    """Compares a scene with every evaluation frame of a capture.
 
-    Without any, flicker and frames a second are measured through its training cameras, and nothing else is.
+    For a capture without evaluation frames only flicker and frames per second are measured, through its training
+    cameras.
 
     Args:
-        render_at: The scene.
+        scene: The scene to render.
         capture: Where the frames come from.
-        device: Where the scene is rendered.
-        lpips: On ``device``; not measured if None.
-        on_view: Called with each view's number, frame, truth in [0, 1] and rendering.
-        play: Renders a joint image where speed matters; ``render_at`` by default.
-        quiet: Whether to show no progress bar.
+        lpips: On the scene's device; LPIPS is not measured if None.
+        on_view: Called with the index, frame, ground truth in [0, 1] and rendering of each view.
+        quiet: Whether to hide the progress bar.
     """
-    play = play or (lambda camera: render_at(camera, False))
+    device = scene.device
     views = []
     for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
         frame = capture.frame(name)
         truth = frame.image.to(device).float() / 255.0
-        rendering = render_at(frame.camera.to(device), True)
+        rendering = scene.render(frame.camera.to(device), branches=True)
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
     return Evaluation(
-        views, _flicker(render_at, cameras, quiet), frame_rate(play, cameras), lpips.net if lpips else None
+        views, _flicker(scene, cameras, quiet), frame_rate(scene.play, cameras), lpips.net if lpips else None
     )
 
 
@@ -152,17 +162,17 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
     )
 
 
-def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """One camera at consecutive times of others."""
+def _at_times(camera: Camera, cameras: Sequence[Camera], max_count: int) -> list[Camera]:
+    """One camera at the first ``max_count`` times of other cameras."""
     times = sorted({c.time for c in cameras})
-    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, moment) for moment in times[:most]]
+    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, time) for time in times[:max_count]]
 
 
-def _flicker(render_at: RenderAt, cameras: Sequence[Camera], quiet: bool) -> float | None:
+def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | None:
     changes = []
     before: Rendering | None = None
     for camera in progress(_at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES), "flicker", quiet):
-        after = render_at(camera, True)
+        after = scene.render(camera, branches=True)
         if before is not None:
             assert before.dynamic is not None
             assert after.dynamic is not None
@@ -174,7 +184,7 @@ def _flicker(render_at: RenderAt, cameras: Sequence[Camera], quiet: bool) -> flo
 
 
 def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:
-    """Frames a second by the clock, after one to warm up, through one camera after the other."""
+    """Frames per second of wall time, after one warm-up frame, cycling through the cameras."""
     device = cameras[0].viewmat.device
 
     def play_all() -> None:
@@ -194,7 +204,7 @@ def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> f
 
 
 def write_views(path: Path, evaluation: Evaluation) -> None:
-    """Writes one line a view as CSV; nothing between commas is "not measured"."""
+    """Writes one line per view as CSV; an empty field was not measured."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [f.name for f in fields(ViewMetrics)], lineterminator="\n")
     writer.writeheader()

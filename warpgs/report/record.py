@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import SCALARS, Even
 
 from warpgs.config import TrainConfig
 from warpgs.files import read_bounded
-from warpgs.runs import run as runs
+from warpgs.runs.config_file import read_config
 
 Curve = list[tuple[float, float]]
 """(iteration, value), in order."""
@@ -76,7 +76,7 @@ def read_records(folders: Sequence[Path]) -> list[Record]:
 
 
 def _read(label: str, folder: Path) -> Record:
-    config = runs.load_config(folder)
+    config = read_config(folder)
     metrics = _read_metrics(folder)
     return Record(label, folder, config, metrics, _read_views(folder / "views.csv"), _read_curves(folder / "events"))
 

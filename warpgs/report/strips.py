@@ -1,20 +1,17 @@
 """Truth, our image and the error of a run's views."""
 
 import base64
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from warpgs import visualize as pictures
 from warpgs.progress import progress
-from warpgs.runs import run as runs
-from warpgs.runs.trained import Player
+from warpgs.runs.run import Run
 
 from .record import Record
 
@@ -60,21 +57,18 @@ def rendered(record: Record, names: Sequence[str], device: Literal["cuda", "cpu"
         ValueError: If the capture or the checkpoint can't be read.
         OSError: Likewise.
     """
-    config = runs.resolve(dataclasses.replace(record.config, device=device, lpips=None))
-    target = torch.device(config.device or "cpu")
-    capture = runs.open_capture(config, quiet)
-    scene, facts = runs.newest_scene(record.folder, config)
-    render_at = Player(scene.to(target), config, facts)
+    run = Run.open(record.folder, device)
+    capture, scene = run.open_capture(quiet), run.trained_scene()
     strips = {}
     for name in progress(names, f"pictures of {record.label}", quiet):
         if name not in capture.cameras:
             raise ValueError(f"{capture.name} has no view {name}")
         frame = capture.frame(name)
-        truth = frame.image.to(target).float() / 255.0
-        ours = render_at(frame.camera.to(target), False).joint.image.clamp(0, 1)
+        truth = frame.image.to(scene.device).float() / 255.0
+        ours = scene.render(frame.camera.to(scene.device)).joint.image.clamp(0, 1)
         images = pictures.to_bytes(truth), pictures.to_bytes(ours), pictures.error_image(ours, truth)
         strips[name] = Strip(*map(data_uri, images))
-    evaluated, newest = record.metrics.get("iterations"), facts["iteration"]
+    evaluated, newest = record.metrics.get("iterations"), scene.metadata.iteration
     note = "" if evaluated == newest else f"pictures are of iteration {newest}, figures of iteration {evaluated}"
     return Strips(strips, note)
 
@@ -86,7 +80,7 @@ def from_folder(record: Record, names: Sequence[str], reason: str) -> Strips:
 
 
 def _kept(folder: Path, name: str) -> Strip | None:
-    root = (folder / "pictures").resolve()
+    root = (folder / "images").resolve()
     path = (root / f"{name}.png").resolve()
     if path.parent != root or not path.is_file():
         return None

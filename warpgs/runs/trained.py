@@ -10,7 +10,7 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.render import Rendering, render
+from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
 
 from .checkpoint import Metadata

@@ -11,7 +11,7 @@ from warpgs.data import depth_alignment as depth
 from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.render import render
+from warpgs.rendering import render
 
 from . import point_cloud as init
 from .views import View, Views

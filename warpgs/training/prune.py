@@ -10,7 +10,7 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
-from warpgs.render import render
+from warpgs.rendering import render
 
 from . import optimizer as optim
 

@@ -12,7 +12,7 @@ from torch.nn.functional import mse_loss
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.model.scene import SplitScene
 from warpgs.ops.depth_error import depth_error
-from warpgs.render import Rendering, render
+from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import record
 from warpgs.runtime.streams import PRIORITY
 

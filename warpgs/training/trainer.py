@@ -175,7 +175,7 @@ class Trainer:
 
     def _roll_back(self, logger: TrainingLogger) -> None:
         """Returns to the newest checkpoint; what follows is random in another way."""
-        newest = checkpoint.saved(self.run)[-1]
+        newest = checkpoint.list_checkpoints(self.run)[-1]
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
         if rollbacks > MAX_ROLLBACKS:
             raise ValueError(
@@ -198,17 +198,17 @@ class Trainer:
         tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
         tensors["alignments"] = self.alignments
         moment = self.protocol.at(max(0, self.iteration - 1))
-        facts = {
-            "iteration": self.iteration,
-            "rollbacks": self.rollbacks,
-            "moving": moment.moving,
-            "relit": moment.relit,
-            "sh_degree": moment.sh_degree,
-            "train_seconds": self.seconds + time.monotonic() - self._started,
-            "peak_bytes": self._peak_bytes(),
-            "views": list(self.capture.train),
-        }
-        checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, facts)
+        metadata = checkpoint.Metadata(
+            iteration=self.iteration,
+            use_deformation=moment.moving,
+            use_appearance=moment.relit,
+            sh_degree=moment.sh_degree,
+            train_seconds=self.seconds + time.monotonic() - self._started,
+            peak_bytes=self._peak_bytes(),
+            rollbacks=self.rollbacks,
+            views=self.capture.train,
+        )
+        checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, metadata)
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
 
     def _peak_bytes(self) -> int | None:
@@ -224,10 +224,10 @@ class Trainer:
             ValueError: If it is damaged or of another config.
         """
         loaded = checkpoint.load(path)
-        if loaded.facts["views"] != list(self.capture.train):
+        if loaded.metadata.views != self.capture.train:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
-        self._begin_with(checkpoint.load_scene(loaded, self.config.model, path))
+        self._begin_with(checkpoint.load_scene(loaded, self.config.model))
         for name, parameter in self.scene.named_parameters():
             if f"adam.step.{name}" in loaded.tensors:
                 shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
@@ -237,9 +237,10 @@ class Trainer:
         statistics = self.step.statistics
         statistics.total = loaded.tensor("gradients.total", statistics.total.shape).to(self.device)
         statistics.count = loaded.tensor("gradients.count", statistics.count.shape).to(self.device)
-        self.iteration, self.rollbacks = int(loaded.number("iteration")), int(loaded.number("rollbacks"))
-        self.seconds, self._started = loaded.number("train_seconds"), time.monotonic()
-        self._earlier_peak = loaded.facts["peak_bytes"] or 0
+        metadata = loaded.metadata
+        self.iteration, self.rollbacks = metadata.iteration, metadata.rollbacks
+        self.seconds, self._started = metadata.train_seconds, time.monotonic()
+        self._earlier_peak = metadata.peak_bytes or 0
 
     def restore_newest(self) -> None:
         """Takes up the newest checkpoint of the run folder; a run that died before its first one begins anew.
@@ -247,6 +248,6 @@ class Trainer:
         Raises:
             ValueError: If it is damaged; the one before it is then the newest once it is deleted.
         """
-        saved = checkpoint.saved(self.run)
+        saved = checkpoint.list_checkpoints(self.run)
         if saved:
             self.restore(saved[-1])

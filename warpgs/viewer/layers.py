@@ -11,7 +11,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.render import render
+from warpgs.rendering import render
 from warpgs.visualize import depth_image, to_bytes
 
 LayerName = Literal["joint", "static", "dynamic", "depth", "alpha", "dynamic mask"]

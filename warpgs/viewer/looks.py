@@ -47,10 +47,10 @@ def first_look(source: Source, training: TrainingCameras | None) -> Look:
     """The middle training camera; without any, a look at the middle of the scene."""
     if training is not None:
         return look_through(training, len(training.views) // 2)
-    player = None if source.follow else source.current()
+    trained = None if source.follow else source.current()
     ball = Ball(torch.zeros(3), 1.0)
-    if player is not None:
-        means = torch.cat([player.scene.static.means, player.scene.dynamic.means]).detach().cpu()
+    if trained is not None:
+        means = torch.cat([trained.scene.static.means, trained.scene.dynamic.means]).detach().cpu()
         ball = Ball.around(means) if len(means) else ball
     camera = default_camera(ball)
     position, target = camera.position.double().numpy(), ball.center.double().numpy()

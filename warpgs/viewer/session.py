@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
-from warpgs.runs.trained import Player
+from warpgs.runs.trained import TrainedScene
 from warpgs.visualize import to_bytes
 
 from .clock import Clock
@@ -54,7 +54,7 @@ KEYFRAME_SCALE = 0.1
 class RenderRequest(NamedTuple):
     """Everything that a picture depends on, but its resolution."""
 
-    player: Player
+    scene: TrainedScene
     pose: Pose
     canvas: tuple[int, int]
     across: int
@@ -103,7 +103,7 @@ class Session:
         self._said_at = 0.0
         self.panel = Panel(client.gui, training, width)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
-        self.path = PathEditor(client.scene, self.panel, source.folder, self._look, scale)
+        self.path = PathEditor(client.scene, self.panel, source.run.folder, self._look, scale)
         self._connect()
         if training is not None:
             put(self.panel.view, len(training.views) // 2 + 1)  # which snaps
@@ -205,15 +205,15 @@ class Session:
         return rest if rest > 0 and shown < 1 else IDLE_SECONDS
 
     def _wish(self) -> RenderRequest | None:
-        player, panel = self._source.current(), self.panel
-        if player is None:
+        scene, panel = self._source.current(), self.panel
+        if scene is None:
             return None
         looks = (panel.layer.value, bool(panel.residual.value), panel.moment)
-        return RenderRequest(player, self._pose(), self._canvas(), panel.across, *looks)
+        return RenderRequest(scene, self._pose(), self._canvas(), panel.across, *looks)
 
     def _draw(self, wish: RenderRequest, scale: float, size: tuple[int, int]) -> None:
-        replays = scale == 1 and wish.layer == "joint" and wish.residual and wish.player.records
-        is_first = replays and not wish.player.is_recorded(size)
+        replays = scale == 1 and wish.layer == "joint" and wish.residual and wish.scene.uses_graphs
+        is_first = replays and not wish.scene.is_captured(size)
         with self._rendering:
             start = time.perf_counter()
             camera = camera_of(wish.pose, size, wish.moment)
@@ -230,16 +230,16 @@ class Session:
 
     def _replayed(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
         """A whole joint picture on CUDA, faster than its kernels could be launched."""
-        return to_bytes(wish.player.play(camera.to(wish.player.device)))
+        return to_bytes(wish.scene.play(camera.to(wish.scene.device)))
 
     def _rendered(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
-        return picture(self._splats_of(wish), camera, wish.layer, wish.player.config.antialias)
+        return picture(self._splats_of(wish), camera, wish.layer, wish.scene.config.antialias)
 
     def _splats_of(self, wish: RenderRequest) -> Splats:
         """The scene at the moment; the last one is kept, so that the networks rest while only the camera moves."""
         kept = self._splats
-        if kept is None or any(getattr(kept[0], n) != getattr(wish, n) for n in ("player", "moment", "residual")):
-            kept = self._splats = (wish, wish.player.splats(wish.moment, wish.residual))
+        if kept is None or any(getattr(kept[0], n) != getattr(wish, n) for n in ("scene", "moment", "residual")):
+            kept = self._splats = (wish, wish.scene.splats(wish.moment, wish.residual))
         return kept[1]
 
     def _pose(self) -> Pose:
@@ -268,11 +268,11 @@ class Session:
         self._said_at = now
         lines = [plain(line) for line in (self._problem, self._note, self._source.note) if line]
         if self._shown is not None:
-            player = self._shown[0].player
-            static, dynamic = len(player.scene.static), len(player.scene.dynamic)
+            trained = self._shown[0].scene
+            static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
             recent = sum(now - sent < RATE_SECONDS for sent in self._sent)
             cost, rate = self._cost
             rate = recent / RATE_SECONDS if recent > 2 else rate
             counts = f"{static:,} static, {dynamic:,} dynamic Gaussians"
-            lines += [counts, f"iteration {player.facts['iteration']:,}", f"{cost}, {rate:.1f} FPS"]
+            lines += [counts, f"iteration {trained.metadata.iteration:,}", f"{cost}, {rate:.1f} FPS"]
         self.panel.status.content = "  \n".join(lines)

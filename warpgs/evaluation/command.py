@@ -1,0 +1,27 @@
+"""``warpgs eval``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Evaluates a run's newest checkpoint; writes metrics.json, views.csv, images and a video into its folder."""
+
+    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    """Run folder."""
+    lpips: Path | None = None
+    """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
+    device: Literal["cuda", "cpu"] | None = None
+    """Device to render on; by default CUDA if there is a GPU."""
+    quiet: bool = False
+    """Hide progress."""
+
+    def run(self) -> None:
+        """Evaluates and prints a summary; raises as ``evaluate_run``."""
+        from .evaluate_run import evaluate_run
+
+        print(evaluate_run(self.run_folder, lpips=self.lpips, device=self.device, quiet=self.quiet))

@@ -1,0 +1,127 @@
+"""Evaluation of a run folder: metrics.json, views.csv, images/ and time.mp4."""
+
+import dataclasses
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warpgs import visualize
+from warpgs.data.capture import Capture, Frame
+from warpgs.files import write_json, write_png
+from warpgs.progress import progress
+from warpgs.rendering import Rendering
+from warpgs.runs.run import Device, Run
+from warpgs.runs.trained import TrainedScene
+from warpgs.video.mp4 import Video
+
+from .evaluate import Evaluation, evaluate, write_views
+from .lpips import find, locate
+
+NUM_IMAGES = 6
+"""Evaluation views to save as images, spread over the capture."""
+
+VIDEO_FRAMES = 120
+"""Frames of the video over time."""
+
+
+def evaluate_run(
+    folder: Path,
+    capture: Capture | None = None,
+    lpips: Path | None = None,
+    device: Device | None = None,
+    quiet: bool = False,
+) -> str:
+    """Evaluates the newest checkpoint of a run and writes the results into its folder.
+
+    Args:
+        folder: Run folder.
+        capture: Its capture, if it is open already.
+        lpips: Folder with the weights of LPIPS; the one of the config if None.
+        device: Device to render on; CUDA if None and there is a GPU.
+        quiet: Whether to hide progress bars.
+
+    Returns:
+        A summary to print.
+
+    Raises:
+        ValueError: If the run, its capture or the weights of LPIPS cannot be used.
+        OSError: If a file cannot be written.
+    """
+    run = Run.open(folder, device)
+    locate(lpips or run.config.lpips)  # before the time-consuming parts
+    capture = capture or run.open_capture(quiet)
+    scene = run.trained_scene()
+    network = find(lpips or run.config.lpips)
+    chosen = {round(k * (len(capture.val) - 1) / max(1, NUM_IMAGES - 1)) for k in range(NUM_IMAGES)}
+
+    def save_image(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
+        if index in chosen:
+            write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
+
+    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, quiet)
+    counts = {"num_static": len(scene.scene.static), "num_dynamic": len(scene.scene.dynamic)}
+    write_json(folder / "metrics.json", {**evaluation.summary(), **_training(scene), **counts, "commit": commit()})
+    write_views(folder / "views.csv", evaluation)
+    _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
+    return _summary(evaluation, counts)
+
+
+def _training(scene: TrainedScene) -> dict[str, Any]:
+    metadata = scene.metadata
+    return {
+        "iterations": metadata.iteration,
+        "train_seconds": metadata.train_seconds,
+        "peak_bytes": metadata.peak_bytes,
+    }
+
+
+def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool) -> None:
+    """The middle evaluation camera (without one, training camera) over time: joint | static | dynamic."""
+    names = capture.val or capture.train
+    camera = capture.cameras[names[len(names) // 2]].to(scene.device)
+    with Video(path) as video:
+        for k in progress(range(VIDEO_FRAMES), "video over time", quiet):
+            at_time = dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1))
+            rendering = scene.render(at_time, branches=True)
+            layers = (rendering.joint, rendering.static, rendering.dynamic)
+            images = [layer.image for layer in layers if layer is not None]
+            video.add(visualize.to_bytes(torch.cat(images, 1)))
+
+
+def _summary(evaluation: Evaluation, counts: dict[str, int]) -> str:
+    values = evaluation.summary()
+
+    def show(name: str, digits: int) -> str:
+        value = values[name]
+        return "not measured" if value is None else f"{value:.{digits}f}"
+
+    last_line = f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians"
+    if not evaluation.views:
+        quality = "the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"
+        return f"{quality}\nflicker {show('flicker', 5)}, {show('fps', 1)} FPS\n{last_line}"
+    lpips = f"LPIPS ({evaluation.lpips_net}) {show('lpips', 4)}"
+    if evaluation.lpips_net is None:
+        lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
+    lines = [
+        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
+        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, "
+        f"flicker {show('flicker', 5)}, {show('fps', 1)} FPS",
+        last_line,
+    ]
+    if values["masked_psnr"] is not None:
+        lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")
+    return "\n".join(lines)
+
+
+def commit() -> str | None:
+    """The commit of this program if it runs from a checkout; None if it is installed."""
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():
+        return None
+    try:
+        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True)
+    except OSError:
+        return None
+    return done.stdout.strip() or None

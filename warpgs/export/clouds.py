@@ -1,0 +1,53 @@
+"""A trained scene as a cloud of Gaussians at any time."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from warpgs.cameras import Camera
+from warpgs.config import RenderSettings
+from warpgs.progress import progress
+from warpgs.rendering import render
+from warpgs.runs.trained import TrainedScene
+
+from .cloud import Cloud
+
+
+@dataclass(frozen=True)
+class Clouds:
+    """The clouds of a trained scene over time.
+
+    Attributes:
+        scene: The scene, on the CPU.
+        rows: Indices of the Gaussians to export, static ones first; all if None.
+    """
+
+    scene: TrainedScene
+    rows: Int64[np.ndarray, " M"] | None = None
+
+    def at(self, time: float) -> Cloud:
+        """The Gaussians at a time in [0, 1], in the same rows at every time."""
+        cloud = Cloud.of_splats(self.scene.splats(time))
+        return cloud if self.rows is None else cloud.select(self.rows)
+
+    def most_visible(self, count: int, cameras: Sequence[Camera], quiet: bool = True) -> "Clouds":
+        """The same scene with at most ``count`` Gaussians: those with the largest blend weights in some camera.
+
+        Raises:
+            ValueError: If ``count`` is not positive.
+        """
+        if count < 1:
+            raise ValueError(f"--max-gaussians must be at least 1, got {count}")
+        settings = RenderSettings(statistics=True, antialias=self.scene.config.antialias)
+        weight = np.zeros(len(self.at(0.0)))
+        if len(weight) <= count:
+            return self
+        for camera in progress(cameras, "weighing Gaussians", quiet):
+            weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
+            assert weights is not None
+            weight = np.maximum(weight, weights.numpy())
+        kept = np.sort(np.argsort(-weight, kind="stable")[:count])
+        return dataclasses.replace(self, rows=kept if self.rows is None else self.rows[kept])
