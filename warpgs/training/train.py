@@ -19,7 +19,7 @@ NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 
 def checked(capture: Capture, config: TrainConfig) -> Capture:
     """The capture, after printing its warnings; a capture that is not fit to train on exits with code 1."""
-    findings = quick_findings(capture, all_static=config.assume == "static")
+    findings = quick_findings(capture.assuming(config.assume))
     for finding in findings:
         print(finding, file=sys.stderr if finding.level == "error" else sys.stdout)
     if any(finding.level == "error" for finding in findings):
