@@ -18,7 +18,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.files import write_array, write_json, write_png
-from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, Picture, raytrace
+from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, TracedImage, raytrace
 from warpgs.progress import progress
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
@@ -150,7 +150,7 @@ def _samples(count: int, device: torch.device) -> Tensor:
     return (torch.stack(places, 1) % 1.0).float().contiguous().to(device)
 
 
-def picture(time: float, shift: float, scene: BuiltinScene, device: torch.device) -> tuple[Picture, Camera]:
+def picture(time: float, shift: float, scene: BuiltinScene, device: torch.device) -> tuple[TracedImage, Camera]:
     """What a camera ``shift`` world units to the right of the training camera sees, in world units."""
     camera = _camera(time, scene, shift).to(device)
     bodies = _as_tensors([*_static_bodies(), *_moving_bodies(time)], device)
