@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from warpgs.files import write_json
-from warpgs.ops.tiles import forget_budgets
+from warpgs.ops.tiles import reset_budgets
 
 from .command import Bench
 from .measure import Measurements, measure
@@ -65,7 +65,7 @@ def bench(options: Bench, scenes: Iterable[Scene], device: str) -> None:
     print_machine(head)
     results, trace = [], []
     for scene in scenes:
-        forget_budgets()  # of the previous scene
+        reset_budgets()  # of the previous scene
         result, kernels = measure(options, scene, device)
         print_result(result)
         results.append(result)
