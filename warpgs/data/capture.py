@@ -1,8 +1,10 @@
-"""A capture: posed pictures of a moving scene, read frame by frame."""
+"""A capture: posed images of a dynamic scene, read frame by frame."""
 
+import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -11,20 +13,24 @@ from torch import Tensor
 from warpgs.cameras import Camera
 
 MIN_EXTENT = 0.05
-"""Keeps the rates of training above zero where the camera hardly moves; captures are normalised to about [-1, 1]."""
+"""Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
+
+Assumption = Literal["masks", "static", "dynamic"]
+"""What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture with all that is known of it, on the CPU.
+    """One image and everything that is known about it, on the CPU.
 
     Attributes:
-        name: Its id in the capture.
+        name: Id in the capture.
         camera: Undistorted pinhole camera in scene units, with the frame's time in [0, 1].
         image: [H, W, 3] 8-bit RGB.
-        static_mask: [H, W] true where the scene is static; None where the capture has no masks.
-        inverse_depth: [H, W] inverse depth up to a scale and an offset of this frame, NaN where unknown; None without.
-        covisible: [H, W] true where masked metrics look (iPhone captures); None without.
+        static_mask: [H, W] true where the scene is static; None if the frame has no mask.
+        inverse_depth: [H, W] inverse depth up to a scale and an offset per frame, NaN where unknown; None if the frame
+            has no depth.
+        covisible: [H, W] true where masked metrics are computed (iPhone captures); None if the frame has no such mask.
     """
 
     name: str
@@ -36,7 +42,7 @@ class Frame:
 
 
 class Capture:
-    """A capture in scene units: positions are (p − center) · scale of the files.
+    """A capture in scene units: a position p of the files is (p − center) · scale.
 
     Attributes:
         name: For messages and reports.
@@ -44,8 +50,9 @@ class Capture:
         cameras: The camera of each id of ``train`` and ``val``.
         points: [P, 3] sparse static points, P may be 0.
         point_colors: [P, 3] 8-bit RGB of the points; None where the capture has none.
-        extent: Radius of the training cameras' positions around their mean, times 1.1, at least 0.05: the unit of
-            3DGS's position learning rate and of its densification [scene units].
+        extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
+            unit of 3DGS's position learning rate and densification thresholds [scene units].
+        assumption: What is taken as dynamic; see ``assuming``.
     """
 
     def __init__(
@@ -59,10 +66,10 @@ class Capture:
         read: Callable[[str], Frame],
         cache_frames: int = 256,
     ) -> None:
-        """Keeps what is given; ``read`` is called for frames that are not among the last ``cache_frames``.
+        """Stores its arguments; ``read`` is called for frames that are not among the last ``cache_frames`` read.
 
         Raises:
-            ValueError: If there is no frame to train on.
+            ValueError: If there are no training frames.
         """
         if not train:
             raise ValueError(f"{name} has no frames to train on")
@@ -74,10 +81,20 @@ class Capture:
         self.point_colors = point_colors
         positions = torch.stack([cameras[name].position for name in train])
         self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+        self.assumption: Assumption = "masks"
         self._read = lru_cache(maxsize=cache_frames)(read)
 
+    def assuming(self, assumption: Assumption) -> "Capture":
+        """The same capture whose static masks are as in the files ("masks"), all true ("static") or all false.
+
+        Both share the cache of frames. ``assuming("masks")`` restores the masks of the files, which evaluation needs.
+        """
+        capture = copy.copy(self)
+        capture.assumption = assumption
+        return capture
+
     def frame(self, name: str) -> Frame:
-        """Reads a frame, or takes it from the cache of the last ``cache_frames`` read.
+        """A frame, from the cache if it is among the last ``cache_frames`` read.
 
         Raises:
             KeyError: If the capture has no frame of this id.
@@ -85,4 +102,7 @@ class Capture:
         """
         if name not in self.cameras:
             raise KeyError(name)
-        return self._read(name)
+        frame = self._read(name)
+        if self.assumption == "masks":
+            return frame
+        return replace(frame, static_mask=torch.full(frame.image.shape[:2], self.assumption == "static"))
