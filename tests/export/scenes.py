@@ -10,8 +10,10 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
+from warpgs.runs.checkpoint import Metadata
+from warpgs.runs.trained import TrainedScene
 
-FACTS = {"moving": True, "relit": True, "sh_degree": 1, "iteration": 32}
+METADATA = Metadata(iteration=32, use_deformation=True, use_appearance=True, sh_degree=1)
 
 
 def cloud(num, degree=1, seed=0):
@@ -51,8 +53,13 @@ def refusal(read, path):
     return None
 
 
-def moments(num_static=40, num_dynamic=20, seed=0):
-    """A scene whose networks do something: what moves goes a good part of its way in between."""
+def clouds(num_static=40, num_dynamic=20, seed=0):
+    """The clouds of ``trained_scene``."""
+    return Clouds(trained_scene(num_static, num_dynamic, seed))
+
+
+def trained_scene(num_static=40, num_dynamic=20, seed=0):
+    """A scene whose networks have a visible effect."""
     torch.manual_seed(seed)
     scene = SplitScene.empty(num_static, num_dynamic, tiny.MODEL)
     for part in (scene.static, scene.dynamic):
@@ -60,7 +67,7 @@ def moments(num_static=40, num_dynamic=20, seed=0):
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return Moments(scene, TrainConfig(model=tiny.MODEL), FACTS)
+    return TrainedScene(scene, TrainConfig(model=tiny.MODEL, device="cpu"), METADATA)
 
 
 def _random(num):
