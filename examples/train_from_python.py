@@ -6,6 +6,7 @@ python examples/train_from_python.py --data nerfds/as --preset fast --iterations
 
 import argparse
 import dataclasses
+import json
 from pathlib import Path
 
 import warpgs
@@ -13,7 +14,7 @@ from warpgs.config import PRESETS
 
 
 def main() -> None:
-    """Reads the options and trains."""
+    """Reads the options, trains and prints the metrics."""
     parser = argparse.ArgumentParser(description="Train SplitGaussian from Python.")
     parser.add_argument("--data", type=Path, help="folder of a capture (default: the built-in scene)")
     parser.add_argument("--preset", choices=list(PRESETS), default="quick", help="defaults of the config")
@@ -23,7 +24,9 @@ def main() -> None:
     # Every option of `warpgs train` is a field of the config; `config.model` and its other parts are dataclasses, too.
     preset = PRESETS[options.preset]
     config = dataclasses.replace(preset, data=options.data, iterations=options.iterations, out=options.out)
-    warpgs.train(config)
+    run = warpgs.train(config, log=print)
+    metrics = json.loads((run.folder / "metrics.json").read_text())
+    print(f"PSNR on evaluation views: {metrics['psnr']:.2f} dB")
 
 
 if __name__ == "__main__":
