@@ -51,7 +51,7 @@ def test_a_run_that_is_being_trained_is_not_resumed_beside(finished):
     with runs.held(finished[1]):
         second = train("--resume", finished[1], "--device", "cpu")
     assert second.returncode == 2
-    assert f"error: {finished[1]} is being trained by another process" in second.stderr
+    assert f"train.py: {finished[1]} is being trained by another process" in second.stderr
     with runs.held(finished[1]):
         pass  # free again
 
