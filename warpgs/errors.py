@@ -16,8 +16,8 @@ ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a
 def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str = ADVICE) -> int:
     """Runs a command and returns its exit code: the int that it returns, 0 if it returns something else.
 
-    ValueError, ImportError, OSError, lack of memory and Ctrl-C end with one line on stderr; for Ctrl-C it is the message
-    of the KeyboardInterrupt if that has one. Other errors are bugs and are raised.
+    ValueError, ImportError, OSError, lack of memory and Ctrl-C end with one line on stderr; for Ctrl-C that is the
+    message of the KeyboardInterrupt, if any. Other errors are bugs and are raised.
 
     Args:
         command: The command.

@@ -11,7 +11,7 @@ import pytest
 
 from tests.data import captures
 from tests.data.captures import edit_json, write_array
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
@@ -19,7 +19,7 @@ from warpgs.data.motion_check import motion_between
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    root = filmed.write_capture(tmp_path_factory.mktemp("check") / "capture")
+    root = boards.write_capture(tmp_path_factory.mktemp("check") / "capture")
     shutil.rmtree(root / "frames")
     return root
 
@@ -115,8 +115,8 @@ def test_points_at_the_cameras_are_a_warning(root):
 
 
 def write_depth(root, convert):
-    for k, view in enumerate(filmed.poses(16)):
-        write_array(root / f"depth/1x/shot{k:03d}.npy", convert(filmed.depth(view)).astype(np.float32))
+    for k, view in enumerate(boards.poses(16)):
+        write_array(root / f"depth/1x/shot{k:03d}.npy", convert(boards.depth(view)).astype(np.float32))
 
 
 def test_inverse_depth_of_any_scale_is_fit(root):

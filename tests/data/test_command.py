@@ -7,7 +7,7 @@ import sys
 import pytest
 import tyro
 
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.data.command import Check
 
 HEAVY = ("torch", "numpy", "cv2", "warp", "scipy")
@@ -15,7 +15,7 @@ HEAVY = ("torch", "numpy", "cv2", "warp", "scipy")
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return filmed.write_capture(tmp_path_factory.mktemp("commands"))
+    return boards.write_capture(tmp_path_factory.mktemp("commands"))
 
 
 def check(*arguments):

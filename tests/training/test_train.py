@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
@@ -143,7 +143,7 @@ def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
 
 
 def test_one_time_for_all_frames_is_only_warned_of_where_all_is_static(tmp_path, capsys):
-    root = filmed.write_capture(tmp_path / "film")
+    root = boards.write_capture(tmp_path / "film")
     names = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({name: {"time_id": 0} for name in names}))
     capture = load_capture(root)
