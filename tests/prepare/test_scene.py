@@ -7,7 +7,7 @@ import pytest
 
 from tests.prepare import filmed
 from warpgs.data.lens import Lens
-from warpgs.data.loaders.nerfies import load_capture, recognise
+from warpgs.data.loaders import load_capture, recognize
 from warpgs.prepare.scene import pinhole_lens, resized_lens, scene_units, static_points
 from warpgs.prepare.sfm import Cameras
 
@@ -19,7 +19,7 @@ def root(tmp_path_factory):
 
 def test_what_is_written_is_read_back_as_nerf_ds(root):
     capture = load_capture(root)
-    assert recognise(root) == "nerfds"
+    assert recognize(root) == "nerfds"
     name = capture.train[3]
     frame, k = capture.frame(name), int(name.removeprefix("shot"))
     images, masks = filmed.film(16)
@@ -37,7 +37,7 @@ def test_half_size_is_read_with_factor_2_and_what_moves_in_part_counts_as_moving
     frame, mask = capture.frame(name), filmed.film(16)[1][int(name.removeprefix("shot"))]
     blocks = mask.reshape(mask.shape[0] // 2, 2, mask.shape[1] // 2, 2)
     assert np.array_equal(~frame.static_mask.numpy(), blocks.any((1, 3)))
-    assert recognise(root) == "nerfds"
+    assert recognize(root) == "nerfds"
     assert frame.camera.K[0, 0].item() == pytest.approx(filmed.FOCAL / 2)
 
 

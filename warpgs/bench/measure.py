@@ -12,21 +12,21 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.ops.projection import record_projection
+from warpgs.ops.projection import Geometry, View, record_projection
 from warpgs.ops.rows import Rows
 from warpgs.ops.ssim import ssim
 from warpgs.ops.tiles import record_tiles
 from warpgs.runtime.graphs import capture
 from warpgs.runtime.profiling import KernelTime, profile
-from warpgs.runtime.replay import PLAIN_CALLS
-from warpgs.runtime.tape import Run
+from warpgs.runtime.replay import EAGER_CALLS
+from warpgs.runtime.tape import OpContext
 
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
 from .workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
 
-WARM_UPS = {"cuda": 50 + PLAIN_CALLS, "cpu": 1}
+WARM_UPS = {"cuda": 50 + EAGER_CALLS, "cpu": 1}
 """Runs before the first measured one. On CUDA they record replays and bring clock rates and threads to a steady state;
 on CPU, where runs take long, one run compiles the kernels."""
 
@@ -142,11 +142,12 @@ def peak_memory(workload: Workload) -> Measurements:
 @torch.no_grad()
 def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings) -> int:
     """Number of pairs of a Gaussian and a tile that it intersects."""
-    run = Run(splats.means.device, [])
-    geometry = (splats.means, splats.quats, splats.scales, splats.opacities, camera.viewmat, camera.K)
-    projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
-    rows = Rows(run, projection, splats.num_channels, settings.depth, camera.size)
-    begins, ends = record_tiles(run, rows, camera.size).ranges.unbind(-1)
+    ctx = OpContext(splats.means.device, [])
+    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
+    view = View(camera.viewmat, camera.K, *camera.size)
+    projection = record_projection(ctx, geometry, view, settings.near, settings.antialias)
+    rows = Rows(ctx, projection, splats.num_channels, settings.depth, camera.size)
+    begins, ends = record_tiles(ctx, rows, camera.size).ranges.unbind(-1)
     return int((ends - begins).sum())
 
 

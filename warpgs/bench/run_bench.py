@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from warpgs.files import write_json
-from warpgs.ops.tiles import forget_budgets
+from warpgs.ops.tiles import reset_budgets
 
 from .command import Bench
 from .measure import Measurements, measure
@@ -63,7 +63,7 @@ def bench(options: Bench, scenes: Iterable[Scene], device: str) -> list[Path]:
     print_machine(head)
     results, trace = [], []
     for scene in scenes:
-        forget_budgets()  # of the previous scene
+        reset_budgets()  # of the previous scene
         result, kernels = measure(options, scene, device)
         print_result(result)
         results.append(result)

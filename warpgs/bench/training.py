@@ -17,9 +17,10 @@ from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.runs.run import Run
-from warpgs.training import point_cloud as init
-from warpgs.training.schedule import Moment, Protocol
-from warpgs.training.step import WARM_UPS, Draw, Step
+from warpgs.runtime.graphs import WARM_UPS
+from warpgs.training.point_cloud import scene_box
+from warpgs.training.schedule import IterationPlan, Protocol
+from warpgs.training.step import Sample, Step
 from warpgs.training.views import Views
 
 from .report import print_rows
@@ -77,7 +78,7 @@ def random_scene(splats: Splats, camera: Camera) -> SplitScene:
                 torch.zeros(int(part.sum()), (config.sh_degree + 1) ** 2 - 1, 3),
             )
         )
-    return SplitScene(parts[0], parts[1], config, *init.scene_box(splats.means))
+    return SplitScene(parts[0], parts[1], config, *scene_box(splats.means))
 
 
 def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
@@ -101,20 +102,20 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
     for stage in (protocol.stage1, protocol.stage2):
         step = Step(config, scene, views, alignments, capture.extent)
-        moment = protocol.at((stage.start + stage.end) // 2)
-        result[f"{stage.name}_ms"] = statistics.median(_times(step, moment, device, repeats))
+        plan = protocol.at((stage.start + stage.end) // 2)
+        result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     if device == "cuda":
         result["peak_memory_mb"] = torch.cuda.max_memory_allocated() // 10**6
     return result
 
 
-def _times(step: Step, moment: Moment, device: str, repeats: int) -> Iterable[float]:
-    draws = [
-        Draw(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k))) for k in range(repeats)
+def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterable[float]:
+    samples = [
+        Sample(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k))) for k in range(repeats)
     ]
-    for draw in [draws[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
-        step(moment, draw)
-    return [milliseconds(partial(step, moment, draw), device) for draw in draws]
+    for sample in [samples[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
+        step(plan, sample)
+    return [milliseconds(partial(step, plan, sample), device) for sample in samples]
 
 
 def bench_fps(folder: Path, device: str) -> dict[str, Any]:

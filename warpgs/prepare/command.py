@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.data.check import check_capture
-from warpgs.data.loaders import Dataset
 
 from .frames import Selection
 from .options import LensModel, Options
@@ -77,7 +76,7 @@ class Check:
 
     capture: tyro.conf.Positional[Path]
     """Folder with dataset.json."""
-    dataset: Dataset | None = None
+    dataset: str | None = None
     """Its layout; recognised from its files if not given."""
     factor: int | None = None
     """Downscaling of the pictures; the dataset's usual one if not given."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.images import MAX_SIDE, decode
-from warpgs.data.motion_check import FLATTEST, MIN_SIDE
+from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
 from warpgs.files import write_json, write_png
 from warpgs.progress import progress
 
@@ -106,10 +106,10 @@ def take_frames(
             )
         size = image.shape[1::-1]
         image = _scaled(image, selection.longest_side)
-        if min(image.shape[:2]) < max(MIN_SIDE, max(image.shape[:2]) / FLATTEST):
+        if min(image.shape[:2]) < max(MIN_SIDE, max(image.shape[:2]) / MAX_ASPECT):
             raise ValueError(
                 f"{source}: {origin} of {image.shape[1]}×{image.shape[0]} pixels is too flat: the shorter side must "
-                f"have at least {MIN_SIDE} pixels and 1/{FLATTEST} of the longer one"
+                f"have at least {MIN_SIDE} pixels and 1/{MAX_ASPECT} of the longer one"
             )
         taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step))
         write_png(folder / f"{taken[-1].name}.png", image)

@@ -13,11 +13,20 @@ ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
 )
 
+UNFIT = 1
+"""Exit code if training on the capture would be useless."""
+
+REFUSED = 2
+"""Exit code after errors that the user can fix."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in shells."""
+
 
 def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
-    """The config of a command line: a preset's defaults, changed by options.
+    """The config of a command line: the defaults of a preset, changed by options.
 
-    The built-in scene has ``quick`` as its default preset, captures have ``paper``.
+    The default preset is ``quick`` for the built-in scene and ``paper`` for captures.
 
     Raises:
         ValueError: If a run is resumed with other options.
@@ -36,21 +45,32 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
 def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Trains, then evaluates; returns the exit code.
 
-    Ctrl-C saves a checkpoint and ends with 130; wrong options and other errors of the user end with one line and 2.
+    Ctrl-C saves a checkpoint and ends with 130. Errors that the user can fix end with one line and 2, captures on which
+    training would be useless with one line per error and 1.
     """
     try:
-        config = parse(sys.argv[1:] if arguments is None else arguments, prog)
-        from .train import train  # after --help, which needs no torch
-
-        return train(config)
+        return run(parse(sys.argv[1:] if arguments is None else arguments, prog))
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise
-        print(f"error: {out_of_memory(error)}; {ADVICE}", file=sys.stderr)
-        return 2
+        return _refuse(f"error: {out_of_memory(error)}; {ADVICE}", REFUSED)
     except (ValueError, OSError) as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
+        return _refuse(f"error: {one_line(error)}", REFUSED)
+    except KeyboardInterrupt as stop:
+        return _refuse(str(stop) or "stopped", INTERRUPTED)
+
+
+def run(config: TrainConfig) -> int:
+    """Trains, then evaluates, and prints what happens; returns the exit code."""
+    from .train import UnfitCaptureError, train  # imports torch, which --help does not need
+
+    try:
+        train(config, log=print)
+    except UnfitCaptureError as error:
+        return _refuse("\n".join(map(str, error.findings)), UNFIT)
+    return 0
+
+
+def _refuse(text: str, code: int) -> int:
+    print(text, file=sys.stderr)
+    return code
