@@ -1,4 +1,4 @@
-"""Cross-check against gsplat's own torch reference, which runs on CPU."""
+"""Cross-check against the torch reference of gsplat, which runs on CPU."""
 
 import warnings
 
@@ -14,7 +14,7 @@ from warpgs.ops.sh import spherical_harmonics
 from warpgs.runtime.tape import OpContext
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # gsplat's own, on import
+    warnings.simplefilter("ignore")  # of gsplat itself, on import
     theirs = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed (extra 'gsplat')")
 
 CAMERA = make_camera(80, 60)
@@ -43,7 +43,7 @@ def test_projection_agrees():
     splats, ours, (radii, means2d, depths, conics, compensations) = splats_and_theirs()
     seen = (ours.radii > 0).all(-1)
     assert 50 < seen.sum() < 200
-    assert (radii[seen] > 0).all()  # gsplat's box is wider, so it sees at least what is seen here
+    assert (radii[seen] > 0).all()  # gsplat uses larger boxes, so at least these are visible
     assert relative_error(ours.means2d[seen], means2d[seen]) < 1e-6
     assert relative_error(ours.depths[seen], depths[seen]) < 1e-6
     assert relative_error(ours.conics[seen], conics[seen]) < 1e-6
@@ -61,7 +61,7 @@ def test_spherical_harmonics_agree(degree):
     assert error(spherical_harmonics(splats.means, splats.sh, CAMERA.viewmat, degree=degree), expected) < 2e-6
 
 
-def test_tiles_are_those_of_the_box_less_those_that_the_ellipse_misses():
+def test_tiles_are_those_of_the_box_that_the_ellipse_intersects():
     _, ours, _ = splats_and_theirs()
     ctx = OpContext(torch.device("cpu"), [])
     result = tiles.record_tiles(ctx, Rows(ctx, ours, 3, False, CAMERA.size), CAMERA.size)

@@ -108,7 +108,7 @@ def test_a_video_has_the_requested_frame_rate(tmp_path):
 @pytest.mark.parametrize("shape", [(1, 32, 3), (20, 1, 3)])
 def test_a_frame_too_small_for_a_video_is_refused(tmp_path, shape):
     with (
-        pytest.raises(ValueError, match="a video needs two pixels a side"),
+        pytest.raises(ValueError, match="a video needs at least 2 × 2 pixels"),
         mp4.Video(tmp_path / "a.mp4") as video,
     ):
         video.add(np.zeros(shape, np.uint8))
