@@ -155,9 +155,8 @@ def test_recently_used_signatures_and_recordings_are_kept(recordings):
     others = [(20 + k, 10) for k in range(2 * replay.MAX_SIGNATURES)]
     for other in others:
         render_sizes([other, often])
-    assert [signature.recordings for signature in replay._signatures.values()] == [0] * (replay.MAX_SIGNATURES - 1) + [
-        1
-    ]
+    numbers = [signature.recordings for signature in replay._signatures.values()]
+    assert numbers == [0] * (replay.MAX_SIGNATURES - 1) + [1]
     made = len(recordings)
     for other in others[: replay.MAX_RECORDINGS + 1]:
         render_sizes([*[other] * (replay.EAGER_CALLS + 2), often])
@@ -241,10 +240,9 @@ def test_the_number_of_recordings_is_limited(recordings):
         for _ in range(replay.EAGER_CALLS + 2):
             splats = as_leaves(make_splats(num))
             render(splats, make_camera()).joint.image.sum().backward()
-        kept = [len(signature.idle) for signature in replay._signatures.values()]
-        assert (
-            sum(kept) == sum(signature.recordings for signature in replay._signatures.values()) <= replay.MAX_RECORDINGS
-        )
+        signatures = replay._signatures.values()
+        kept = [len(signature.idle) for signature in signatures]
+        assert sum(kept) == sum(signature.recordings for signature in signatures) <= replay.MAX_RECORDINGS
         assert kept[-1] == 1
 
 

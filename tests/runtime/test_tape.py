@@ -96,7 +96,7 @@ def test_nothing_is_listed_after_the_end_of_a_profile():
 
 
 def test_two_profiles_at_once_are_refused():
-    with profile(), pytest.raises(RuntimeError, match="already"), profile():
+    with profile(), pytest.raises(RuntimeError, match="another profile is active"), profile():
         pass
 
 

@@ -73,7 +73,8 @@ class _Budget:
 
     def fits(self, capacity: int, num_gaussians: int) -> bool:
         """Whether buffers of a capacity hold the last demand, and are not much larger than the next ones would be."""
-        return self.last <= capacity <= 2 * self.capacity(num_gaussians)
+        max_capacity = 2 * self.capacity(num_gaussians)  # reads the last demand, too
+        return self.last <= capacity <= max_capacity
 
 
 _budgets = threading.local()
