@@ -1,5 +1,6 @@
 """A trained scene: splats at any time, rendered images, and fast playback."""
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -90,8 +91,10 @@ class TrainedScene:
         inputs.viewmat.copy_(camera.viewmat)
         inputs.K.copy_(camera.K)
         inputs.time.fill_(camera.time)
-        seen = Camera(inputs.viewmat, inputs.K, *camera.size)
-        return self._graphs.run(camera.size, lambda: (self._render(seen, inputs.time, False).joint.image,))[0]
+        return self._graphs.run(camera.size, partial(self._render_inputs, inputs, camera.size))[0]
+
+    def _render_inputs(self, inputs: _Inputs, size: tuple[int, int]) -> tuple[Float[Tensor, "H W 3"]]:
+        return (self._render(Camera(inputs.viewmat, inputs.K, *size), inputs.time, False).joint.image,)
 
     @torch.no_grad()
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
