@@ -55,7 +55,7 @@ def test_a_run_that_is_being_trained_cannot_be_resumed(finished):
     with run.lock():
         second = train("--resume", finished[1], "--device", "cpu")
     assert second.returncode == 2
-    assert f"error: {finished[1]} is being trained by another process" in second.stderr
+    assert f"train.py: {finished[1]} is being trained by another process" in second.stderr
     with run.lock():
         pass  # unlocked
 
@@ -116,7 +116,7 @@ def refused(*arguments):
 def test_a_folder_without_a_capture_is_refused_in_one_line_with_exit_code_2(tmp_path):
     text = refused("--data", tmp_path, *QUICK)
     assert "dataset.json is missing" in text
-    assert len([line for line in text.splitlines() if line.startswith("error:")]) == 1
+    assert len([line for line in text.splitlines() if line.startswith("train.py:")]) == 1
 
 
 def test_a_damaged_image_is_refused_by_name(tmp_path):

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -41,53 +41,49 @@ class Frame:
     covisible: Bool[Tensor, "H W"] | None = None
 
 
+@dataclass(eq=False)
 class Capture:
     """A capture in scene units: a position p of the files is (p − center) · scale.
 
     Attributes:
         name: For messages and reports.
-        train, val: Ids of the frames to train on and to evaluate on.
         cameras: The camera of each id of ``train`` and ``val``.
+        train, val: Ids of the frames to train on and to evaluate on.
         points: [P, 3] sparse static points, P may be 0.
-        point_colors: [P, 3] 8-bit RGB of the points; None where the capture has none.
+        point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
+        read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
+        cache_frames: Number of frames to keep in memory.
+        assumption: What is taken as dynamic; see ``assuming``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
             unit of 3DGS's position learning rate and densification thresholds [scene units].
-        assumption: What is taken as dynamic; see ``assuming``.
+
+    Raises:
+        ValueError: If there are no training frames.
     """
 
-    def __init__(
-        self,
-        name: str,
-        cameras: dict[str, Camera],
-        train: Sequence[str],
-        val: Sequence[str],
-        points: Float[Tensor, "P 3"],
-        point_colors: UInt8[Tensor, "P 3"] | None,
-        read: Callable[[str], Frame],
-        cache_frames: int = 256,
-    ) -> None:
-        """Stores its arguments; ``read`` is called for frames that are not among the last ``cache_frames`` read.
+    name: str
+    cameras: dict[str, Camera]
+    train: Sequence[str]
+    val: Sequence[str]
+    points: Float[Tensor, "P 3"]
+    point_colors: UInt8[Tensor, "P 3"] | None
+    read: Callable[[str], Frame]
+    cache_frames: int = 256
+    assumption: Assumption = field(default="masks", init=False)
+    extent: float = field(init=False)
 
-        Raises:
-            ValueError: If there are no training frames.
-        """
-        if not train:
-            raise ValueError(f"{name} has no frames to train on")
-        self.name = name
-        self.cameras = cameras
-        self.train = tuple(train)
-        self.val = tuple(val)
-        self.points = points
-        self.point_colors = point_colors
-        positions = torch.stack([cameras[name].position for name in train])
+    def __post_init__(self) -> None:
+        if not self.train:
+            raise ValueError(f"{self.name} has no frames to train on")
+        self.train, self.val = tuple(self.train), tuple(self.val)
+        positions = torch.stack([self.cameras[name].position for name in self.train])
         self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
-        self.assumption: Assumption = "masks"
-        self._read = lru_cache(maxsize=cache_frames)(read)
+        self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
 
     def assuming(self, assumption: Assumption) -> "Capture":
-        """The same capture whose static masks are as in the files ("masks"), all true ("static") or all false.
+        """The same capture with static masks as in the files ("masks"), all true ("static") or all false ("dynamic").
 
-        Both share the cache of frames. ``assuming("masks")`` restores the masks of the files, which evaluation needs.
+        The captures have one cache of frames. ``assuming("masks")`` restores the masks of the files for evaluation.
         """
         capture = copy.copy(self)
         capture.assumption = assumption
@@ -102,7 +98,7 @@ class Capture:
         """
         if name not in self.cameras:
             raise KeyError(name)
-        frame = self._read(name)
+        frame = self._cached(name)
         if self.assumption == "masks":
             return frame
         return replace(frame, static_mask=torch.full(frame.image.shape[:2], self.assumption == "static"))

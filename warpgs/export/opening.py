@@ -36,7 +36,7 @@ def weighing_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
         chosen = [names[round(fraction * (len(names) - 1))] for fraction in fractions]
         return [capture.cameras[name] for name in chosen]
     times = camera_paths.evenly_spaced(WEIGHING_CAMERAS)
-    scene = camera_paths.Ball.around(_means(clouds.at(0.5)))
+    scene = camera_paths.BoundingSphere.around(_means(clouds.at(0.5)))
     return [camera_paths.default_camera(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
 
 
@@ -44,7 +44,7 @@ def opening(clouds: Clouds, capture: Capture | None, keys: int, seconds: float) 
     """How a page of a run begins."""
     cloud = _finite(clouds.at(0.5))
     track: list[Camera] = []
-    camera = camera_paths.default_camera(camera_paths.Ball.around(_means(cloud)))
+    camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
     if capture is not None:
         names = capture.val or capture.train
         camera, track = capture.cameras[names[len(names) // 2]], camera_paths.training_path(capture, keys)

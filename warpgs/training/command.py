@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 from warpgs.config import PRESETS, TrainConfig
-from warpgs.errors import is_out_of_memory, one_line, out_of_memory
+from warpgs.errors import run_command
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
@@ -15,12 +15,6 @@ ADVICE = (
 
 UNFIT = 1
 """Exit code if training on the capture would be useless."""
-
-REFUSED = 2
-"""Exit code after errors that the user can fix."""
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as in shells."""
 
 
 def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
@@ -48,16 +42,7 @@ def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
     Ctrl-C saves a checkpoint and ends with 130. Errors that the user can fix end with one line and 2, captures on which
     training would be useless with one line per error and 1.
     """
-    try:
-        return run(parse(sys.argv[1:] if arguments is None else arguments, prog))
-    except (RuntimeError, MemoryError) as error:
-        if not is_out_of_memory(error):
-            raise
-        return _refuse(f"error: {out_of_memory(error)}; {ADVICE}", REFUSED)
-    except (ValueError, OSError) as error:
-        return _refuse(f"error: {one_line(error)}", REFUSED)
-    except KeyboardInterrupt as stop:
-        return _refuse(str(stop) or "stopped", INTERRUPTED)
+    return run_command(lambda: run(parse(sys.argv[1:] if arguments is None else arguments, prog)), prog, ADVICE)
 
 
 def run(config: TrainConfig) -> int:
@@ -67,10 +52,6 @@ def run(config: TrainConfig) -> int:
     try:
         train(config, log=print)
     except UnfitCaptureError as error:
-        return _refuse("\n".join(map(str, error.findings)), UNFIT)
+        print("\n".join(map(str, error.findings)), file=sys.stderr)
+        return UNFIT
     return 0
-
-
-def _refuse(text: str, code: int) -> int:
-    print(text, file=sys.stderr)
-    return code

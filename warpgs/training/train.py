@@ -124,7 +124,7 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     Raises:
         UnfitCaptureError: If it has errors that would make training useless.
     """
-    findings = quick_findings(capture, all_static=config.assume == "static")
+    findings = quick_findings(capture.assuming(config.assume))
     errors = [finding for finding in findings if finding.level == "error"]
     for finding in findings:
         if finding not in errors:

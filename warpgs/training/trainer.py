@@ -214,7 +214,7 @@ class Trainer:
             train_seconds=self.seconds + time.monotonic() - self._started,
             peak_bytes=self._peak_bytes(),
             rollbacks=self.rollbacks,
-            views=self.capture.train,
+            views=tuple(self.capture.train),
         )
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, metadata)
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Literal, get_args
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -13,16 +12,13 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
-from warpgs.visualize import to_bytes
+from warpgs.visualize import depth_image, to_bytes
 
 LayerName = Literal["joint", "static", "dynamic", "depth", "alpha", "dynamic mask"]
 LAYERS: tuple[LayerName, ...] = get_args(LayerName)
 
 SEEN_ALPHA = 0.5
 """A pixel has a colour in the depth layer where it is at least this opaque."""
-
-DEPTH_PERCENTILES = (2.0, 98.0)
-"""Inverse depths of an image that have the first and the last colour."""
 
 
 @torch.no_grad()
@@ -43,18 +39,12 @@ def picture(splats: Splats, camera: Camera, layer: LayerName, antialias: bool = 
     assert shown is not None
     if layer == "depth":
         assert shown.depth is not None
-        return _depth_picture(shown.depth, shown.alpha)
+        return depth_image(_inverse_depth(shown.depth, shown.alpha))
     image = shown.alpha[..., None] if layer == "alpha" else shown.image
     return to_bytes(image.expand(-1, -1, 3))
 
 
-def _depth_picture(depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Inverse depth in colours, red near and blue far; black where nothing is."""
+def _inverse_depth(depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Inverse depth, NaN where less than ``SEEN_ALPHA`` is opaque."""
     seen = ((alpha >= SEEN_ALPHA) & (depth > 0)).cpu().numpy()
-    if not seen.any():
-        return np.zeros((*seen.shape, 3), np.uint8)
-    inverse = 1.0 / np.where(seen, depth.cpu().numpy(), 1.0)
-    low, high = np.percentile(inverse[seen], DEPTH_PERCENTILES)
-    level = np.clip((inverse - low) / max(high - low, 1e-6), 0, 1)  # a wall at one depth is of one colour, not NaN
-    colored = cv2.applyColorMap((level * 255).round().astype(np.uint8), cv2.COLORMAP_TURBO)
-    return np.where(seen[..., None], cv2.cvtColor(colored, cv2.COLOR_BGR2RGB), 0).astype(np.uint8)
+    return 1.0 / np.where(seen, depth.cpu().numpy(), np.nan)
