@@ -27,7 +27,7 @@ class Bounds:
     max: int = MAX_VALUE
     positive: bool = False
 
-    def check(self, name: str, value: float) -> None:
+    def check(self, name: str, value: int | float) -> None:
         """Raises ValueError, naming the option, if the value is out of range or not a number."""
         if not value >= self.min:
             raise ValueError(f"{name} must be a number of at least {self.min}, got {value}")

@@ -1,4 +1,4 @@
-"""The trunk and the two networks on it (paper Eq. 8b and 10)."""
+"""The trunk and the two networks that use it (paper Eq. 8b and 10), and the deformation models by name."""
 
 import pytest
 import torch
@@ -6,15 +6,19 @@ import torch
 from tests.reference.encoding import encode
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.config import ModelConfig
-from warpgs.model.fields import AppearanceField, DeformationField, Trunk
+from warpgs.model.appearance import AppearanceField
+from warpgs.model.fields import FIELDS, make_deformation
+from warpgs.model.mlp_deformation import MlpDeformation
+from warpgs.model.scene import SplitScene
+from warpgs.model.trunk import Trunk
 
 CENTER = torch.tensor([1.0, -2.0, 0.5])
 HALF_SIZE = torch.tensor([2.0, 2.0, 2.0])
 TIME = torch.tensor([0.37])
 OUTPUTS = 5
-FIELDS = (DeformationField, AppearanceField)
+NETWORKS = (*FIELDS.values(), AppearanceField)
 SHAPES = [(8, 4), (3, 2), (3, 1), (1, 4), (4, 4)]
-"""Numbers of layers, and the layer after which the encoding enters again: also none after which it could."""
+"""Numbers of layers, and the layer after which the encoding is concatenated, which need not exist."""
 
 
 def model(**changes):
@@ -22,15 +26,15 @@ def model(**changes):
     return ModelConfig(**{**sizes, **changes})
 
 
-def woken(trunk):
-    """Gives the last layer, which begins at zero, values that show."""
+def randomize_head(trunk):
+    """Gives the last layer, which is initialized to zero, random values."""
     for part in trunk.layers(trunk.values.data)[-1]:
         part.copy_(torch.randn(part.shape, generator=generator()))
 
 
 def make_trunk(**changes):
     trunk = Trunk(model(**changes), CENTER, HALF_SIZE, OUTPUTS)
-    woken(trunk)
+    randomize_head(trunk)
     return trunk
 
 
@@ -39,9 +43,9 @@ def outputs_of(field, means, time=TIME):
     return outputs if isinstance(outputs, tuple) else (outputs,)
 
 
-def make_field(kind, **changes):
-    field = kind(model(**changes), CENTER, HALF_SIZE)
-    woken(field.trunk)
+def make_field(network, **changes):
+    field = network(model(**changes), CENTER, HALF_SIZE)
+    randomize_head(field.trunk)
     return field
 
 
@@ -68,26 +72,26 @@ def double_parameters(trunk):
 
 
 @pytest.mark.parametrize(("depth", "skip"), SHAPES)
-def test_the_trunk_is_a_chain_of_layers_which_the_encoding_enters_again(depth, skip):
+def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip):
     trunk = make_trunk(depth=depth, skip=skip)
     expected = plain_trunk(double_parameters(trunk), random_means(), skip)
     assert relative_error(trunk(random_means(), TIME), expected) < 2e-6
 
 
 @pytest.mark.parametrize(("depth", "skip"), SHAPES)
-def test_gradients_of_the_trunk_are_those_of_the_chain_of_layers(depth, skip):
+def test_gradients_of_the_trunk_are_those_of_the_reference(depth, skip):
     trunk = make_trunk(depth=depth, skip=skip)
     outputs = trunk(random_means(), TIME)
-    (cotangent,) = random_like([outputs])
-    outputs.backward(cotangent)
+    (v_outputs,) = random_like([outputs])
+    outputs.backward(v_outputs)
     parameters = double_parameters(trunk)
-    plain_trunk(parameters, random_means(), skip).backward(cotangent.double())
+    plain_trunk(parameters, random_means(), skip).backward(v_outputs.double())
     ours = [part for layer in trunk.layers(trunk.values.grad) for part in layer]
     for gradient, expected in zip(ours, parameters, strict=True):
         assert relative_error(gradient, expected.grad) < 1e-5
 
 
-def test_nothing_flows_to_the_weights_of_padding():
+def test_padding_gets_no_gradient():
     trunk = make_trunk()
     trunk(random_means(), TIME).square().sum().backward()
     counted = torch.zeros_like(trunk.values)
@@ -98,15 +102,15 @@ def test_nothing_flows_to_the_weights_of_padding():
     assert not trunk.values[counted == 0].any()
 
 
-def test_layers_begin_as_those_of_torch_do():
+def test_layers_are_initialized_as_those_of_torch():
     trunk = Trunk(model(width=64), CENTER, HALF_SIZE, OUTPUTS)
     for weight, bias in trunk.layers(trunk.values.detach())[:-1]:
-        most = weight.shape[1] ** -0.5
-        assert 0.95 * most < float(weight.abs().max()) <= most
-        assert 0.5 * most < float(bias.abs().max()) <= most
+        bound = weight.shape[1] ** -0.5
+        assert 0.95 * bound < float(weight.abs().max()) <= bound
+        assert 0.5 * bound < float(bias.abs().max()) <= bound
 
 
-def test_the_papers_trunk_has_eight_layers_of_256_units():
+def test_the_default_trunk_has_eight_layers_of_256_units():
     trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, OUTPUTS)
     encoded = 3 * 21 + 21
     shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
@@ -114,7 +118,7 @@ def test_the_papers_trunk_has_eight_layers_of_256_units():
     assert shapes == [*((256, c) for c in columns), (OUTPUTS, 256)]
 
 
-def test_positions_are_seen_relative_to_the_box():
+def test_positions_are_normalized_by_the_box():
     trunk = make_trunk()
     twin = Trunk(model(), torch.zeros(3), torch.ones(3), OUTPUTS)
     twin.values.data.copy_(trunk.values.data)
@@ -128,24 +132,24 @@ def test_the_box_is_saved_with_the_network():
     assert torch.equal(state["half_size"], HALF_SIZE)
 
 
-@pytest.mark.parametrize("kind", FIELDS)
-def test_networks_begin_as_no_change(kind):
-    outputs = kind(model(), CENTER, HALF_SIZE)(random_means(), TIME)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_untrained_networks_output_zero(network):
+    outputs = network(model(), CENTER, HALF_SIZE)(random_means(), TIME)
     assert not any(output.any() for output in outputs)
 
 
-@pytest.mark.parametrize("kind", FIELDS)
-def test_a_network_that_begins_as_no_change_can_learn(kind):
-    field = kind(model(), CENTER, HALF_SIZE)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_the_head_of_an_untrained_network_gets_gradients(network):
+    field = network(model(), CENTER, HALF_SIZE)
     sum(output.sum() for output in field(random_means(), TIME)).backward()
     head = field.trunk.layers(field.trunk.values.grad)[-1]
     assert head.weight.any()
     assert head.bias.all()
 
 
-@pytest.mark.parametrize("kind", FIELDS)
-def test_networks_depend_on_position_and_on_time(kind):
-    field = make_field(kind)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_networks_depend_on_position_and_on_time(network):
+    field = make_field(network)
     here, there = outputs_of(field, random_means()), outputs_of(field, random_means() + 0.1)
     later = outputs_of(field, random_means(), TIME + 0.1)
     for index, output in enumerate(here):
@@ -153,25 +157,25 @@ def test_networks_depend_on_position_and_on_time(kind):
         assert (output != later[index]).all()
 
 
-@pytest.mark.parametrize("kind", FIELDS)
-def test_positions_get_no_gradient_from_networks(kind):
-    field, means = make_field(kind), random_means().requires_grad_()
+@pytest.mark.parametrize("network", NETWORKS)
+def test_networks_pass_no_gradient_to_positions(network):
+    field, means = make_field(network), random_means().requires_grad_()
     sum(output.square().sum() for output in field(means, TIME)).backward()
     assert means.grad is None
     assert all(part.any() for layer in field.trunk.layers(field.trunk.values.grad) for part in layer)
 
 
-@pytest.mark.parametrize("kind", FIELDS)
-def test_each_gaussian_is_looked_at_alone(kind):
-    field, means = make_field(kind), random_means()
+@pytest.mark.parametrize("network", NETWORKS)
+def test_gaussians_do_not_affect_each_other(network):
+    field, means = make_field(network), random_means()
     for together, alone in zip(outputs_of(field, means), outputs_of(field, means[3:4]), strict=True):
         assert error(together[3:4], alone) < 1e-5
 
 
-@pytest.mark.parametrize("kind", FIELDS)
+@pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("num", [0, 1])
-def test_few_gaussians_are_enough(kind, num):
-    field = make_field(kind)
+def test_few_gaussians_are_enough(network, num):
+    field = make_field(network)
     outputs = outputs_of(field, random_means(num))
     sum(output.sum() for output in outputs).backward()
     assert {len(output) for output in outputs} == {num}
@@ -179,7 +183,7 @@ def test_few_gaussians_are_enough(kind, num):
 
 
 def test_the_deformation_has_offsets_of_position_rotation_and_scale():
-    field = make_field(DeformationField)
+    field = make_field(MlpDeformation)
     offsets = field(random_means(), TIME)
     expected = plain_trunk(double_parameters(field.trunk), random_means(), skip=4)
     assert offsets.shape == (9, 3 + 4 + 3)
@@ -195,7 +199,46 @@ def test_the_appearance_has_a_residual_of_every_coefficient_up_to_its_degree(deg
     assert len(together.unique(dim=1).T) == 3 * (degree + 1) ** 2 + 1
 
 
-def test_an_appearance_that_leaves_opacities_alone_has_no_residual_of_them():
+def test_without_appearance_opacity_there_are_no_residuals_of_opacities():
     residuals, logits = make_field(AppearanceField, appearance_opacity=False)(random_means(), TIME)
     assert logits is None
     assert residuals.all()
+
+
+# Adding a deformation model ------------------------------------------------------------------------------------------
+
+
+class Drift(torch.nn.Module):
+    """All dynamic Gaussians move with one velocity."""
+
+    def __init__(self, config, center, half_size):
+        super().__init__()
+        self.velocity = torch.nn.Parameter(center.new_zeros(3))
+
+    def forward(self, means, time):
+        offsets = means.new_zeros(len(means), 10)
+        offsets[:, :3] = self.velocity * time
+        return offsets
+
+
+def scene_with(name):
+    return SplitScene.empty(3, 4, ModelConfig(depth=1, width=2, deformation=name))
+
+
+def test_a_deformation_model_that_is_added_to_the_dictionary_deforms_the_scene(monkeypatch):
+    monkeypatch.setitem(FIELDS, "drift", Drift)
+    scene = scene_with("drift")
+    scene.deformation.velocity.data = torch.tensor([1.0, 2.0, 3.0])
+    means = scene.splats(torch.tensor([0.5])).means
+    assert torch.equal(means[:3], scene.static.means)
+    assert error(means[3:], scene.dynamic.means + torch.tensor([0.5, 1.0, 1.5])) < 1e-6
+
+
+def test_an_unknown_deformation_model_is_refused_with_the_names_of_the_known_ones(monkeypatch):
+    monkeypatch.setitem(FIELDS, "drift", Drift)
+    with pytest.raises(ValueError, match=r"no deformation model 'dirft'; model\.deformation is one of: drift, mlp"):
+        scene_with("dirft")
+
+
+def test_the_default_deformation_model_is_that_of_the_paper():
+    assert type(make_deformation(ModelConfig(depth=1, width=2), CENTER, HALF_SIZE)) is MlpDeformation

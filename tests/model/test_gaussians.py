@@ -1,4 +1,4 @@
-"""Gaussians as the optimizer holds them."""
+"""Gaussians as they are optimized."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def copies(gaussians):
     return {name: p.detach().clone() for name, p in gaussians.named_parameters()}
 
 
-def test_the_parameters_are_the_six_that_groups_are_made_of():
+def test_gaussians_have_the_parameters_in_the_list():
     assert [name for name, _ in make_gaussians(2).named_parameters()] == list(PARAMETERS)
 
 
@@ -56,7 +56,7 @@ def test_gradients_reach_every_parameter_through_the_activations():
 
 
 @pytest.mark.parametrize("parents", [[], [2], [0, 1, 2, 3], [3, 3, 0, 3, 1, 2, 2]])
-def test_gathering_makes_copies_of_the_parents(parents):
+def test_gathering_copies_the_parents(parents):
     gaussians = make_gaussians(4)
     before = copies(gaussians)
     gaussians.gather(torch.tensor(parents, dtype=torch.int64))
@@ -65,7 +65,7 @@ def test_gathering_makes_copies_of_the_parents(parents):
         assert torch.equal(parameter, before[name][parents])
 
 
-def test_gathering_keeps_the_parameter_objects_and_their_wish_for_gradients():
+def test_gathering_keeps_parameter_objects_and_requires_grad():
     gaussians = make_gaussians(4)
     gaussians.sh_rest.requires_grad_(False)
     before = {name: (id(p), p.requires_grad) for name, p in gaussians.named_parameters()}
@@ -89,26 +89,26 @@ def test_gathering_drops_gradients():
     assert all(parameter.grad is None for parameter in gaussians.parameters())
 
 
-def test_gaussians_at_points_are_round_and_of_the_size_asked_for():
+def test_gaussians_at_points_are_isotropic_with_the_given_scales():
     scales = torch.tensor([0.1, 2.0])
     gaussians = Gaussians.from_points(torch.randn(2, 3), torch.rand(2, 3), scales, 0.3)
     assert error(gaussians.scales, scales[:, None].expand(2, 3)) < 1e-6
     assert torch.equal(gaussians.quats, torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2))
 
 
-def test_gaussians_at_points_have_the_opacity_asked_for():
+def test_gaussians_at_points_have_the_given_opacity():
     gaussians = Gaussians.from_points(torch.randn(3, 3), torch.rand(3, 3), torch.ones(3), 0.3)
     assert error(gaussians.opacities, torch.full((3,), 0.3)) < 1e-6
 
 
-def test_gaussians_at_points_have_the_colours_asked_for_from_everywhere():
+def test_gaussians_at_points_have_the_given_colours_in_all_directions():
     means, colors = torch.randn(20, 3), torch.rand(20, 3)
     gaussians = Gaussians.from_points(means, colors, torch.ones(20), 0.3)
-    shown = spherical_harmonics(means.double(), gaussians.sh.double(), make_camera().viewmat.double(), 3)
-    assert error(shown, colors) < 1e-6
+    actual = spherical_harmonics(means.double(), gaussians.sh.double(), make_camera().viewmat.double(), 3)
+    assert error(actual, colors) < 1e-6
 
 
-def test_gaussians_at_points_leave_the_points_given_alone():
+def test_gaussians_at_points_copy_the_points():
     points = torch.zeros(2, 3)
     gaussians = Gaussians.from_points(points, torch.rand(2, 3), torch.ones(2), 0.3)
     gaussians.means.data += 1.0
@@ -116,7 +116,7 @@ def test_gaussians_at_points_leave_the_points_given_alone():
 
 
 @pytest.mark.parametrize("num", [0, 1, 5])
-def test_empty_gaussians_take_the_state_of_as_many_others(num):
+def test_empty_gaussians_load_the_state_of_others(num):
     gaussians, other = Gaussians.empty(num), make_gaussians(num)
     gaussians.load_state_dict(other.state_dict())
     for name, parameter in gaussians.named_parameters():
@@ -124,7 +124,7 @@ def test_empty_gaussians_take_the_state_of_as_many_others(num):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_gaussians_hold_the_coefficients_up_to_their_degree(degree):
+def test_gaussians_have_the_coefficients_up_to_their_degree(degree):
     points = Gaussians.from_points(torch.zeros(2, 3), torch.rand(2, 3), torch.ones(2), 0.5, degree)
     for gaussians in (points, Gaussians.empty(2, degree)):
         assert gaussians.sh.shape == (2, (degree + 1) ** 2, 3)

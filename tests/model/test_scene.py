@@ -1,4 +1,4 @@
-"""The scene at a moment: static Gaussians with changing appearance, dynamic ones that move (paper Eq. 5, 8, 11)."""
+"""The scene at a time: static Gaussians with changing appearance, dynamic ones that deform (paper Eq. 5, 8, 11)."""
 
 import pytest
 import torch
@@ -33,11 +33,11 @@ def make_gaussians(num, seed):
     )
 
 
-def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, awake=True, **changes):
-    """A scene; if ``awake``, with networks that change something."""
+def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, trained=True, **changes):
+    """A scene; if ``trained``, with networks whose outputs are not 0."""
     static, dynamic = make_gaussians(num_static, 1), make_gaussians(num_dynamic, 2)
     scene = SplitScene(static, dynamic, model(**changes), torch.zeros(3), torch.full((3,), 3.0))
-    if awake:
+    if trained:
         for network in (scene.deformation, scene.appearance):
             for parameter in network.trunk.layers(network.trunk.values.data)[-1]:
                 parameter.copy_(0.2 * torch.randn(parameter.shape, generator=generator()))
@@ -63,9 +63,9 @@ def differing(a, b):
 # Eq. 5 ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_scene_is_its_static_and_then_its_dynamic_gaussians():
+def test_a_scene_is_its_static_followed_by_its_dynamic_gaussians():
     scene = make_scene()
-    splats = scene.splats(TIME, moving=False, relit=False)
+    splats = scene.splats(TIME, use_deformation=False, use_appearance=False)
     for part, gaussians in ((static_part(splats), scene.static), (dynamic_part(splats), scene.dynamic)):
         assert torch.equal(part["means"], gaussians.means)
         assert torch.equal(part["quats"], gaussians.quats)
@@ -74,7 +74,7 @@ def test_a_scene_is_its_static_and_then_its_dynamic_gaussians():
         assert torch.equal(part["sh"], gaussians.sh)
 
 
-def test_each_gaussian_says_of_which_branch_it_is():
+def test_is_dynamic_marks_the_branch_of_each_gaussian():
     assert make_scene().splats(TIME).is_dynamic.tolist() == [False] * NUM_STATIC + [True] * NUM_DYNAMIC
 
 
@@ -97,7 +97,7 @@ def test_either_branch_may_be_empty(sizes):
     assert int(splats.is_dynamic.sum()) == sizes[1]
 
 
-def test_the_degree_of_harmonics_is_passed_on():
+def test_the_sh_degree_is_passed_on():
     scene = make_scene()
     assert scene.splats(TIME, sh_degree=2).sh_degree == 2
     assert scene.static_splats(sh_degree=1).sh_degree == 1
@@ -105,7 +105,7 @@ def test_the_degree_of_harmonics_is_passed_on():
 
 def test_the_static_gaussians_alone_have_their_own_appearance():
     scene = make_scene()
-    alone, whole = scene.static_splats(), static_part(scene.splats(TIME, relit=False))
+    alone, whole = scene.static_splats(), static_part(scene.splats(TIME, use_appearance=False))
     for name in (*GEOMETRY, "opacities", "sh"):
         assert error(getattr(alone, name), whole[name]) < 1e-6
 
@@ -140,21 +140,25 @@ def test_opacities_stay_within_zero_and_one_whatever_their_residuals():
         assert ((opacities >= 0) & (opacities <= 1)).all()
 
 
-def test_opacities_are_constant_where_the_config_says_so():
+def test_opacities_are_constant_without_appearance_opacity():
     splats = static_part(make_scene(appearance_opacity=False).splats(TIME))
     assert torch.equal(splats["opacities"], make_scene().static.opacities)
 
 
-def test_without_relighting_the_appearance_network_does_not_matter():
-    scene, plain = make_scene(appearance_opacity=True), make_scene(awake=False)
-    assert not differing(static_part(scene.splats(TIME, relit=False)), static_part(plain.splats(TIME, relit=False)))
+def test_without_use_appearance_the_appearance_network_does_not_matter():
+    scene, plain = make_scene(appearance_opacity=True), make_scene(trained=False)
+    assert not differing(
+        static_part(scene.splats(TIME, use_appearance=False)), static_part(plain.splats(TIME, use_appearance=False))
+    )
 
 
 @pytest.mark.parametrize("appearance_opacity", [False, True])
-def test_relighting_begins_with_the_image_that_was_there(appearance_opacity):
-    scene = make_scene(awake=False, appearance_opacity=appearance_opacity, appearance_degree=3)
+def test_an_untrained_appearance_network_leaves_the_images_unchanged(appearance_opacity):
+    scene = make_scene(trained=False, appearance_opacity=appearance_opacity, appearance_degree=3)
     settings = RenderSettings(branches=True)
-    before, after = (render(scene.splats(TIME, relit=r), make_camera(), settings=settings) for r in (False, True))
+    before, after = (
+        render(scene.splats(TIME, use_appearance=r), make_camera(), settings=settings) for r in (False, True)
+    )
     for name in ("joint", "static", "dynamic"):
         assert torch.equal(getattr(before, name).image, getattr(after, name).image)
         assert getattr(before, name).alpha.any()
@@ -163,7 +167,7 @@ def test_relighting_begins_with_the_image_that_was_there(appearance_opacity):
 # Eq. 11 --------------------------------------------------------------------------------------------------------------
 
 
-def test_positions_move_by_their_offset():
+def test_positions_are_shifted_by_their_offsets():
     scene = make_scene()
     shift = scene.deformation(scene.dynamic.means, TIME)[:, :3]
     assert shift.all()
@@ -174,36 +178,36 @@ def test_positions_move_by_their_offset():
 def test_covariances_are_those_of_equation_11b():
     scene = make_scene()
     dynamic = scene.dynamic
-    _, turn, stretch = scene.deformation(dynamic.means, TIME).double().split([3, 4, 3], 1)
+    _, rotation_offset, scale_offset = scene.deformation(dynamic.means, TIME).double().split([3, 4, 3], 1)
     R = rotation(dynamic.quats.double())
-    R_offset = rotation(turn + torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
-    A = R_offset @ R @ torch.diag_embed(stretch.exp()) @ R.mT
+    R_offset = rotation(rotation_offset + torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    A = R_offset @ R @ torch.diag_embed(scale_offset.exp()) @ R.mT
     before = covariance(dynamic.quats.double(), dynamic.log_scales.double().exp())
-    moved = dynamic_part(scene.splats(TIME))
-    after = covariance(moved["quats"].double(), moved["scales"].double())
+    deformed = dynamic_part(scene.splats(TIME))
+    after = covariance(deformed["quats"].double(), deformed["scales"].double())
     assert relative_error(after, A @ before @ A.mT) < 1e-6
     assert relative_error(before, after) > 0.1
 
 
-def test_dynamic_gaussians_begin_where_they_are():
-    scene = make_scene(awake=False)
-    assert not differing(dynamic_part(scene.splats(TIME)), dynamic_part(scene.splats(TIME, moving=False)))
+def test_an_untrained_deformation_network_leaves_dynamic_gaussians_unchanged():
+    scene = make_scene(trained=False)
+    assert not differing(dynamic_part(scene.splats(TIME)), dynamic_part(scene.splats(TIME, use_deformation=False)))
 
 
-def test_without_moving_time_does_not_matter_to_dynamic_gaussians():
+def test_without_use_deformation_time_does_not_matter_to_dynamic_gaussians():
     scene = make_scene()
-    now, later = (scene.splats(time, moving=False) for time in (TIME, LATER))
+    now, later = (scene.splats(time, use_deformation=False) for time in (TIME, LATER))
     assert not differing(dynamic_part(now), dynamic_part(later))
 
 
-def test_noise_on_time_moves_dynamic_gaussians_as_that_later_time_would():
+def test_noise_on_time_deforms_dynamic_gaussians_as_another_time_does():
     scene = make_scene()
     noisy, later = scene.splats(TIME, time_noise=LATER - TIME), scene.splats(LATER)
     for name in GEOMETRY:
         assert error(dynamic_part(noisy)[name], dynamic_part(later)[name]) < 1e-5
 
 
-def test_noise_on_time_leaves_static_gaussians_alone():
+def test_noise_on_time_leaves_static_gaussians_unchanged():
     scene = make_scene(appearance_opacity=True)
     noisy, plain = scene.splats(TIME, time_noise=LATER - TIME), scene.splats(TIME)
     assert not differing(static_part(noisy), static_part(plain))
@@ -220,14 +224,14 @@ def test_no_gradient_flows_to_positions_through_the_networks():
         assert network.trunk.layers(network.trunk.values.grad)[0].weight.any()
 
 
-def test_the_gradient_of_moved_positions_is_that_of_positions():
+def test_the_gradient_of_deformed_positions_is_that_of_canonical_positions():
     scene = make_scene()
     scene.splats(TIME).means.backward(torch.full((NUM_STATIC + NUM_DYNAMIC, 3), 2.0))
     assert (scene.static.means.grad == 2.0).all()
     assert (scene.dynamic.means.grad == 2.0).all()
 
 
-def test_an_empty_scene_takes_the_state_of_another():
+def test_an_empty_scene_loads_the_state_of_another():
     scene = make_scene()
     other = SplitScene.empty(NUM_STATIC, NUM_DYNAMIC, model())
     other.load_state_dict(scene.state_dict())

@@ -1,4 +1,4 @@
-"""Training on the GPU: replayed steps are eager ones, and half precision loses little."""
+"""Training on the GPU: replayed steps equal eager ones, and half precision loses little."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ from tests import tiny
 from tests.scenes import generator, relative_error
 from warpgs.ops.mlp import num_values, perceptron, split
 from warpgs.rendering import render
-from warpgs.runs.trained import Player
-from warpgs.runtime.graphs import capture
-from warpgs.training.step import WARM_UPS
+from warpgs.runs.checkpoint import Metadata
+from warpgs.runs.trained import TrainedScene
+from warpgs.runtime.graphs import WARM_UPS, capture
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -27,21 +27,21 @@ def trainer_on_cuda(data, run, **changes):
 
 
 def parameters_after_steps(data, run, **changes):
-    """After iterations of stage II with one set of Gaussians, which is where most of a run's time goes."""
+    """Parameters after iterations of stage II with constant numbers of Gaussians."""
     trainer = trainer_on_cuda(data, run, **changes)
-    trainer._add_dynamic()
-    with torch.no_grad():  # a sphere's rotation would be trained by rounding errors alone
+    trainer._add_dynamic_gaussians()
+    with torch.no_grad():  # the rotation of a sphere would get gradients from rounding errors only
         trainer.scene.dynamic.log_scales += torch.linspace(-0.5, 0.5, 3, device="cuda")
-    moment = trainer.protocol.at(trainer.protocol.stage2.start)
+    plan = trainer.protocol.at(trainer.protocol.stage2.start)
     for iteration in range(STEPS):
         trainer.iteration = iteration
-        trainer.step(moment, trainer._draw(moment))
+        trainer.step(plan, trainer._sample(plan))
     torch.cuda.synchronize()
     return {name: p.detach().clone() for name, p in trainer.scene.named_parameters()}
 
 
-def test_replayed_steps_change_parameters_as_eager_ones_do(data, tmp_path):
-    """Not to the bit: the GPU adds gradients up in another order every time, and Adam makes much of tiny ones."""
+def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path):
+    """Up to noise: the GPU adds gradients in an order that varies, and Adam amplifies tiny ones."""
     eager, again = (parameters_after_steps(data, tmp_path / f"eager{k}", graph=False) for k in range(2))
     replayed = parameters_after_steps(data, tmp_path / "replayed", graph=True)
     for name, expected in eager.items():
@@ -50,24 +50,25 @@ def test_replayed_steps_change_parameters_as_eager_ones_do(data, tmp_path):
             assert relative_error(replayed[name], expected) < max(1e-3, 4.0 * noise), name
 
 
-def test_a_run_with_graphs_goes_through_all_stages(data, tmp_path):
+def test_a_run_with_graphs_passes_all_stages(data, tmp_path):
     trainer = trainer_on_cuda(data, tmp_path / "run")
     assert tiny.train(trainer)
     assert all(p.isfinite().all() for p in trainer.scene.parameters())
 
 
-def test_a_played_frame_is_the_rendered_one(data, tmp_path):
+def test_a_played_frame_equals_the_rendered_one(data, tmp_path):
     trainer = trainer_on_cuda(data, tmp_path / "run")
     tiny.train(trainer)
-    player = Player(trainer.scene, trainer.config, {"moving": True, "relit": True, "sh_degree": 1})
+    metadata = Metadata(iteration=tiny.LENGTH, use_deformation=True, use_appearance=True, sh_degree=1)
+    scene = TrainedScene(trainer.scene, trainer.config, metadata)
     cameras = [trainer.capture.cameras[name].to("cuda") for name in trainer.capture.train[:3]]
     for camera in cameras:
-        assert relative_error(player.play(camera), player(camera, False).joint.image) < 1e-5
+        assert relative_error(scene.play(camera), scene.render(camera).joint.image) < 1e-5
 
 
 @pytest.mark.parametrize("opacity", [False, True])
 @pytest.mark.parametrize("captured", [False, True])
-def test_colours_that_come_late_come_in_time(data, tmp_path, opacity, captured):
+def test_render_waits_for_late_colours(data, tmp_path, opacity, captured):
     model = dataclasses.replace(tiny.MODEL, appearance_opacity=opacity)
     trainer = trainer_on_cuda(data, tmp_path / "run", model=model)
     tiny.train(trainer)
@@ -75,37 +76,40 @@ def test_colours_that_come_late_come_in_time(data, tmp_path, opacity, captured):
     scene.requires_grad_(True)
     time = torch.tensor([camera.time], device="cuda")
 
-    def drawn(late):
+    def image_and_gradients(late):
         image = render(scene.splats(time, late_sh=late), camera).joint.image
         return (image.detach(), *torch.autograd.grad(image.square().sum(), list(scene.parameters())))
 
-    late = (capture(lambda: drawn(True)) if captured else lambda: drawn(True))()
-    for actual, expected in zip(late, drawn(False), strict=True):
+    def with_late_colours():
+        return image_and_gradients(late=True)
+
+    late = capture(with_late_colours)() if captured else with_late_colours()
+    for actual, expected in zip(late, image_and_gradients(late=False), strict=True):
         assert relative_error(actual, expected) < 1e-4
 
 
-def test_graphs_that_are_taken_again_take_over_the_memory(data, tmp_path):
+def test_graphs_that_are_captured_again_reuse_the_memory(data, tmp_path):
     trainer = trainer_on_cuda(data, tmp_path / "run")
-    trainer._add_dynamic()
-    moment = trainer.protocol.at(trainer.protocol.stage2.start)
+    trainer._add_dynamic_gaussians()
+    plan = trainer.protocol.at(trainer.protocol.stage2.start)
     reserved = []
     for _ in range(8):
-        trainer.step.resized()
+        trainer.step.reset_statistics()
         for _ in range(WARM_UPS + 2):
-            trainer.step(moment, trainer._draw(moment))
+            trainer.step(plan, trainer._sample(plan))
         torch.cuda.synchronize()
         reserved.append(torch.cuda.memory_reserved())
     assert reserved[-1] <= reserved[2]
 
 
 def rounded(x):
-    """In half precision, as seen on the way forth; the way back does not notice."""
+    """Rounded to half precision in the forward pass; the backward pass is the identity."""
     return x + (x.detach().half().double() - x.detach())
 
 
 def plain(encoding, weights, biases, skip):
-    """The layers in double precision, with what is kept in half precision rounded: else units near zero, which pass
-    gradients in the one case and not in the other, would be most of the difference."""
+    """The layers in double precision, with rounding wherever half precision is stored: otherwise ReLU units near zero,
+    which pass gradients in one case only, would cause most of the difference."""
     encoding = values = rounded(encoding)
     for k, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
         values = torch.cat([values, encoding], 1) if k == skip else values
@@ -116,17 +120,17 @@ def plain(encoding, weights, biases, skip):
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])
 @pytest.mark.parametrize("num", [0, 1, 1000])
 @pytest.mark.parametrize("outputs", [3, 10])
-def test_half_precision_loses_little_whatever_the_size_of_gradients(num, scale, outputs):
+def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outputs):
     g = generator()
     encoding = torch.rand(num, 21, generator=g).double() * 2 - 1
     shapes = [(64, 21), (64, 64), (64, 85), (64, 64), (outputs, 64)]
     weights = [torch.randn(*shape, generator=g) / shape[1] ** 0.5 for shape in shapes]
     biases = [0.1 * torch.randn(rows, generator=g) for rows, _ in shapes]
-    cotangent = scale * torch.randn(num, outputs, generator=g)
+    v_outputs = scale * torch.randn(num, outputs, generator=g)
 
     expected = [p.double().requires_grad_() for p in (*weights, *biases)]
     values = plain(encoding, expected[:5], expected[5:], skip=2)
-    values.backward(cotangent.double())
+    values.backward(v_outputs.double())
 
     padded = [(64, 24), (64, 64), (64, 88), (64, 64), (16, 64)]
     flat = torch.zeros(num_values(padded))
@@ -134,9 +138,11 @@ def test_half_precision_loses_little_whatever_the_size_of_gradients(num, scale, 
         layer.weight[: weight.shape[0], : weight.shape[1]] = weight
         layer.bias[: len(bias)] = bias
     flat = flat.cuda().requires_grad_()
-    inputs = torch.nn.functional.pad(encoding.half().cuda(), (64, 3))  # room before, padding behind
+    inputs = torch.nn.functional.pad(
+        encoding.half().cuda(), (64, 3)
+    )  # columns for the hidden units before, padding after
     ours = perceptron(inputs, flat, padded, skip=2, num_outputs=outputs)
-    ours.backward(cotangent.cuda())
+    ours.backward(v_outputs.cuda())
 
     assert ours.is_contiguous()
     gradients = split(flat.grad, padded)

@@ -13,9 +13,10 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import render
-from warpgs.training.losses import dynamic_loss, image_loss, static_loss
+from warpgs.training.loss_terms import TERMS
+from warpgs.training.losses import LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
-from warpgs.training.step import TERMS, Draw, Step
+from warpgs.training.step import Sample, Step
 from warpgs.training.views import Views
 
 HEIGHT, WIDTH = 21, 18
@@ -29,7 +30,7 @@ def random_image(seed):
 
 
 def static_mask():
-    """True where static: all but a block."""
+    """True where static: everywhere but in a block."""
     mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     mask[5:13, 4:11] = False
     return mask
@@ -95,25 +96,25 @@ def test_gradients_of_the_static_loss_are_those_of_equation_9(weight):
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_the_static_image_is_free_where_something_moves(weight):
+def test_the_static_image_is_unconstrained_in_the_dynamic_region(weight):
     changed = static_loss(changed_at(IMAGE, ~MASK), changed_at(TRUTH, ~MASK), MASK, weight)
     assert error(changed, static_loss(IMAGE, TRUTH, MASK, weight)) < 1e-6
     assert not gradient(static_loss, IMAGE, TRUTH, MASK, weight)[~MASK].any()
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_the_static_image_is_bound_wherever_the_mask_says_static(weight):
+def test_the_static_image_is_constrained_in_the_static_region(weight):
     assert gradient(static_loss, IMAGE, TRUTH, MASK, weight)[MASK].any(1).all()
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_where_all_is_static_the_static_loss_is_that_of_the_whole_image(weight):
+def test_if_everything_is_static_the_static_loss_covers_the_whole_image(weight):
     everywhere = torch.ones_like(MASK)
     assert error(static_loss(IMAGE, TRUTH, everywhere, weight), image_loss(IMAGE, TRUTH, weight)) < 1e-6
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_where_nothing_is_static_there_is_no_static_loss(weight):
+def test_if_nothing_is_static_the_static_loss_is_zero(weight):
     nowhere = torch.zeros_like(MASK)
     assert static_loss(IMAGE, TRUTH, nowhere, weight).abs() < 1e-6
     assert not gradient(static_loss, IMAGE, TRUTH, nowhere, weight).any()
@@ -123,7 +124,7 @@ def test_where_nothing_is_static_there_is_no_static_loss(weight):
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_the_dynamic_loss_masks_the_truth_alone(weight):
+def test_the_dynamic_loss_masks_the_ground_truth_only(weight):
     expected = compared(IMAGE, TRUTH * where(~MASK), weight)
     assert error(dynamic_loss(IMAGE, TRUTH, MASK, weight, BLACK), expected) < 1e-6
 
@@ -136,29 +137,29 @@ def test_gradients_of_the_dynamic_loss_are_those_of_equation_12(weight):
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_the_truth_where_all_is_still_does_not_matter_to_the_dynamic_image(weight):
+def test_the_ground_truth_of_the_static_region_does_not_matter_to_the_dynamic_loss(weight):
     changed = dynamic_loss(IMAGE, changed_at(TRUTH, MASK), MASK, weight, BLACK)
     assert error(changed, dynamic_loss(IMAGE, TRUTH, MASK, weight, BLACK)) < 1e-6
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
-def test_the_dynamic_image_is_bound_everywhere(weight):
+def test_the_dynamic_image_is_constrained_everywhere(weight):
     assert gradient(dynamic_loss, IMAGE, TRUTH, MASK, weight, BLACK).any(2).all()
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
 @pytest.mark.parametrize("background", [BLACK, PURPLE])
-def test_a_dynamic_image_of_what_moves_over_its_background_has_no_loss(weight, background):
+def test_a_perfect_dynamic_image_over_its_background_has_no_loss(weight, background):
     perfect = background.repeat(HEIGHT, WIDTH, 1)
     perfect[5:13, 4:11] = TRUTH[5:13, 4:11]
     assert dynamic_loss(perfect, TRUTH, MASK, weight, background).abs() < 1e-6
 
 
-def test_a_dynamic_image_without_its_background_has_a_loss():
+def test_a_perfect_dynamic_image_over_another_background_has_a_loss():
     perfect = torch.zeros(HEIGHT, WIDTH, 3)
     perfect[5:13, 4:11] = TRUTH[5:13, 4:11]
-    still = 1.0 - 8 * 7 / (HEIGHT * WIDTH)
-    expected = still * PURPLE.double().mean()
+    static_fraction = 1.0 - 8 * 7 / (HEIGHT * WIDTH)
+    expected = static_fraction * PURPLE.double().mean()
     assert error(dynamic_loss(perfect, TRUTH, MASK, 0.0, PURPLE), expected) < 1e-6
 
 
@@ -171,7 +172,7 @@ ALIGNMENT = torch.tensor([0.5, 0.1])
 
 
 def compared_depth(depth, alpha, target, region):
-    """The depth loss against a target, as inverse depth that has yet to be aligned."""
+    """The depth loss against a target, which is passed as inverse depth before alignment."""
     scale, offset = ALIGNMENT.double()
     inverse_depth = ((1.0 / target.double() - offset) / scale).float()
     return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region)
@@ -182,35 +183,35 @@ def test_the_depth_loss_is_that_of_equation_14():
     assert error(compared_depth(DEPTH, OPAQUE, TARGET, MASK), expected) < 1e-6
 
 
-def test_depth_is_free_outside_the_region():
+def test_depth_is_unconstrained_outside_the_region():
     assert not gradient(compared_depth, DEPTH, OPAQUE, TARGET, MASK)[~MASK].any()
 
 
-def test_depth_is_pulled_to_its_target_with_equal_force():
+def test_gradients_of_depth_are_signs_of_its_error():
     expected = (DEPTH.double() - TARGET.double()).sign() / (HEIGHT * WIDTH)
     assert error(gradient(compared_depth, DEPTH, OPAQUE, TARGET, torch.ones_like(MASK)), expected) < 1e-9
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
-def test_pixels_of_unknown_depth_are_left_out(unknown):
+def test_pixels_of_unknown_depth_are_ignored(unknown):
     target, known = TARGET.clone(), MASK.clone()
     target[0] = unknown
     known[0] = False
     expected = compared_depth(DEPTH, OPAQUE, TARGET, known)
     assert error(compared_depth(DEPTH, OPAQUE, target, MASK), expected) < 1e-7
-    pull = gradient(compared_depth, DEPTH, OPAQUE, target, MASK)
-    assert pull.isfinite().all()
-    assert not pull[0].any()
+    v_depth = gradient(compared_depth, DEPTH, OPAQUE, target, MASK)
+    assert v_depth.isfinite().all()
+    assert not v_depth[0].any()
 
 
-def test_pixels_where_little_was_drawn_are_left_out():
-    alpha, drawn = OPAQUE.clone(), MASK.clone()
+def test_pixels_with_low_alpha_are_ignored():
+    alpha, opaque = OPAQUE.clone(), MASK.clone()
     alpha[1] = 0.4
-    drawn[1] = False
-    assert error(compared_depth(DEPTH, alpha, TARGET, MASK), compared_depth(DEPTH, OPAQUE, TARGET, drawn)) < 1e-7
+    opaque[1] = False
+    assert error(compared_depth(DEPTH, alpha, TARGET, MASK), compared_depth(DEPTH, OPAQUE, TARGET, opaque)) < 1e-7
 
 
-def test_without_any_known_depth_there_is_no_loss():
+def test_without_any_known_depth_the_loss_is_zero():
     target = torch.full_like(TARGET, torch.nan)
     assert compared_depth(DEPTH, OPAQUE, target, MASK) == 0
     assert not gradient(compared_depth, DEPTH, OPAQUE, target, MASK).any()
@@ -233,10 +234,11 @@ LOSS = LossConfig(
     depth_dynamic=0.4,
     depth_end=2.0,  # no decay
 )
+NOTHING = LossConfig(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
 SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, appearance_from=100)
 STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
-"""The first iteration of each."""
+"""First iteration of each stage."""
 
 
 def make_gaussians(chosen):
@@ -246,33 +248,34 @@ def make_gaussians(chosen):
 
 
 def prepared(stage, loss=LOSS, at=0, **options):
-    """A scene, an iteration of a stage (the first one or the one after ``at`` others) and what trains it then."""
+    """A scene, the plan of an iteration of a stage, by default of the first, and a step that trains the scene."""
     frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
     capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
     config = TrainConfig(model=NETWORK, loss=loss, schedule=SCHEDULE, **options)
     static, dynamic = make_gaussians(~SPLATS.is_dynamic), make_gaussians(SPLATS.is_dynamic)
     scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
-    moment = Protocol(config, has_depth=True).at(STAGES[stage] + at)
-    assert moment.stage.name == stage
+    plan = Protocol(config, has_depth=True).at(STAGES[stage] + at)
+    assert plan.phase.stage == stage
     views = Views(capture, torch.device("cpu"), 1 << 30)
-    return scene, moment, Step(config, scene, views, ALIGNMENTS, capture.extent)
+    return scene, plan, Step(config, scene, views, ALIGNMENTS, capture.extent)
 
 
 def terms_of(stage, loss=LOSS):
-    """What the first iteration of a stage says of its loss, and the rendering that it compares."""
-    scene, moment, step = prepared(stage, loss)
+    """The weighted terms of the first iteration of a stage, and the rendering that they compare."""
+    scene, plan, step = prepared(stage, loss)
+    phase = plan.phase
     with torch.no_grad():
-        splats = scene.splats(torch.zeros(1), moment.moving, moment.relit, moment.sh_degree)
+        splats = scene.splats(torch.zeros(1), phase.use_deformation, phase.use_appearance, phase.sh_degree)
         rendering = render(splats, CAMERA, settings=RenderSettings(branches=True, depth=True))
-    step(moment, Draw(0, 0.0, PURPLE))
-    return dict(zip(TERMS, step.sums[:5], strict=True)), rendering
+    step(plan, Sample(0, 0.0, PURPLE))
+    return {name: torch.tensor(value) for name, value in step.take_means().terms.items()}, rendering
 
 
 def changed_by(stage, loss=LOSS, at=0, **options):
     """Names of the parameters that an iteration of a stage changes; layers of networks count as the network."""
-    scene, moment, step = prepared(stage, loss, at, **options)
+    scene, plan, step = prepared(stage, loss, at, **options)
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
-    step(moment, Draw(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE))
     changed = [name for name, p in scene.named_parameters() if not torch.equal(p, before[name])]
     return {name.split(".")[0] if name.startswith(("deformation", "appearance")) else name for name in changed}
 
@@ -308,7 +311,7 @@ def test_the_static_term_is_the_weighted_static_loss_in_every_stage(stage):
 
 
 @pytest.mark.parametrize("stage", ["stage1", "stage2"])
-def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_background_drawn(stage):
+def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_sampled_background(stage):
     terms, rendering = terms_of(stage)
     dynamic = rendering.dynamic
     image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
@@ -316,7 +319,7 @@ def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_background_drawn
     assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
 
 
-def test_the_joint_term_compares_the_joint_image_with_the_whole_truth():
+def test_the_joint_term_compares_the_joint_image_with_the_whole_ground_truth():
     terms, rendering = terms_of("stage2")
     assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
 
@@ -329,7 +332,7 @@ def test_the_joint_term_compares_the_joint_image_with_the_whole_truth():
         ("stage2", {"static", "dynamic", "joint", "depth", "depth_dynamic"}),
     ],
 )
-def test_each_stage_has_its_terms(stage, used):
+def test_each_stage_has_its_active_terms(stage, used):
     terms, _ = terms_of(stage)
     assert {name for name, value in terms.items() if value != 0} == used
 
@@ -341,64 +344,97 @@ def test_the_depth_term_is_that_of_the_static_branch_in_the_static_region(stage)
     assert error(terms["depth"], expected) < 1e-5
 
 
-def test_the_dynamic_branch_has_its_share_of_the_depth_loss_in_the_dynamic_region():
+def test_the_dynamic_depth_term_has_a_relative_weight_and_the_dynamic_region():
     terms, rendering = terms_of("stage1")
     expected = 0.4 * 2.0 * expected_depth(rendering.dynamic, ~VIEW_MASK)
     assert error(terms["depth_dynamic"], expected) < 1e-5
 
 
 @pytest.mark.parametrize("stage", ["stage1", "stage2"])
-def test_the_weight_of_depth_decays_exponentially(stage):
+def test_the_depth_term_decays_exponentially(stage):
     constant, _ = terms_of(stage)
     decaying, _ = terms_of(stage, dataclasses.replace(LOSS, depth_end=0.02))
     assert error(decaying["depth"] / constant["depth"], torch.tensor(0.01 ** (STAGES[stage] / 72_000))) < 1e-5
 
 
-def test_without_a_weight_depth_does_not_count():
+def test_with_a_weight_of_zero_the_depth_terms_are_zero():
     terms, _ = terms_of("stage1", dataclasses.replace(LOSS, depth=0.0))
     assert terms["depth"] == 0
     assert terms["depth_dynamic"] == 0
 
 
-# What gradients reach ------------------------------------------------------------------------------------------------
+# Adding a term -------------------------------------------------------------------------------------------------------
+
+
+def dynamic_alpha(inputs):
+    """Mean opacity of the dynamic image."""
+    return inputs.rendering.dynamic.alpha.mean()
+
+
+SPARSITY = LossTerm(
+    dynamic_alpha,
+    is_active=lambda phase, config: phase.stage == "stage1",
+    weight=lambda plan, config: 0.25,
+)
+
+
+def test_a_term_that_is_added_to_the_dictionary_is_trained_and_reported(monkeypatch):
+    monkeypatch.setitem(TERMS, "sparsity", SPARSITY)
+    terms, rendering = terms_of("stage1", NOTHING)
+    assert error(terms["sparsity"], 0.25 * rendering.dynamic.alpha.double().mean()) < 1e-6
+    assert "logit_opacities" in of_dynamic(changed_by("stage1", NOTHING))
+
+
+def test_a_term_is_inactive_in_other_phases(monkeypatch):
+    monkeypatch.setitem(TERMS, "sparsity", SPARSITY)
+    terms, _ = terms_of("stage2", NOTHING)
+    assert terms["sparsity"] == 0
+    assert changed_by("stage2", NOTHING) == set()
+
+
+def test_terms_are_reported_in_the_order_of_the_dictionary():
+    terms, _ = terms_of("stage2")
+    assert list(terms) == list(TERMS) == ["static", "dynamic", "joint", "depth", "depth_dynamic"]
+
+
+# Parameters that are trained -----------------------------------------------------------------------------------------
 
 GEOMETRY = {"means", "quats", "log_scales"}
 EARLY_APPEARANCE = {"logit_opacities", "sh_dc"}
-"""Harmonics of higher degrees come later."""
-NOTHING = LossConfig(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
+"""Spherical harmonics of higher degrees are trained later."""
 
 
-def test_in_pretraining_static_gaussians_alone_are_trained():
+def test_pretraining_trains_static_gaussians_only():
     changed = changed_by("pretrain")
     assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
     assert len(changed) == len(of_static(changed))
 
 
-def test_in_stage_1_the_static_image_trains_static_gaussians_alone():
+def test_in_stage_1_the_static_term_trains_static_gaussians_only():
     changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0))
     assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
     assert len(changed) == len(of_static(changed))
 
 
-def test_in_stage_1_the_dynamic_image_trains_dynamic_gaussians_alone():
+def test_in_stage_1_the_dynamic_term_trains_dynamic_gaussians_only():
     changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0))
     assert of_dynamic(changed) == GEOMETRY | EARLY_APPEARANCE
     assert len(changed) == len(of_dynamic(changed))
 
 
-def test_in_stage_1_the_static_image_trains_the_appearance_network_once_it_is_in_use():
+def test_in_stage_1_the_static_term_trains_the_appearance_network_once_it_is_in_use():
     changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0), at=150)
     assert of_static(changed) >= GEOMETRY | EARLY_APPEARANCE
     assert changed == {f"static.{name}" for name in of_static(changed)} | {"appearance"}
 
 
-def test_in_stage_1_the_dynamic_image_trains_the_deformation_network_once_it_is_in_use():
+def test_in_stage_1_the_dynamic_term_trains_the_deformation_network_once_it_is_in_use():
     changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0), at=150)
     assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
     assert changed == {f"dynamic.{name}" for name in of_dynamic(changed)} | {"deformation"}
 
 
-def test_in_stage_2_the_joint_image_trains_dynamic_gaussians_and_both_networks():
+def test_in_stage_2_the_joint_term_trains_dynamic_gaussians_and_both_networks():
     changed = changed_by("stage2", dataclasses.replace(NOTHING, joint=1.0))
     assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
     assert {"deformation", "appearance"} <= changed

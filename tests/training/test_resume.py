@@ -1,4 +1,4 @@
-"""A run that was stopped, in whatever way, goes on as if it had not been."""
+"""A resumed run continues bit for bit as if it had never stopped."""
 
 import dataclasses
 import signal
@@ -11,6 +11,7 @@ import pytest
 
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.training import command
 from warpgs.training import train as script
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("quickly")
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
 
-# Long enough to be killed in the middle.
+# Long enough to be killed before the end.
 LONG = {
     "preset": "quick",
     "device": "cpu",
@@ -44,7 +45,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(data, tmp_path_factory):
-    """A run that nothing stopped."""
+    """A run without interruption."""
     run = tmp_path_factory.mktemp("whole")
     trainer = tiny.trainer(data, run)
     assert tiny.train(trainer)
@@ -58,20 +59,20 @@ def resumed(data, run):
     return trainer
 
 
-def test_the_tiny_run_grows_and_prunes(whole):
+def test_the_tiny_run_densifies_and_prunes(whole):
     counts = [len(checkpoint.load(path).tensors["scene.static.means"]) for path in checkpoint.list_checkpoints(whole)]
     assert max(counts) > counts[0]
     assert 10 < counts[-1] < max(counts)
 
 
-def test_two_runs_are_the_same_bit_for_bit(data, whole, tmp_path):
+def test_two_runs_are_bit_identical(data, whole, tmp_path):
     tiny.train(tiny.trainer(data, tmp_path))
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 
 
-# In pretraining, between warm-up and growth, between growth and reset, at the start of stage II.
+# In pretraining, before and after the first densification, at the start of stage II.
 @pytest.mark.parametrize("stop", [3, 9, 14, 22])
-def test_a_run_stopped_and_resumed_is_the_same_bit_for_bit(data, whole, tmp_path, stop):
+def test_a_resumed_run_is_bit_identical(data, whole, tmp_path, stop):
     first = tiny.trainer(data, tmp_path)
     assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= stop))
     assert first.iteration == stop
@@ -79,7 +80,7 @@ def test_a_run_stopped_and_resumed_is_the_same_bit_for_bit(data, whole, tmp_path
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 
 
-def test_a_run_stopped_after_every_iteration_is_the_same_bit_for_bit(data, whole, tmp_path):
+def test_a_run_resumed_after_every_iteration_is_bit_identical(data, whole, tmp_path):
     finished = tiny.train(tiny.trainer(data, tmp_path), tiny.StopWhen(lambda: True))
     sessions = 1
     while not finished:
@@ -91,15 +92,15 @@ def test_a_run_stopped_after_every_iteration_is_the_same_bit_for_bit(data, whole
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 
 
-def test_resuming_from_an_earlier_checkpoint_is_the_same_bit_for_bit(data, whole, tmp_path):
+def test_a_run_resumed_from_an_earlier_checkpoint_is_bit_identical(data, whole, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
     trainer.restore(checkpoint.path_of(whole, 7))
     tiny.train(trainer)
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 
 
-def test_another_seed_is_another_run(data, whole, tmp_path):
-    """What the others compare is not the same by itself."""
+def test_another_seed_gives_another_run(data, whole, tmp_path):
+    """So the comparisons above are meaningful."""
     config = dataclasses.replace(tiny.CONFIG, seed=1)
     tiny.train(tiny.trainer(data, tmp_path, config))
     assert "scene.static.means" in tiny.differences(tiny.state(tmp_path), tiny.state(whole))
@@ -123,30 +124,30 @@ def test_training_time_adds_up_over_sessions(data, tmp_path):
 
 @pytest.fixture
 def stopped(data, tmp_path):
-    """A run as train.py leaves it after Ctrl-C, with checkpoints of iterations 0, 7 and 10."""
+    """A run that was interrupted, with checkpoints of iterations 0, 7 and 10."""
     config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")
-    trainer = script.start(config)
+    trainer = script.make_trainer(config)
     tiny.train(trainer, tiny.StopWhen(lambda: trainer.iteration >= 10))
     return trainer.run
 
 
 @pytest.mark.parametrize("kept", [0, 4, 100, -1])
-def test_a_truncated_newest_checkpoint_is_named_and_not_gone_on_from(stopped, kept):
+def test_a_truncated_newest_checkpoint_is_refused_by_name(stopped, kept):
     newest = checkpoint.list_checkpoints(stopped)[-1]
     newest.write_bytes(newest.read_bytes()[:kept])
     with pytest.raises(ValueError, match=f"{newest} is damaged"):
-        script.start(command.parse(["--resume", str(stopped)]))
+        script.make_trainer(command.parse(["--resume", str(stopped)]))
 
 
-def test_without_its_damaged_newest_checkpoint_a_run_goes_on_from_the_one_before(stopped, whole):
+def test_after_deleting_the_newest_checkpoint_a_run_continues_from_the_previous_one(stopped, whole):
     checkpoint.list_checkpoints(stopped)[-1].unlink()
-    trainer = script.start(command.parse(["--resume", str(stopped)]))
+    trainer = script.make_trainer(command.parse(["--resume", str(stopped)]))
     assert trainer.iteration == 7
     tiny.train(trainer)
     assert tiny.differences(tiny.state(stopped), tiny.state(whole)) == []
 
 
-def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tmp_path, monkeypatch):
+def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     options = [
         "--data",
@@ -166,25 +167,15 @@ def test_a_run_killed_in_the_middle_and_resumed_is_the_same_bit_for_bit(data, tm
     last = checkpoint.load(checkpoint.list_checkpoints(killed)[-1]).metadata.iteration
     assert 30 <= last < 120
 
-    reference = script.start(command.parse([*options, str(whole)]))
+    reference = script.make_trainer(command.parse([*options, str(whole)]))
     tiny.train(reference)
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-    assert script.train(command.parse(["--resume", str(killed)])) == 0
+    assert command.main(["--resume", str(killed)]) == 0
     assert tiny.differences(tiny.state(killed), tiny.state(whole)) == []
     assert (killed / "metrics.json").is_file()
 
 
-# Checkpoints that don't fit -----------------------------------------------------------------------------------------
-
-
-def rewritten(run, change):
-    """The newest checkpoint with its tensors and facts changed."""
-    path = checkpoint.list_checkpoints(run)[-1]
-    loaded = checkpoint.load(path)
-    tensors, facts = dict(loaded.tensors), dict(loaded.facts)
-    change(tensors, facts)
-    checkpoint.save(path, tensors, facts)
-    return path
+# Checkpoints that do not fit -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -193,29 +184,31 @@ def rewritten(run, change):
 def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
     run = tmp_path / "run"
     tiny.train(tiny.trainer(data, run))
-    path = rewritten(run, lambda tensors, facts: tensors.update({name: tensors[name][:2].clone()}))
+    path = checkpoint.list_checkpoints(run)[-1]
+    loaded = checkpoint.load(path)
+    checkpoint.save(path, {**loaded.tensors, name: loaded.tensors[name][:2].clone()}, loaded.metadata)
     with pytest.raises(ValueError, match=rf"{path.name} is damaged: expected {name} as "):
         tiny.trainer(data, run).restore_newest()
 
 
 @pytest.mark.parametrize(("name", "value"), [("iteration", "x"), ("train_seconds", None), ("rollbacks", -1)])
-def test_facts_that_are_no_numbers_are_refused_by_name(data, tmp_path, name, value):
+def test_metadata_of_another_type_is_refused_by_name(data, tmp_path, name, value):
     run = tmp_path / "run"
     tiny.train(tiny.trainer(data, run))
-    rewritten(run, lambda tensors, facts: facts.update({name: value}))
-    with pytest.raises(ValueError, match=f"is damaged: {name} can't be"):
+    tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values.update({name: value}))
+    with pytest.raises(ValueError, match=f"is damaged: {name} cannot be"):
         tiny.trainer(data, run).restore_newest()
 
 
 def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
     run = tmp_path / "run"
     tiny.train(tiny.trainer(data, run))
-    rewritten(run, lambda tensors, facts: facts["views"].reverse())
+    tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values["views"].reverse())
     with pytest.raises(ValueError, match="was trained on other frames than builtin has now"):
         tiny.trainer(data, run).restore_newest()
 
 
-def test_a_run_that_died_before_its_first_checkpoint_begins_anew(data, tmp_path):
+def test_a_run_without_a_checkpoint_starts_from_the_beginning(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path / "run")
     trainer.restore_newest()
     assert trainer.iteration == 0

@@ -1,4 +1,4 @@
-"""Training gets through what captures lack and what goes wrong on the way, or says in words why not."""
+"""Training copes with incomplete captures and with failures, or reports them in words."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ import torch
 from tests import tiny
 from tests.data.captures import edit_json, write_png
 from tests.tiny import quickly  # noqa: F401  # a fixture
-from warpgs.evaluation import evaluate
+from warpgs.evaluation import evaluate, evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.training import command, losses
 from warpgs.training import train as script
@@ -31,7 +31,7 @@ def original(tmp_path_factory):
 
 @pytest.fixture
 def data(original, tmp_path):
-    """A copy, to take things from."""
+    """A copy that a test may change."""
     return shutil.copytree(original, tmp_path / "capture")
 
 
@@ -45,13 +45,13 @@ def is_finite(run):
 
 
 def end_to_end(data, run, monkeypatch, capsys, **changes):
-    """What ``train.py`` says and measures."""
+    """Output and metrics of ``train.py``."""
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     monkeypatch.setattr(evaluate, "TIMED_FRAMES", 2)
-    # Without a reset of opacities, after which what is large goes: where little is known, Gaussians start large.
+    # Without opacity resets, after which large Gaussians are removed: without depth or points they start large.
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=tiny.LENGTH)
     config = dataclasses.replace(tiny.CONFIG, data=data, out=run, schedule=schedule, **changes)
-    assert script.train(config) == 0
+    assert command.run(config) == 0
     assert is_finite(run)
     assert checkpoint.load(checkpoint.list_checkpoints(run)[-1]).metadata.iteration == tiny.LENGTH
     return capsys.readouterr().out, json.loads((run / "metrics.json").read_text())
@@ -60,45 +60,45 @@ def end_to_end(data, run, monkeypatch, capsys, **changes):
 # Values that are not finite -----------------------------------------------------------------------------------------
 
 
-def spoil_loss(monkeypatch, trainer, is_spoilt):
-    """Makes the loss, and so all gradients, NaN in the iterations of which ``is_spoilt`` says so."""
+def spoil_loss(monkeypatch, trainer, is_spoiled):
+    """Makes the loss, and so all gradients, NaN in the iterations for which ``is_spoiled`` is true."""
     whole = losses.static_loss
     monkeypatch.setattr(
-        losses, "static_loss", lambda *a: whole(*a) * (torch.nan if is_spoilt(trainer.iteration) else 1.0)
+        losses, "static_loss", lambda *a: whole(*a) * (torch.nan if is_spoiled(trainer.iteration) else 1.0)
     )
 
 
 @pytest.fixture
-def spoilt_once(data, run, monkeypatch):
-    """A trainer whose loss is NaN when it first comes to iteration 10; its last checkpoint is of iteration 7 then."""
+def spoiled_once(data, run, monkeypatch):
+    """A trainer whose loss is NaN at its first visit of iteration 10; its last checkpoint is then of iteration 7."""
     trainer, iterations = tiny.trainer(data, run), [10]
     spoil_loss(monkeypatch, trainer, lambda k: k in iterations and not iterations.remove(k))
     return trainer
 
 
-def test_after_a_loss_that_is_not_finite_training_goes_back_and_says_so(spoilt_once, capsys):
-    assert tiny.train(spoilt_once)
-    said = capsys.readouterr().out
-    assert "the loss or a parameter is not finite after iteration 14: back to iteration 7" in said
-    assert said.count("not finite") == 1
+def test_after_a_loss_that_is_not_finite_training_rolls_back_and_reports_it(spoiled_once, capsys):
+    assert tiny.train(spoiled_once)
+    output = capsys.readouterr().out
+    assert "the loss or a parameter is not finite after iteration 14: back to iteration 7" in output
+    assert output.count("not finite") == 1
 
 
-def test_a_loss_that_was_not_finite_once_leaves_a_finite_scene_at_the_end(spoilt_once, run):
-    tiny.train(spoilt_once)
+def test_after_a_rollback_the_final_scene_is_finite(spoiled_once, run):
+    tiny.train(spoiled_once)
     assert checkpoint.load(checkpoint.list_checkpoints(run)[-1]).metadata.iteration == tiny.LENGTH
     assert is_finite(run)
 
 
-def test_after_going_back_the_noise_is_another(spoilt_once, data, run, tmp_path):
-    """Else the same loss would come again."""
-    straight = tiny.trainer(data, tmp_path / "straight")
-    tiny.train(straight)
-    tiny.train(spoilt_once)
-    assert "scene.static.means" in tiny.differences(tiny.state(run), tiny.state(straight.run))
+def test_after_a_rollback_the_noise_differs(spoiled_once, data, run, tmp_path):
+    """Otherwise the same loss would occur again."""
+    reference = tiny.trainer(data, tmp_path / "reference")
+    tiny.train(reference)
+    tiny.train(spoiled_once)
+    assert "scene.static.means" in tiny.differences(tiny.state(run), tiny.state(reference.run))
 
 
-def test_a_run_that_went_back_resumes_bit_for_bit(spoilt_once, data, run, tmp_path):
-    tiny.train(spoilt_once)
+def test_a_run_with_a_rollback_resumes_bit_for_bit(spoiled_once, data, run, tmp_path):
+    tiny.train(spoiled_once)
     again = tiny.trainer(data, tmp_path / "again")
     again.restore(checkpoint.path_of(run, 14))
     tiny.train(again)
@@ -106,8 +106,8 @@ def test_a_run_that_went_back_resumes_bit_for_bit(spoilt_once, data, run, tmp_pa
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "sh_dc"])
-def test_gaussians_that_are_not_finite_are_no_good_state(data, run, name):
-    """None is pruned before the next checkpoint."""
+def test_a_state_with_gaussians_that_are_not_finite_is_not_saved(data, run, name):
+    """Nothing is pruned before the next checkpoint."""
     trainer = tiny.trainer(data, run)
 
     def spoil():
@@ -119,16 +119,16 @@ def test_gaussians_that_are_not_finite_are_no_good_state(data, run, name):
     assert is_finite(run)
 
 
-def test_a_loss_that_is_never_finite_ends_in_words(data, run, monkeypatch):
+def test_a_loss_that_stays_not_finite_is_an_error(data, run, monkeypatch):
     trainer = tiny.trainer(data, run)
     spoil_loss(monkeypatch, trainer, lambda k: k >= 8)
-    with pytest.raises(ValueError, match="is not finite after iteration 14, and was not after 3 returns") as caught:
+    with pytest.raises(ValueError, match="is not finite after iteration 14, even after 3 returns") as caught:
         tiny.train(trainer)
     assert str(checkpoint.path_of(run, 7)) in str(caught.value)
     assert is_finite(run)
 
 
-def test_a_loss_that_is_not_finite_from_the_start_ends_in_words(data, run, monkeypatch):
+def test_a_loss_that_is_not_finite_from_the_start_is_an_error(data, run, monkeypatch):
     trainer = tiny.trainer(data, run)
     spoil_loss(monkeypatch, trainer, lambda k: True)
     with pytest.raises(ValueError, match="is not finite after iteration 7"):
@@ -146,7 +146,7 @@ def run_as_main(monkeypatch, capsys, *arguments):
     return caught.value.code, capsys.readouterr().err
 
 
-def test_out_of_memory_is_one_line_that_says_what_to_try(data, run, monkeypatch, capsys):
+def test_out_of_memory_is_one_line_with_advice(data, run, monkeypatch, capsys):
     def out_of_memory(*_):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nMore of torch's advice.")
 
@@ -184,10 +184,10 @@ def test_a_capture_that_is_refused_leaves_no_run_folder(data, run, monkeypatch, 
     assert not run.exists()
 
 
-# What captures lack -------------------------------------------------------------------------------------------------
+# Incomplete captures ------------------------------------------------------------------------------------------------
 
 
-def test_without_depth_the_pretraining_goes_to_stage_1(data, run):
+def test_without_depth_stage_1_takes_the_iterations_of_the_pretraining(data, run):
     shutil.rmtree(data / "depth")
     trainer = tiny.trainer(data, run)
     assert trainer.protocol.pretrain.end == 0
@@ -214,10 +214,10 @@ def test_a_capture_without_depth_and_points_trains(data, run, monkeypatch, capsy
     assert metrics["num_static"] + metrics["num_dynamic"] > 0
 
 
-def test_a_capture_without_evaluation_frames_trains_and_says_what_is_not_measured(data, run, monkeypatch, capsys):
+def test_a_capture_without_evaluation_frames_trains_and_reports_what_is_not_measured(data, run, monkeypatch, capsys):
     edit_json(data / "dataset.json", val_ids=[])
-    said, metrics = end_to_end(data, run, monkeypatch, capsys)
-    assert "the capture has no frames to evaluate on: PSNR, SSIM and LPIPS not measured" in said
+    output, metrics = end_to_end(data, run, monkeypatch, capsys)
+    assert "the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured" in output
     assert metrics["psnr"] is None
     assert metrics["num_views"] == 0
     assert metrics["iterations"] == tiny.LENGTH
@@ -234,7 +234,7 @@ def mask_all(data, value):
         write_png(path, np.full((tiny.SCENE.height, tiny.SCENE.width), value, np.uint8))
 
 
-def test_a_capture_in_which_all_moves_trains(data, run, monkeypatch, capsys):
+def test_a_capture_in_which_everything_moves_trains(data, run, monkeypatch, capsys):
     mask_all(data, 0)
     _, metrics = end_to_end(data, run, monkeypatch, capsys)
     assert metrics["num_dynamic"] > 0
@@ -249,13 +249,13 @@ def test_a_capture_in_which_nothing_moves_trains(data, run, monkeypatch, capsys)
     assert metrics["psnr_static"] == metrics["psnr"]
 
 
-def test_assuming_that_nothing_moves_trains_no_dynamic_gaussians(data, run, monkeypatch, capsys):
+def test_assuming_static_trains_no_dynamic_gaussians(data, run, monkeypatch, capsys):
     _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="static")
     assert metrics["num_dynamic"] == 0
     assert metrics["num_static"] > 0
 
 
-def test_assuming_that_all_moves_trains_no_static_gaussians(data, run, monkeypatch, capsys):
+def test_assuming_dynamic_trains_no_static_gaussians(data, run, monkeypatch, capsys):
     _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="dynamic")
     assert metrics["num_static"] == 0
     assert metrics["num_dynamic"] > 0
@@ -264,20 +264,20 @@ def test_assuming_that_all_moves_trains_no_static_gaussians(data, run, monkeypat
 @pytest.mark.parametrize("assume", ["static", "dynamic"])
 def test_an_empty_branch_resumes(data, run, assume):
     config = dataclasses.replace(tiny.CONFIG, data=data, out=run, assume=assume)
-    first = script.start(config)
+    first = script.make_trainer(config)
     tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 24))
-    again = script.start(command.parse(["--resume", str(run)]))
+    again = script.make_trainer(command.parse(["--resume", str(run)]))
     assert again.iteration == 24
     assert tiny.train(again)
 
 
-def test_a_capture_without_masks_is_refused_with_what_to_try(data, run):
+def test_a_capture_without_masks_is_refused_with_advice(data, run):
     shutil.rmtree(data / "resized_mask")
-    with pytest.raises(ValueError, match=r"has no mask of what moves.*--assume static"):
-        script.start(dataclasses.replace(tiny.CONFIG, data=data, out=run, dataset="nerfds"))
+    with pytest.raises(ValueError, match=r"has no mask of the dynamic region.*--assume static"):
+        script.make_trainer(dataclasses.replace(tiny.CONFIG, data=data, out=run, dataset="nerfds"))
 
 
-def test_a_capture_without_masks_trains_when_told_what_moves(data, run, monkeypatch, capsys):
+def test_a_capture_without_masks_trains_under_an_assumption(data, run, monkeypatch, capsys):
     shutil.rmtree(data / "resized_mask")
     _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="static", dataset="nerfds")
     assert metrics["psnr"] > 0

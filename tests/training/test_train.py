@@ -1,6 +1,7 @@
-"""python train.py, as a user starts it."""
+"""``python train.py`` as a user runs it, and ``warpgs.train``."""
 
 import csv
+import dataclasses
 import json
 import signal
 import subprocess
@@ -12,12 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.prepare import boards
+import warpgs
+from tests import tiny
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
+from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
-from warpgs.runs import run as runs
+from warpgs.runs.run import Run
 from warpgs.training import train as script
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
@@ -40,23 +43,24 @@ def finished(data, tmp_path_factory):
     return train("--data", data, *QUICK, "--iterations", 40, "--out", folder), folder
 
 
-def test_a_run_ends_with_its_figures_for_people(finished):
+def test_a_run_ends_with_a_summary_of_its_metrics(finished):
     run, _ = finished
     assert run.returncode == 0, run.stderr
     assert "PSNR" in run.stdout
     assert "LPIPS not measured" in run.stdout
 
 
-def test_a_run_that_is_being_trained_is_not_resumed_beside(finished):
-    with runs.held(finished[1]):
+def test_a_run_that_is_being_trained_cannot_be_resumed(finished):
+    run = Run.open(finished[1])
+    with run.lock():
         second = train("--resume", finished[1], "--device", "cpu")
     assert second.returncode == 2
     assert f"train.py: {finished[1]} is being trained by another process" in second.stderr
-    with runs.held(finished[1]):
-        pass  # free again
+    with run.lock():
+        pass  # unlocked
 
 
-def test_a_run_leaves_its_metrics(finished):
+def test_a_run_writes_its_metrics(finished):
     metrics = json.loads((finished[1] / "metrics.json").read_text())
     wanted = (
         "psnr ssim lpips psnr_static psnr_dynamic flicker fps train_seconds num_static num_dynamic iterations commit"
@@ -67,7 +71,7 @@ def test_a_run_leaves_its_metrics(finished):
     assert metrics["psnr"] > 10
 
 
-def test_a_run_leaves_metrics_of_every_view(finished):
+def test_a_run_writes_metrics_of_every_view(finished):
     with open(finished[1] / "views.csv") as file:
         rows = list(csv.DictReader(file))
     assert [row["name"] for row in rows] == ["right_000000", "right_000002", "right_000004"]
@@ -75,16 +79,16 @@ def test_a_run_leaves_metrics_of_every_view(finished):
     assert float(rows[0]["psnr"]) > 10
 
 
-def test_a_run_leaves_pictures_a_video_and_events(finished):
+def test_a_run_writes_images_a_video_and_events(finished):
     folder = finished[1]
-    sheet = cv2.imread(str(folder / "pictures/right_000002.png"))
+    sheet = cv2.imread(str(folder / "images/right_000002.png"))
     assert sheet.shape[1] == 5 * SMALL.width
     video = cv2.VideoCapture(str(folder / "time.mp4"))
     assert video.read()[0]
     assert list((folder / "events").glob("events*"))
 
 
-def test_a_run_keeps_its_resolved_config(finished):
+def test_a_run_writes_its_resolved_config(finished):
     config = json.loads((finished[1] / "config.json").read_text())
     schedule = config["schedule"]
     assert schedule["pretrain"] + schedule["stage1"] + schedule["stage2"] == 40
@@ -109,13 +113,13 @@ def refused(*arguments):
     return run.stderr + run.stdout
 
 
-def test_a_folder_that_is_no_capture_is_one_line_and_exit_code_2(tmp_path):
+def test_a_folder_without_a_capture_is_refused_in_one_line_with_exit_code_2(tmp_path):
     text = refused("--data", tmp_path, *QUICK)
     assert "dataset.json is missing" in text
-    assert len([line for line in text.splitlines() if line.startswith("error:")]) == 1
+    assert len([line for line in text.splitlines() if line.startswith("train.py:")]) == 1
 
 
-def test_a_damaged_picture_is_one_line_that_names_it(tmp_path):
+def test_a_damaged_image_is_refused_by_name(tmp_path):
     data = builtin_capture(tmp_path, SMALL, quiet=True)
     path = data / "rgb/1x/left_000003.png"
     path.write_bytes(path.read_bytes()[:100])
@@ -123,14 +127,14 @@ def test_a_damaged_picture_is_one_line_that_names_it(tmp_path):
 
 
 def look_away(data):
-    """Turns every camera around its vertical axis: none sees the points any more."""
+    """Turns every camera around its vertical axis, so that it does not see the points."""
     for path in (data / "camera").iterdir():
-        facts = json.loads(path.read_text())
-        facts["orientation"] = (np.diag([-1.0, 1.0, -1.0]) @ np.array(facts["orientation"])).tolist()
-        path.write_text(json.dumps(facts))
+        camera = json.loads(path.read_text())
+        camera["orientation"] = (np.diag([-1.0, 1.0, -1.0]) @ np.array(camera["orientation"])).tolist()
+        path.write_text(json.dumps(camera))
 
 
-def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
+def test_an_unfit_capture_is_refused_in_one_line_with_exit_code_1(tmp_path):
     data = builtin_capture(tmp_path, SMALL, quiet=True)
     look_away(data)
     run = train("--data", data, *QUICK, "--iterations", 40, "--out", tmp_path / "run")
@@ -142,19 +146,19 @@ def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_one_time_for_all_frames_is_only_warned_of_where_all_is_static(tmp_path, capsys):
-    root = boards.write_capture(tmp_path / "film")
+def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_static(tmp_path):
+    root = tiny.write(tmp_path)
     names = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({name: {"time_id": 0} for name in names}))
-    capture = load_capture(root)
-    assert script.checked(capture, TrainConfig(assume="static")) is capture
-    assert "warning: all training frames have one time" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stop:
-        script.checked(capture, TrainConfig())
-    assert stop.value.code == 1
+    capture, lines = load_capture(root), []
+    script.check_capture(capture, TrainConfig(assume="static"), lines.append)
+    assert any(line.startswith("warning: all training frames have one time") for line in lines)
+    with pytest.raises(script.UnfitCaptureError, match="all training frames have one time") as error:
+        script.check_capture(capture, TrainConfig(), lines.append)
+    assert [finding.level for finding in error.value.findings] == ["error"]
 
 
-def test_what_training_would_suffer_from_is_told_and_what_is_well_is_not(finished):
+def test_warnings_about_the_capture_are_printed(finished):
     run, _ = finished
     warnings = [line for line in run.stdout.splitlines() if line.startswith("warning:")]
     assert warnings == ["warning: 6 training frames are very few"]
@@ -168,20 +172,20 @@ def test_an_unknown_option_is_an_error():
     assert "bogus" in refused("--bogus", 1)
 
 
-def test_resuming_takes_no_other_options(finished):
-    assert "leave out --seed" in refused("--resume", finished[1], "--seed", 3)
+def test_resuming_with_other_options_is_refused(finished):
+    assert "omit --seed" in refused("--resume", finished[1], "--seed", 3)
 
 
-def test_resuming_what_is_no_run_is_one_line(tmp_path):
-    assert "is no run folder" in refused("--resume", tmp_path)
+def test_resuming_a_folder_without_a_run_is_refused(tmp_path):
+    assert "is not a run folder" in refused("--resume", tmp_path)
 
 
 def test_too_few_iterations_are_refused(data):
     assert "iterations must be a number of at least 3" in refused("--data", data, *QUICK, "--iterations", 1)
 
 
-def test_ctrl_c_keeps_what_was_done_and_says_how_to_go_on(data, tmp_path):
-    # A job in the background ignores SIGINT and so would what it starts: the handler is put back as a terminal has it.
+def test_ctrl_c_saves_a_checkpoint_and_tells_how_to_continue(data, tmp_path):
+    # Background jobs and their children ignore SIGINT: restore the handler of a terminal.
     program = (
         "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
@@ -201,5 +205,54 @@ def test_ctrl_c_keeps_what_was_done_and_says_how_to_go_on(data, tmp_path):
     assert run.returncode == 130
     assert "Traceback" not in stderr
     assert f"--resume {folder}" in stderr
-    facts = checkpoint.load(checkpoint.list_checkpoints(folder)[-1]).facts
-    assert facts["iteration"] > 0
+    assert checkpoint.load(checkpoint.list_checkpoints(folder)[-1]).metadata.iteration > 0
+
+
+# From Python ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def config(tmp_path, contracts_off, monkeypatch):
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+    return dataclasses.replace(tiny.CONFIG, data=tiny.write(tmp_path / "capture"), out=tmp_path / "run")
+
+
+def test_train_returns_the_finished_run(config):
+    run = warpgs.train(config)
+    assert run.folder == config.out
+    assert run.trained_scene().metadata.iteration == tiny.LENGTH
+    assert (run.folder / "metrics.json").is_file()
+
+
+def test_train_prints_nothing_unless_it_is_given_a_log(config, capsys):
+    warpgs.train(config)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_train_logs_its_folder_and_the_metrics(config):
+    lines = []
+    warpgs.train(config, log=lines.append)
+    assert any(line.startswith("builtin: 6 views, on cpu, into ") for line in lines)
+    assert any("PSNR" in line for line in lines)
+
+
+def test_train_resumes_with_the_config_of_the_run(config):
+    warpgs.train(config)
+    assert warpgs.train(TrainConfig(resume=config.out)).config.schedule == config.schedule
+
+
+def test_train_raises_on_an_unknown_dataset_or_model(config):
+    for changes in ({"dataset": "imaginary"}, {"model": dataclasses.replace(tiny.MODEL, deformation="imaginary")}):
+        with pytest.raises(ValueError, match="imaginary"):
+            warpgs.train(dataclasses.replace(config, **changes))
+        assert not config.out.exists()
+
+
+def test_train_raises_on_an_unfit_capture(config):
+    look_away(config.data)
+    with pytest.raises(script.UnfitCaptureError, match="the cameras do not see the points"):
+        warpgs.train(config)
+
+
+def test_a_number_on_the_command_line_is_checked_by_its_bounds(data):
+    assert "model.width must be a number of at least 1, got 0" in refused("--data", data, *QUICK, "--model.width", 0)

@@ -12,7 +12,7 @@ class Bench:
     scenes: tuple[Literal["small", "large", "wide"], ...] = ()
     """Scenes to measure: small (480x270, 100k Gaussians of 3 px), large (1920x1080, 1M of 4 px), wide (1920x1080, 200k
     of 20 px). By default all on CUDA and small on CPU."""
-    device: Literal["cpu", "cuda"] | None = None
+    device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""
     repeats: int = 30
     """Number of runs to take the medians over."""

@@ -47,10 +47,7 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 
 def train(config: TrainConfig, log: Log | None = None) -> Run:
-    """Trains and evaluates a run.
-
-        run = warpgs.train(TrainConfig(data=Path("nerfds/as")), log=print)
-        image = run.trained_scene().render(camera).joint.image
+    """Trains and evaluates a run: ``warpgs.train(TrainConfig(data=Path("nerfds/as")), log=print).trained_scene()``.
 
     The first Ctrl-C lets the current iteration finish and saves a checkpoint, the second one stops at once.
 
@@ -70,11 +67,7 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
     quiet, log = log is None, log or _ignore
     trainer = make_trainer(config, log)
     run = Run(trainer.run, trainer.config)
-    num_views, num_aligned = len(trainer.views), trainer.num_aligned
-    log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {run.folder}")
-    if num_aligned < num_views:
-        reason = "" if num_aligned else NO_DEPTH
-        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+    _describe(trainer, log)
     num_iterations = trainer.protocol.num_iterations
     with (
         run.lock(),
@@ -88,6 +81,15 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
     log(evaluate_run(run.folder, capture, device=trainer.config.device, quiet=quiet))
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
     return run
+
+
+def _describe(trainer: Trainer, log: Log) -> None:
+    """Logs what is trained where."""
+    num_views, num_aligned = len(trainer.views), trainer.num_aligned
+    log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {trainer.run}")
+    if num_aligned < num_views:
+        reason = "" if num_aligned else NO_DEPTH
+        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
 
 
 def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:

@@ -1,0 +1,141 @@
+"""A training step: its inputs by name, and that nothing but the phase and tensors decides what it does."""
+
+import dataclasses
+import inspect
+
+import pytest
+import torch
+
+from tests import tiny
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.training.optimizer import GROUPS
+from warpgs.training.schedule import Phase
+from warpgs.training.step import Step
+from warpgs.training.step_inputs import StepInputs
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+CPU = torch.device("cpu")
+
+
+# Inputs by name ------------------------------------------------------------------------------------------------------
+
+
+def make_inputs():
+    return StepInputs(("static", "psnr"), ("means", "networks"), CPU)
+
+
+def send(inputs, **changes):
+    values = {
+        "time_noise": 0.5,
+        "dynamic_background": [0.1, 0.2, 0.3],
+        "scales": {"psnr": -10.0, "static": 2.0},
+        "learning_rates": {"networks": 4.0, "means": 3.0},
+    }
+    inputs.send(**{**values, **changes})
+
+
+def test_inputs_reach_the_tensors_of_their_names():
+    inputs = make_inputs()
+    send(inputs)
+    assert inputs.time_noise.tolist() == [0.5]
+    assert torch.equal(inputs.backgrounds, torch.tensor([[0.0] * 3, [0.0] * 3, [0.1, 0.2, 0.3]]))
+    assert {name: value.item() for name, value in inputs.scale.items()} == {"static": 2.0, "psnr": -10.0}
+    assert inputs.scales.tolist() == [2.0, -10.0]
+    assert {name: value.item() for name, value in inputs.learning_rates.items()} == {"means": 3.0, "networks": 4.0}
+
+
+def test_inputs_stay_at_their_addresses():
+    inputs = make_inputs()
+    tensors = [inputs.time_noise, inputs.backgrounds, inputs.scales, *inputs.scale.values()]
+    addresses = [tensor.data_ptr() for tensor in tensors]
+    send(inputs, time_noise=0.75)
+    assert inputs.time_noise is tensors[0]
+    assert inputs.time_noise.item() == 0.75
+    assert [tensor.data_ptr() for tensor in tensors] == addresses
+
+
+@pytest.mark.parametrize("name", ["scales", "learning_rates"])
+def test_a_missing_input_is_an_error(name):
+    with pytest.raises(KeyError):
+        send(make_inputs(), **{name: {}})
+
+
+# The phase decides ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("cache"))
+
+
+class RecordedWork:
+    """Stands in for ``GraphCache`` on the CPU: the work of the first run of each phase is run in all later ones."""
+
+    def __init__(self):
+        self.work = {}
+
+    def run(self, phase, work):
+        return self.work.setdefault(phase, work)()
+
+    def invalidate(self):
+        pass
+
+
+def trained(data, folder, graphs=None):
+    """All tensors of a run that used ``graphs`` throughout."""
+    make_step = Step.__init__
+
+    def with_graphs(step, *arguments):
+        make_step(step, *arguments)
+        step._graphs = graphs and graphs()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Step, "__init__", with_graphs)
+        assert tiny.train(tiny.trainer(data, folder))
+    return tiny.state(folder)
+
+
+def test_work_recorded_in_the_first_iteration_of_a_phase_serves_all_others_bit_for_bit(data, tmp_path):
+    """As a CUDA graph does; so a step reads nothing of its plan but the phase, and everything else from tensors."""
+    eager, recorded = trained(data, tmp_path / "eager"), trained(data, tmp_path / "recorded", RecordedWork)
+    assert tiny.differences(eager, recorded) == []
+
+
+def test_plans_with_equal_phases_share_a_graph(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
+    trainer._add_dynamic_gaussians()
+    trainer.step._graphs = graphs = RecordedWork()
+    iterations = range(trainer.protocol.stage2.start, trainer.protocol.num_iterations)
+    for trainer.iteration in iterations:
+        plan = trainer.protocol.at(trainer.iteration)
+        trainer.step(plan, trainer._sample(plan))
+    plans = [trainer.protocol.at(k) for k in iterations]
+    assert len({plan.progress for plan in plans}) == len(plans)
+    assert set(graphs.work) == {plans[0].phase}
+
+
+def test_the_work_of_a_step_is_given_a_phase_and_a_view_only():
+    parameters = inspect.signature(Step._run).parameters
+    assert list(parameters) == ["self", "phase", "view"]
+    assert parameters["phase"].annotation is Phase
+
+
+def test_a_step_does_not_keep_its_plan(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
+    plan = trainer.protocol.at(0)
+    before = dict(vars(trainer.step))
+    trainer.step(plan, trainer._sample(plan))
+    assert {name: id(value) for name, value in vars(trainer.step).items()} == {n: id(v) for n, v in before.items()}
+
+
+@pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Phase)])
+def test_phases_that_differ_in_one_field_are_different_keys(field):
+    phase = Phase("stage1", use_deformation=True, use_appearance=True, sh_degree=1, with_depth=True)
+    other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
+    assert len({phase, other}) == 2
+
+
+def test_every_parameter_group_has_a_learning_rate(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
+    assert [group["name"] for group in trainer.step.optimizer.param_groups] == list(GROUPS)
