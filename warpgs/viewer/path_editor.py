@@ -7,8 +7,8 @@ from pathlib import Path
 import viser
 
 from warpgs.cameras import Camera
+from warpgs.video import keyframes
 
-from . import keyframes
 from .frustums import ORANGE, add_frustum
 from .panel import Panel, plain
 from .pose import camera_of, pose_of
