@@ -1,19 +1,24 @@
 """Runs that take less than a second: a small built-in capture and small networks, through all stages."""
 
 import dataclasses
+import json
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
+from warpgs.runs.run import Run
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.trainer import Trainer
@@ -106,6 +111,15 @@ class StopWhen(Interrupt):
 def state(run: Path) -> dict[str, Tensor]:
     """All tensors of a run's newest checkpoint: parameters, moments, statistics."""
     return checkpoint.load(checkpoint.list_checkpoints(run)[-1]).tensors
+
+
+def edit_metadata(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Changes the plain values of a checkpoint in its file."""
+    with safe_open(path, framework="pt") as file:
+        header, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    values = json.loads(header["facts"])
+    change(values)
+    save_file(tensors, path, metadata={**header, "facts": json.dumps(values)})
 
 
 def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:

@@ -3,7 +3,7 @@
 import importlib.metadata
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import tyro
 
@@ -19,6 +19,7 @@ from .video.command import Render
 from .viewer.command import View
 
 
+@runtime_checkable
 class Command(Protocol):
     """A dataclass of options with a method ``run``."""
 

@@ -1,4 +1,4 @@
-"""Evaluation: figures recomputed here from pictures that are known."""
+"""Evaluation: metrics recomputed here from known images."""
 
 import csv
 import dataclasses
@@ -21,12 +21,13 @@ from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
-from warpgs.evaluation import evaluate
+from warpgs.evaluation import evaluate, evaluate_run
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips
+from warpgs.files import write_json
 from warpgs.rendering import Layer, Rendering
-from warpgs.runs import run as runs
-from warpgs.training import train as script
+from warpgs.runs.run import open_capture
+from warpgs.training.train import train
 
 H, W = 12, 16
 CPU = torch.device("cpu")
@@ -41,10 +42,10 @@ def frame(name, time, masks=True, covisible=False):
     return Frame(name, camera, image, static if masks else None, None, seen if covisible else None)
 
 
-def capture(val=VAL, **kind):
+def capture(val=VAL, **options):
     """Training frames at times 0 and 1, evaluation frames between them."""
     times = {"first": 0.0, "last": 1.0, **{name: (k + 1) / 4 for k, name in enumerate(val)}}
-    frames = {name: frame(name, time, **kind) for name, time in times.items()}
+    frames = {name: frame(name, time, **options) for name, time in times.items()}
     cameras = {name: f.camera for name, f in frames.items()}
     return Capture("here", cameras, ["first", "last"], val, torch.zeros(0, 3), None, frames.__getitem__)
 
@@ -59,9 +60,21 @@ def rendering(image, dynamic_alpha=None):
     return Rendering(joint, joint, layer(torch.zeros(H, W, 3), alpha), nothing.int(), nothing, None, None)
 
 
-def pictures_at(images):
+class Scene:
+    """A scene whose renderings are those of a function of camera and branches."""
+
+    device = CPU
+
+    def __init__(self, render):
+        self.render = lambda camera, branches=False: render(camera, branches)
+
+    def play(self, camera):
+        return self.render(camera).joint.image
+
+
+def images_at(images):
     """Renders the image that belongs to a camera's time."""
-    return lambda camera, branches: rendering(images[camera.time])
+    return Scene(lambda camera, branches: rendering(images[camera.time]))
 
 
 def noisy(capture, spread=0.1):
@@ -74,7 +87,7 @@ def noisy(capture, spread=0.1):
 
 
 def evaluated(capture, images, **options):
-    return evaluate.evaluate(pictures_at(images), capture, CPU, quiet=True, **options)
+    return evaluate.evaluate(images_at(images), capture, quiet=True, **options)
 
 
 def decibels(capture, images, name, rows=slice(None), columns=slice(None)):
@@ -178,70 +191,70 @@ def gray(value):
     return torch.full((H, W, 3), value)
 
 
-def test_flicker_is_the_mean_change_between_consecutive_moments():
+def test_flicker_is_the_mean_change_between_consecutive_times():
     images = {0.25: gray(0.2), 0.5: gray(0.5), 0.75: gray(0.4)}
     assert evaluated(capture(), images).flicker == pytest.approx((0.3 + 0.1) / 2)
 
 
-def test_flicker_is_seen_through_the_middle_camera_alone():
+def test_flicker_uses_only_the_middle_camera():
     here = capture()
     for k, name in enumerate(VAL):
         here.cameras[name].viewmat[0, 3] = k
     seen = []
 
-    def render_at(camera, branches):
+    def render(camera, branches):
         if branches:
             seen.append((camera.viewmat[0, 3].item(), camera.time))
         return rendering(gray(0.5))
 
-    evaluate.evaluate(render_at, here, CPU, quiet=True)
+    evaluate.evaluate(Scene(render), here, quiet=True)
     assert seen[len(VAL) :] == [(1.0, 0.25), (1.0, 0.5), (1.0, 0.75)]
 
 
-def test_flicker_leaves_out_what_is_dynamic_at_either_moment():
-    def render_at(camera, branches):
+def test_flicker_omits_pixels_that_are_dynamic_at_either_time():
+    def render(camera, branches):
         alpha = torch.zeros(H, W)
         image = gray(0.5)
         if camera.time == 0.5:
             alpha[:3], image[:3] = 1.0, 1.0
         return rendering(image, alpha)
 
-    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).flicker == 0.0
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).flicker == 0.0
 
 
 @pytest.mark.parametrize("val", [("a",), ()])
-def test_flicker_needs_two_moments(val):
+def test_flicker_needs_two_times(val):
     here = capture(val)
     for camera in here.cameras.values():
         object.__setattr__(camera, "time", 0.25)
     assert evaluated(here, {0.25: gray(0.5)}).flicker is None
 
 
-def test_flicker_is_not_measured_where_all_is_dynamic():
-    def render_at(camera, branches):
+def test_flicker_is_not_measured_if_everything_is_dynamic():
+    def render(camera, branches):
         return rendering(gray(camera.time), torch.ones(H, W))
 
-    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).flicker is None
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).flicker is None
 
 
-# Frames a second ----------------------------------------------------------------------------------------------------
+# Frames per second ----------------------------------------------------------------------------------------------------
 
 
-def test_frames_a_second_are_joint_images_by_the_clock_after_one_to_warm_up(monkeypatch):
+def test_fps_counts_joint_images_after_one_warm_up_frame(monkeypatch):
     now = [0.0]
 
-    def render_at(camera, branches):
+    def render(camera, branches):
         now[0] += 0.0 if branches else (100.0 if now[0] == 0.0 else 0.02)
         return rendering(gray(0.5))
 
     monkeypatch.setattr(evaluate.time, "perf_counter", lambda: now[0])
-    assert evaluate.evaluate(render_at, capture(), CPU, quiet=True).fps == pytest.approx(50.0)
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).fps == pytest.approx(50.0)
 
 
 # Without evaluation frames ------------------------------------------------------------------------------------------
 
 
-def test_without_evaluation_frames_no_quality_is_measured_but_flicker_and_speed_are():
+def test_without_evaluation_frames_only_flicker_and_speed_are_measured():
     summary = evaluated(capture(()), {0.0: gray(0.2), 1.0: gray(0.4)}).summary()
     assert (summary["psnr"], summary["ssim"], summary["lpips"], summary["num_views"]) == (None, None, None, 0)
     assert summary["flicker"] == pytest.approx(0.2)
@@ -251,7 +264,7 @@ def test_without_evaluation_frames_no_quality_is_measured_but_flicker_and_speed_
 # Files --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_view_is_a_line_and_what_was_not_measured_is_empty(tmp_path):
+def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
     views = [view_of("a,b", psnr_static=12.5), view_of("c")]
     evaluate.write_views(tmp_path / "views.csv", Evaluation(views, None, 1.0, None))
     with open(tmp_path / "views.csv", newline="") as file:
@@ -263,8 +276,8 @@ def test_a_view_is_a_line_and_what_was_not_measured_is_empty(tmp_path):
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
-def test_json_has_no_values_that_other_readers_refuse(tmp_path, value):
-    evaluate.write_json(tmp_path / "metrics.json", {"psnr": value, "ssim": 0.5})
+def test_json_has_no_infinite_or_nan_values(tmp_path, value):
+    write_json(tmp_path / "metrics.json", {"psnr": value, "ssim": 0.5})
 
     def refuse(constant):
         raise AssertionError(constant)
@@ -283,70 +296,69 @@ def run(quickly, tmp_path_factory):  # noqa: F811  # the fixture
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
         config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path_factory.mktemp("runs") / "run")
-        assert script.train(config) == 0
+        train(config)
     return config.out
 
 
 @pytest.fixture
-def figures(run):
+def metrics(run):
     return json.loads((run / "metrics.json").read_text())
 
 
-def test_metrics_have_all_that_reports_need(figures):
+def test_metrics_have_every_field_that_reports_need(metrics):
     wanted = (
         "psnr ssim lpips psnr_static psnr_dynamic flicker fps train_seconds num_static num_dynamic iterations commit"
     )
-    assert set(wanted.split()) <= figures.keys()
+    assert set(wanted.split()) <= metrics.keys()
 
 
-def test_metrics_of_a_run_are_of_its_last_iterate(figures, run):
+def test_metrics_are_those_of_the_last_checkpoint(metrics, run):
     state = tiny.state(run)
-    assert figures["iterations"] == tiny.LENGTH
-    assert figures["num_static"] == len(state["scene.static.means"]) > 0
-    assert figures["num_dynamic"] == len(state["scene.dynamic.means"]) > 0
-    assert 0 < figures["train_seconds"] < 600
-    assert figures["fps"] > 0
+    assert metrics["iterations"] == tiny.LENGTH
+    assert metrics["num_static"] == len(state["scene.static.means"]) > 0
+    assert metrics["num_dynamic"] == len(state["scene.dynamic.means"]) > 0
+    assert 0 < metrics["train_seconds"] < 600
+    assert metrics["fps"] > 0
 
 
-def test_metrics_name_the_commit_of_a_checkout(figures):
-    root = Path(runs.__file__).parent
+def test_metrics_name_the_commit_of_a_checkout(metrics):
+    root = Path(evaluate_run.__file__).parent
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=False)
     if head.returncode:
-        assert figures["commit"] is None
+        assert metrics["commit"] is None
     else:
-        assert re.fullmatch("[0-9a-f]{7,}", figures["commit"])
-        assert head.stdout.startswith(figures["commit"])
+        assert re.fullmatch("[0-9a-f]{7,}", metrics["commit"])
+        assert head.stdout.startswith(metrics["commit"])
 
 
-def test_metrics_are_the_means_of_the_views(figures, run):
+def test_metrics_are_the_means_of_the_views(metrics, run):
     with open(run / "views.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == figures["num_views"] == 3
+    assert len(rows) == metrics["num_views"] == 3
     for name in ("psnr", "ssim", "psnr_static", "psnr_dynamic"):
-        assert figures[name] == pytest.approx(statistics.fmean(float(row[name]) for row in rows))
+        assert metrics[name] == pytest.approx(statistics.fmean(float(row[name]) for row in rows))
 
 
-def test_a_perfect_picture_of_one_view_is_no_number_in_json_but_one_in_the_table(tmp_path):
+def test_infinite_psnr_is_null_in_json_and_inf_in_the_table(tmp_path):
     here = capture(("a",))
     result = evaluated(here, {0.25: here.frame("a").image.float() / 255})
-    evaluate.write_json(tmp_path / "metrics.json", result.summary())
+    write_json(tmp_path / "metrics.json", result.summary())
     evaluate.write_views(tmp_path / "views.csv", result)
     assert json.loads((tmp_path / "metrics.json").read_text())["psnr"] is None
     assert ",inf," in (tmp_path / "views.csv").read_text()
 
 
-def test_evaluating_a_capture_whose_pictures_were_changed_measures_the_new_ones(run, tmp_path, monkeypatch):
-    """Pictures are read, not remembered."""
+def test_changed_images_of_a_capture_are_read_again(run, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     data, copy = tiny.write(tmp_path), shutil.copytree(run, tmp_path / "copy")
     before = json.loads((run / "metrics.json").read_text())["psnr"]
     for path in (data / "rgb/1x").iterdir():
         write_png(path, np.zeros((tiny.SCENE.height, tiny.SCENE.width, 3), np.uint8))
-    evaluate_run.evaluate_run(copy, runs.open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
+    evaluate_run.evaluate_run(copy, open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
     assert json.loads((copy / "metrics.json").read_text())["psnr"] != pytest.approx(before)
 
 
-def test_figures_are_kept_where_no_video_can_be_written(finished_run, tmp_path, monkeypatch):
+def test_metrics_are_written_even_if_the_video_cannot_be(finished_run, tmp_path, monkeypatch):
     run = shutil.copytree(finished_run, tmp_path / "run")
     for name in ("metrics.json", "views.csv"):
         (run / name).unlink(missing_ok=True)

@@ -109,9 +109,9 @@ def test_one_layer_by_hand():
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     layer = distance.features[0].double()
     units = []
-    for picture in (image, truth):
+    for rgb in (image, truth):
         # The shift and scale of LPIPS are ImageNet's mean and deviation, for values in [-1, 1], rounded.
-        x = ((picture - mean) / std).permute(2, 0, 1)[None].double()
+        x = ((rgb - mean) / std).permute(2, 0, 1)[None].double()
         units.append(nn.functional.normalize(torch.relu(layer(x)), dim=1))
     layer.float()
     expected = ((units[0] - units[1]) ** 2 * distance.weights[0][:, None, None]).sum(1).mean().item()
@@ -125,12 +125,12 @@ def test_a_network_has_as_many_parameters_as_published(net, count):
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_the_smallest_pictures_leave_every_layer_a_pixel(net):
+def test_the_smallest_images_leave_a_pixel_in_every_layer(net):
     assert torch.isfinite(network(net)(torch.rand(32, 32, 3), torch.rand(32, 32, 3)))
 
 
 @pytest.mark.parametrize("size", [(31, 40), (40, 31), (1, 1)])
-def test_smaller_pictures_are_refused_in_words(size):
+def test_smaller_images_are_refused(size):
     with pytest.raises(ValueError, match=r"LPIPS needs 32 pixels a side, got \["):
         network("squeeze")(torch.rand(*size, 3), torch.rand(*size, 3))
 
@@ -203,7 +203,7 @@ def test_loading_names_the_file_that_is_missing(tmp_path, missing):
 def test_a_damaged_file_is_named(tmp_path, name):
     path = write(tmp_path, network("squeeze")) / name
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match=f"{path} can't be read as weights"):
+    with pytest.raises(ValueError, match=f"{path} cannot be read as weights"):
         lpips.find(tmp_path)
 
 
@@ -240,7 +240,7 @@ def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
 
     path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
     torch.save({"features.0.weight": Bomb()}, path)
-    with pytest.raises(ValueError, match="can't be read as weights"):
+    with pytest.raises(ValueError, match="cannot be read as weights"):
         lpips.find(tmp_path)
     assert not (tmp_path / "executed").exists()
 
@@ -268,7 +268,7 @@ def test_real_weights_call_more_noise_farther(real):
 
 @needs_weights
 def test_real_weights_call_blur_farther_than_a_change_of_brightness_of_the_same_psnr(real):
-    """What PSNR can't tell apart and LPIPS was made for."""
+    """Images of equal PSNR that LPIPS is made to tell apart."""
     truth = torch.rand(16, 16, 3).repeat_interleave(4, 0).repeat_interleave(4, 1) * 0.6 + 0.2
     blurred = nn.functional.avg_pool2d(truth.permute(2, 0, 1), 7, 1, 3, count_include_pad=False).permute(1, 2, 0)
     brighter = truth + (blurred - truth).square().mean().sqrt()

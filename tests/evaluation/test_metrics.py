@@ -1,4 +1,4 @@
-"""PSNR, SSIM and flicker against values worked out by hand or by a slow reference."""
+"""PSNR, SSIM and flicker against analytic values or a slow reference."""
 
 import math
 

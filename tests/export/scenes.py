@@ -55,12 +55,12 @@ def refusal(read, path):
 
 
 def clouds(num_static=40, num_dynamic=20, seed=0):
-    """The clouds of a small trained scene."""
+    """The clouds of ``trained_scene``."""
     return Clouds(trained_scene(num_static, num_dynamic, seed))
 
 
 def trained_scene(num_static=40, num_dynamic=20, seed=0):
-    """A scene with networks whose outputs are far from zero: the dynamic Gaussians move by a good part of the scene."""
+    """A scene whose networks have a visible effect."""
     torch.manual_seed(seed)
     scene = SplitScene.empty(num_static, num_dynamic, tiny.MODEL)
     for part in (scene.static, scene.dynamic):
@@ -68,7 +68,7 @@ def trained_scene(num_static=40, num_dynamic=20, seed=0):
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return TrainedScene(scene.requires_grad_(False), TrainConfig(model=tiny.MODEL), METADATA)
+    return TrainedScene(scene.requires_grad_(False), TrainConfig(model=tiny.MODEL, device="cpu"), METADATA)
 
 
 def _random(num):

@@ -1,4 +1,4 @@
-"""Checkpoints: whole whatever happens while they are written, and read with no trust in what they hold."""
+"""Checkpoints: atomic writes, and reading that trusts nothing in the file."""
 
 import dataclasses
 import errno
@@ -13,15 +13,23 @@ import sys
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from tests import tiny
 from tests.export.scenes import refusal
-from warpgs.runs import checkpoint
 from warpgs.model.scene import SplitScene
+from warpgs.runs import checkpoint
 
 TENSORS = {"scene.a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
-FACTS = {"iteration": 3, "moving": True, "peak_bytes": None}
+METADATA = checkpoint.Metadata(iteration=3, use_deformation=True, use_appearance=True, sh_degree=1)
+
+FIELDS = json.dumps(
+    {
+        **{"iteration": 3, "moving": True, "relit": True, "sh_degree": 1},
+        **{"train_seconds": 0.0, "peak_bytes": None, "rollbacks": 0, "views": []},
+    }
+)
 
 
 def scene(num_static=5, num_dynamic=3, model=tiny.MODEL):
@@ -38,7 +46,7 @@ def tensors_of(a_scene):
 @pytest.fixture
 def path(tmp_path):
     path = checkpoint.path_of(tmp_path, 3)
-    checkpoint.save(path, TENSORS, FACTS)
+    checkpoint.save(path, TENSORS, METADATA)
     return path
 
 
@@ -50,41 +58,41 @@ def write_raw(path, header, data=b"", length=None):
 
 
 def metadata(**changes):
-    facts = {"format": "warpgs", "version": str(checkpoint.VERSION), "facts": "{}", **changes}
-    return {"__metadata__": {key: value for key, value in facts.items() if value is not None}}
+    header = {"format": "warpgs", "version": str(checkpoint.VERSION), "facts": FIELDS, **changes}
+    return {"__metadata__": {key: value for key, value in header.items() if value is not None}}
 
 
 # Written and read ---------------------------------------------------------------------------------------------------
 
 
-def test_what_is_saved_is_read_back_bit_for_bit(path):
+def test_a_checkpoint_round_trips_bit_for_bit(path):
     loaded = checkpoint.load(path)
     assert tiny.differences(loaded.tensors, TENSORS) == []
-    assert loaded.facts == FACTS
+    assert loaded.metadata == METADATA
 
 
-def test_who_may_read_other_files_may_read_a_checkpoint(path, tmp_path):
+def test_checkpoints_have_the_permissions_of_other_files(path, tmp_path):
     (tmp_path / "plain").touch()
     assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_a_scene_is_read_back_bit_for_bit(tmp_path):
+def test_a_scene_round_trips_bit_for_bit(tmp_path):
     saved = scene()
-    checkpoint.save(tmp_path / "a.safetensors", tensors_of(saved), FACTS)
-    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL, tmp_path)
+    checkpoint.save(tmp_path / "a.safetensors", tensors_of(saved), METADATA)
+    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL)
     assert tiny.differences(dict(read.state_dict()), dict(saved.state_dict())) == []
 
 
 @pytest.mark.parametrize("counts", [(0, 0), (1, 0), (0, 1)])
-def test_an_empty_branch_is_read_back(tmp_path, counts):
-    checkpoint.save(tmp_path / "a.safetensors", tensors_of(scene(*counts)), FACTS)
-    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL, tmp_path)
+def test_an_empty_branch_round_trips(tmp_path, counts):
+    checkpoint.save(tmp_path / "a.safetensors", tensors_of(scene(*counts)), METADATA)
+    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL)
     assert (len(read.static), len(read.dynamic)) == counts
 
 
 def test_checkpoints_are_listed_oldest_first(tmp_path):
     for iteration in (10_000, 20, 3):
-        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
+        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, METADATA)
     assert checkpoint.list_checkpoints(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in (3, 20, 10_000)]
 
 
@@ -95,12 +103,12 @@ def test_a_folder_without_checkpoints_has_none(tmp_path):
 @pytest.mark.parametrize(("count", "left"), [(2, [4, 5]), (1, [5]), (0, [5]), (9, [1, 2, 3, 4, 5])])
 def test_the_newest_checkpoints_are_kept(tmp_path, count, left):
     for iteration in range(1, 6):
-        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, FACTS)
+        checkpoint.save(checkpoint.path_of(tmp_path, iteration), TENSORS, METADATA)
     checkpoint.keep_newest(tmp_path, count)
     assert checkpoint.list_checkpoints(tmp_path) == [checkpoint.path_of(tmp_path, k) for k in left]
 
 
-def test_what_a_killed_program_left_half_written_is_no_checkpoint_and_goes(path):
+def test_half_written_files_are_not_listed_and_are_removed(path):
     partial = path.with_name("0000009.partial")
     partial.write_bytes(path.read_bytes()[:50])
     assert checkpoint.list_checkpoints(path.parent.parent) == [path]
@@ -112,13 +120,14 @@ def test_what_a_killed_program_left_half_written_is_no_checkpoint_and_goes(path)
 
 
 WITH_SMALL_FILES = """
-import json, pathlib, resource, sys, torch
-from warpgs import checkpoint
+import pathlib, resource, sys, torch
+from warpgs.runs import checkpoint
 resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-checkpoint.save(pathlib.Path(sys.argv[1]), {"b": torch.zeros(100_000)}, json.loads(sys.argv[2]))
+metadata = checkpoint.Metadata(iteration=3, use_deformation=True, use_appearance=True, sh_degree=1)
+checkpoint.save(pathlib.Path(sys.argv[1]), {"b": torch.zeros(100_000)}, metadata)
 """
-"""Saves while the system refuses to write past 4 KiB of a file: in a process of its own, or the log of the tests, if it
-goes to a file, would be refused too."""
+"""Saves while the system refuses files over 4 KiB: in a separate process, because the limit would also hold for a log
+file of the tests."""
 
 
 LARGE = {"b": torch.zeros(100_000)}
@@ -134,7 +143,7 @@ def pressed_ctrl_c(*_):
 
 def test_a_write_that_fails_half_way_leaves_the_old_checkpoint_alone(path):
     before = path.read_bytes()
-    command = [sys.executable, "-c", WITH_SMALL_FILES, str(path), json.dumps(FACTS)]
+    command = [sys.executable, "-c", WITH_SMALL_FILES, str(path)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.stderr.splitlines()[-1].startswith(f"OSError: {path} could not be written")
     assert path.read_bytes() == before
@@ -146,7 +155,7 @@ def test_a_full_disk_leaves_the_old_checkpoint_alone(path, monkeypatch, failing)
     before = path.read_bytes()
     monkeypatch.setattr(os, failing, full_disk)
     with pytest.raises(OSError, match="could not be written"):
-        checkpoint.save(path, LARGE, FACTS)
+        checkpoint.save(path, LARGE, METADATA)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
@@ -154,7 +163,7 @@ def test_a_full_disk_leaves_the_old_checkpoint_alone(path, monkeypatch, failing)
 def test_a_full_disk_is_one_line_that_names_the_file_and_the_reason(path, monkeypatch):
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="could not be written") as caught:
-        checkpoint.save(path, LARGE, FACTS)
+        checkpoint.save(path, LARGE, METADATA)
     text = str(caught.value)
     assert text.startswith(str(path))
     assert "No space left on device" in text
@@ -165,21 +174,21 @@ def test_ctrl_c_while_writing_leaves_the_old_checkpoint_alone(path, monkeypatch)
     before = path.read_bytes()
     monkeypatch.setattr(os, "fsync", pressed_ctrl_c)
     with pytest.raises(KeyboardInterrupt):
-        checkpoint.save(path, LARGE, FACTS)
+        checkpoint.save(path, LARGE, METADATA)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+def test_a_checkpoint_is_synced_before_it_is_renamed(tmp_path, monkeypatch):
     done = []
     fsync, replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda file: (done.append("written"), fsync(file)))
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("named"), replace(*paths)))
-    checkpoint.save(tmp_path / "a.safetensors", TENSORS, FACTS)
+    checkpoint.save(tmp_path / "a.safetensors", TENSORS, METADATA)
     assert done == ["written", "named"]
 
 
-# Files that are not what they should be -----------------------------------------------------------------------------
+# Damaged files -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kept", [0, 1, 7, 8, 9, 100, -1])
@@ -209,16 +218,17 @@ def test_a_file_of_another_program_is_refused(tmp_path):
 LONG = '{"iteration": 1' + 5000 * "0" + "}"
 
 
-@pytest.mark.parametrize("facts", [LONG, None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
-def test_facts_that_are_no_object_are_damage(tmp_path, facts):
-    path = write_raw(tmp_path / "a.safetensors", metadata(facts=facts))
+@pytest.mark.parametrize("text", [LONG, None, "", "{", "[1, 2]", "3", '"moving"', "[" * 100_000])
+def test_metadata_that_is_not_an_object_is_damage(tmp_path, text):
+    path = write_raw(tmp_path / "a.safetensors", metadata(facts=text))
     with pytest.raises(ValueError, match="is damaged"):
         checkpoint.load(path)
 
 
-def test_a_fact_that_is_missing_is_named_with_the_file(path):
+def test_missing_metadata_is_named_with_the_file(path):
+    tiny.edit_metadata(path, lambda values: values.pop("sh_degree"))
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no sh_degree"):
-        checkpoint.load(path).metadata.sh_degree
+        checkpoint.load(path)
 
 
 @pytest.mark.parametrize(
@@ -226,24 +236,37 @@ def test_a_fact_that_is_missing_is_named_with_the_file(path):
     [
         ("moving", "yes"),
         ("relit", 1),
-        ("sh_degree", 3),
         ("sh_degree", 0.5),
         ("sh_degree", []),
         ("iteration", -1),
+        ("iteration", True),
         ("iteration", 10**400),
+        ("train_seconds", "1"),
+        ("views", [1]),
     ],
 )
-def test_facts_that_no_stage_has_are_damage(path, name, value):
-    loaded = checkpoint.load(path)
-    facts = {"moving": True, "relit": True, "sh_degree": 2, "iteration": 5, name: value}
-    checkpoint.save(path, loaded.tensors, facts)
-    with pytest.raises(ValueError, match=f"{path} is damaged: {name} can't be"):
-        checkpoint.load(path).check_stage(2)
+def test_metadata_of_another_type_or_range_is_damage(path, name, value):
+    tiny.edit_metadata(path, lambda values: values.update({name: value}))
+    with pytest.raises(ValueError, match=f"{path} is damaged: {name} cannot be"):
+        checkpoint.load(path)
 
 
-def test_a_tensor_that_is_missing_is_named_with_the_file(path):
+def test_a_degree_that_the_config_does_not_have_is_damage(tmp_path):
+    path = tmp_path / "a.safetensors"
+    checkpoint.save(path, tensors_of(scene()), dataclasses.replace(METADATA, sh_degree=3))
+    with pytest.raises(ValueError, match=f"{path} is damaged: sh_degree cannot be 3"):
+        read_whole(path)
+
+
+def test_the_keys_in_the_file_are_those_of_version_2(path):
+    with safe_open(path, framework="pt") as file:
+        values = json.loads(file.metadata()["facts"])
+    assert {"moving", "relit", "iteration", "views"} <= values.keys()
+
+
+def test_a_missing_tensor_is_named_with_the_file(path):
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no alignments"):
-        checkpoint.load(path).tensors["alignments"]
+        checkpoint.load(path).tensor("alignments", (3, 2))
 
 
 def test_a_pickle_is_refused_and_not_executed(tmp_path):
@@ -279,39 +302,38 @@ def test_a_tensor_larger_than_the_file_is_damage(tmp_path):
 
 
 def read_whole(path):
-    """All that is read of a checkpoint before its scene is shown."""
+    """Reads a checkpoint and its scene."""
     loaded = checkpoint.load(path)
-    loaded.check_stage(tiny.MODEL.sh_degree)
-    checkpoint.load_scene(loaded, tiny.MODEL, path)
+    checkpoint.load_scene(loaded, tiny.MODEL)
 
 
-def test_a_damaged_checkpoint_is_read_or_refused_in_a_line_but_never_anything_else(tmp_path):
+def test_a_damaged_checkpoint_is_read_or_refused_in_one_line(tmp_path):
     path = checkpoint.path_of(tmp_path, 3)
-    checkpoint.save(path, tensors_of(scene()), {**FACTS, "relit": True, "sh_degree": 1})
+    checkpoint.save(path, tensors_of(scene()), METADATA)
     read_whole(path)
     whole, random = path.read_bytes(), np.random.default_rng(0)
     header = 8 + struct.unpack("<Q", whole[:8])[0]
     refused = 0
     for _ in range(300):
         data = bytearray(whole[: random.integers(len(whole))] if random.random() < 0.2 else whole)
-        for place in random.integers(0, min(header, len(data)) if random.random() < 0.8 else len(data), 3):
-            data[place] = random.choice([random.integers(256), *b'0123456789"[]{},:-'])
+        for position in random.integers(0, min(header, len(data)) if random.random() < 0.8 else len(data), 3):
+            data[position] = random.choice([random.integers(256), *b'0123456789"[]{},:-'])
         path.write_bytes(data)
-        said = refusal(read_whole, path)
-        refused += said is not None
-        assert said is None or str(path) in said
+        message = refusal(read_whole, path)
+        refused += message is not None
+        assert message is None or str(path) in message
     assert refused > 200
 
 
-def test_rows_of_no_width_make_no_gaussians(tmp_path):
-    """Such a tensor needs no byte of the file, however many rows it claims."""
+def test_rows_of_zero_width_take_no_memory(tmp_path):
+    """Such a tensor takes no byte of the file, whatever number of rows its header claims."""
     rows = 4_000_000  # 0.9 GB as Gaussians
     entry = {"dtype": "F32", "shape": [rows, 0], "data_offsets": [0, 0]}
     header = {**metadata(), "scene.static.means": entry, "scene.dynamic.means": entry}
     loaded = checkpoint.load(write_raw(tmp_path / "a.safetensors", header))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match="does not hold a scene"):
-        checkpoint.load_scene(loaded, tiny.MODEL, tmp_path / "a.safetensors")
+        checkpoint.load_scene(loaded, tiny.MODEL)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
 
 
@@ -322,13 +344,13 @@ def test_a_config_that_claims_a_huge_network_takes_no_memory(path):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
 
 
-# Scenes that don't fit ----------------------------------------------------------------------------------------------
+# Scenes that do not fit ----------------------------------------------------------------------------------------------
 
 
 def refused(tensors, model=tiny.MODEL):
     path = checkpoint.Path("here.safetensors")
     with pytest.raises(ValueError, match=r"^here\.safetensors ") as caught:
-        checkpoint.load_scene(checkpoint.Checkpoint(path, tensors, {}), model, path)
+        checkpoint.load_scene(checkpoint.Checkpoint(path, tensors, METADATA), model)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -338,14 +360,14 @@ def test_a_scene_of_other_networks_is_refused():
     assert "does not hold a scene of this run's config" in refused(tensors_of(scene()), wider)
 
 
-LACKING = {"static.means": "'static.means'", "static.quats": 'Missing key(s) in state_dict: "static.quats"'}
+MISSING = {"static.means": "'static.means'", "static.quats": 'Missing key(s) in state_dict: "static.quats"'}
 
 
-@pytest.mark.parametrize("name", LACKING)
-def test_a_scene_that_lacks_a_tensor_is_refused(name):
+@pytest.mark.parametrize("name", MISSING)
+def test_a_scene_without_a_tensor_is_refused(name):
     tensors = tensors_of(scene())
     del tensors[f"scene.{name}"]
-    assert f"does not hold a scene of this run's config: {LACKING[name]}" in refused(tensors)
+    assert f"does not hold a scene of this run's config: {MISSING[name]}" in refused(tensors)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (4, 3), (5, 4), (5, 3, 1)])
@@ -354,7 +376,7 @@ def test_a_tensor_of_another_shape_is_refused(shape):
     assert "does not hold a scene of this run's config" in refused(tensors)
 
 
-def test_a_tensor_too_many_is_refused():
+def test_an_unexpected_tensor_is_refused():
     tensors = {**tensors_of(scene()), "scene.static.velocities": torch.zeros(5, 3)}
     assert 'Unexpected key(s) in state_dict: "static.velocities"' in refused(tensors)
 

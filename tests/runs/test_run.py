@@ -1,4 +1,4 @@
-"""Run folders: their config comes back as it was, and what is no run is refused in words."""
+"""Run folders: the config round-trips, and a folder that is not a run is refused with a clear message."""
 
 import dataclasses
 import json
@@ -8,9 +8,12 @@ import pytest
 import torch
 
 from tests import tiny
-from warpgs.runs import checkpoint, run as runs
 from warpgs.config import PRESETS, MaskPerturbation, TrainConfig, scaled
 from warpgs.data.loaders import load_capture
+from warpgs.evaluation import evaluate_run
+from warpgs.runs import checkpoint
+from warpgs.runs.config_file import read_config
+from warpgs.runs.run import Run, choose_device, new_folder, open_run
 
 UNUSUAL = dataclasses.replace(
     tiny.CONFIG,
@@ -25,9 +28,7 @@ UNUSUAL = dataclasses.replace(
 
 
 def create(config, capture):
-    folder = runs.new_folder(config, capture)
-    Run.create(folder, config)
-    return folder
+    return Run.create(new_folder(config, capture), config).folder
 
 
 @pytest.fixture(scope="module")
@@ -55,17 +56,17 @@ def edit(run, change):
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["fast"]), UNUSUAL, tiny.CONFIG])
-def test_a_config_comes_back_as_it_was(tmp_path, capture, config):
+def test_a_config_round_trips(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
     assert read_config(create(config, capture)) == config
 
 
-def test_a_run_that_was_moved_is_where_it_is_now(run, tmp_path):
+def test_a_moved_run_has_its_present_folder(run, tmp_path):
     moved = run.rename(tmp_path / "elsewhere")
     assert read_config(moved).out == moved
 
 
-def test_folders_are_kept_in_full_so_that_a_run_goes_on_from_anywhere(tmp_path, capture, monkeypatch):
+def test_paths_are_saved_as_absolute_paths(tmp_path, capture, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = dataclasses.replace(tiny.CONFIG, out=Path("run"), data=Path("capture"), lpips=Path("weights"))
     kept = read_config(create(config, capture))
@@ -98,14 +99,14 @@ def test_an_unknown_field_is_refused_by_its_name(run, part):
 )
 def test_a_field_of_another_type_is_refused_by_its_name(run, name, value):
     edit(run, lambda values: values.update({name: value}))
-    with pytest.raises(ValueError, match=rf"config\.json: {name} can't be "):
+    with pytest.raises(ValueError, match=rf"config\.json: {name} cannot be "):
         read_config(run)
 
 
 @pytest.mark.parametrize("value", ["0.5", None, True, [1.0]])
-def test_a_rate_that_is_no_number_is_refused(run, value):
+def test_a_rate_that_is_not_a_number_is_refused(run, value):
     edit(run, lambda values: values["optim"].update(means=value))
-    with pytest.raises(ValueError, match=r"config\.json: means can't be "):
+    with pytest.raises(ValueError, match=r"config\.json: means cannot be "):
         read_config(run)
 
 
@@ -114,7 +115,7 @@ def test_a_rate_may_be_a_whole_number(run):
     assert read_config(run).optim.means == 1.0
 
 
-def test_a_part_that_is_no_object_is_refused(run):
+def test_a_section_that_is_not_an_object_is_refused(run):
     edit(run, lambda values: values.update(model=3))
     with pytest.raises(ValueError, match=r"config\.json: expected an object for ModelConfig, got 3"):
         read_config(run)
@@ -123,40 +124,40 @@ def test_a_part_that_is_no_object_is_refused(run):
 @pytest.mark.parametrize("text", ["", "{", "nonsense", '{"seed": 1'])
 def test_a_damaged_config_is_named(run, text):
     (run / "config.json").write_text(text)
-    with pytest.raises(ValueError, match=r"config\.json is damaged"):
+    with pytest.raises(ValueError, match=r"config\.json is not valid JSON"):
         read_config(run)
 
 
-def test_a_config_that_is_no_text_is_damaged(run):
+def test_a_config_that_is_not_text_is_refused(run):
     (run / "config.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match=r"config\.json is damaged"):
+    with pytest.raises(ValueError, match=r"config\.json is not valid JSON"):
         read_config(run)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null"])
-def test_a_config_that_is_no_object_is_refused(run, text):
+def test_a_config_that_is_not_an_object_is_refused(run, text):
     (run / "config.json").write_text(text)
-    with pytest.raises(ValueError, match="expected an object for TrainConfig"):
+    with pytest.raises(ValueError, match="must hold a JSON object"):
         read_config(run)
 
 
 # Folders ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_without_a_config_is_no_run(tmp_path):
-    with pytest.raises(ValueError, match=f"{tmp_path} is no run folder"):
+def test_a_folder_without_a_config_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path} is not a run folder"):
         read_config(tmp_path)
 
 
-def test_a_file_is_no_run(tmp_path):
+def test_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("{}")
-    with pytest.raises(ValueError, match="is no run folder"):
+    with pytest.raises(ValueError, match="is not a run folder"):
         read_config(tmp_path / "file")
 
 
-def test_a_folder_that_holds_something_is_not_trained_into(tmp_path, capture):
+def test_a_folder_with_files_is_not_trained_into(tmp_path, capture):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: go on with --resume {tmp_path}"):
+    with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: continue it with --resume {tmp_path}"):
         create(TrainConfig(out=tmp_path), capture)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
@@ -178,50 +179,65 @@ def test_runs_without_a_folder_get_one_each(tmp_path, capture, monkeypatch):
     assert [folder.name for folder in folders] == ["builtin-fast", "builtin-fast-2", "builtin-fast-3"]
 
 
-def test_cuda_is_refused_where_there_is_none(monkeypatch):
+def test_cuda_is_refused_without_a_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match="use --device cpu"):
-        runs.resolve(TrainConfig(device="cuda"))
+        choose_device("cuda")
 
 
-@pytest.mark.parametrize(("there", "chosen"), [(False, "cpu"), (True, "cuda")])
-def test_a_device_is_chosen_by_what_there_is(monkeypatch, there, chosen):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
-    assert runs.resolve(TrainConfig()).device == chosen
+@pytest.mark.parametrize(("available", "chosen"), [(False, "cpu"), (True, "cuda")])
+def test_the_default_device_is_the_gpu_if_there_is_one(monkeypatch, available, chosen):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: available)
+    assert choose_device() == chosen
 
 
-# The newest scene ---------------------------------------------------------------------------------------------------
+def test_a_config_with_the_old_name_of_a_field_still_opens(run):
+    def rename(values):
+        values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from") + 7
+
+    edit(run, rename)
+    assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
+
+
+def test_a_run_is_locked_against_a_second_process(run):
+    opened = Run.open(run)
+    with opened.lock(), pytest.raises(ValueError, match="being trained by another process"), Run.open(run).lock():
+        pass
+    with opened.lock():
+        pass  # free again
+
+
+# The newest checkpoint ----------------------------------------------------------------------------------------------
 
 
 def test_a_run_without_a_checkpoint_has_no_scene(run):
+    assert Run.open(run).newest_checkpoint() is None
     with pytest.raises(ValueError, match=f"{run} has no checkpoint yet"):
-        runs.newest_scene(run, tiny.CONFIG)
+        open_run(run)
 
 
-def test_the_newest_scene_is_the_one_of_the_last_iteration(run, data):
+def test_the_scene_is_that_of_the_last_iteration(run, data):
     trainer = tiny.trainer(data, run)
     trainer.save()
     trainer.iteration = 20
     trainer.scene.static.means.data[0] = 9.0
     trainer.save()
-    scene, facts = runs.newest_scene(run, tiny.CONFIG)
-    assert facts["iteration"] == 20
-    assert scene.static.means[0].tolist() == [9.0, 9.0, 9.0]
+    trained = open_run(run, "cpu")
+    assert trained.metadata.iteration == 20
+    assert trained.scene.static.means[0].tolist() == [9.0, 9.0, 9.0]
 
 
 def test_a_scene_is_not_read_with_the_config_of_another_run(run, data):
     tiny.trainer(data, run).save()
     other = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, width=16))
     with pytest.raises(ValueError, match="does not hold a scene of this run's config"):
-        runs.newest_scene(run, other)
+        Run(run, other).trained_scene()
 
 
-@pytest.mark.parametrize("lacking", ["moving", "train_seconds"])
-def test_a_checkpoint_that_lacks_a_fact_is_named(run, data, lacking, monkeypatch):
-    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+@pytest.mark.parametrize("missing", ["moving", "train_seconds"])
+def test_a_missing_field_of_a_checkpoint_is_named(run, data, missing):
     tiny.trainer(data, run).save()
     path = checkpoint.list_checkpoints(run)[-1]
-    loaded = checkpoint.load(path)
-    checkpoint.save(path, loaded.tensors, {k: v for k, v in loaded.facts.items() if k != lacking})
-    with pytest.raises(ValueError, match=f"{path} is damaged: it has no {lacking}"):
+    tiny.edit_metadata(path, lambda values: values.pop(missing))
+    with pytest.raises(ValueError, match=f"{path} is damaged: it has no {missing}"):
         evaluate_run.evaluate_run(run, load_capture(data), quiet=True)

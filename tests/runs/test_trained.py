@@ -1,4 +1,4 @@
-"""Playing a scene: frames that are recorded are those that are rendered. (On a real GPU: test_cuda_training.)"""
+"""Playback: captured frames equal rendered frames. (On a real GPU: tests/training/test_cuda_training.py.)"""
 
 import dataclasses
 
@@ -6,68 +6,75 @@ import pytest
 import torch
 
 from tests.export import scenes
-from warpgs.runs import trained as playback
-from warpgs.runs.trained import MAX_RECORDINGS, Player
+from warpgs.runs.trained import MAX_GRAPHS, TrainedScene
+from warpgs.runtime import graphs
+from warpgs.runtime.graphs import WARM_UPS
 
 
 @pytest.fixture
-def recorded(monkeypatch):
-    """Sizes in the order of their recording; without a GPU a graph is a function that is called again."""
+def captured(monkeypatch):
+    """Sizes in the order of their capture; without a GPU a graph is a function that is called again."""
     sizes = []
 
-    def capture(step):
-        sizes.append(tuple(step()[0].shape[1::-1]))
-        return step
+    def record(work, stream=None, pool=None):
+        sizes.append(None)
+        return work
 
-    monkeypatch.setattr(playback, "capture", capture)
-    monkeypatch.setattr(Player, "records", True)
+    monkeypatch.setattr(graphs, "record", record)
+    monkeypatch.setattr(TrainedScene, "uses_graphs", True)
     return sizes
 
 
 @pytest.fixture
-def player():
-    moments = scenes.moments()
-    return Player(moments.scene, moments.config, moments.facts)
+def trained():
+    return scenes.trained_scene()
 
 
-def shifted(camera, by, time):
+def translated(camera, by, time):
     viewmat = camera.viewmat.clone()
     viewmat[0, 3] += by
     return dataclasses.replace(camera, viewmat=viewmat, time=time)
 
 
-def test_every_camera_of_a_size_is_played_from_one_recording(player, recorded):
-    for k in range(3):
-        camera = shifted(scenes.camera(), 0.2 * k, 0.3 * k)
-        assert torch.equal(player.play(camera), player(camera, False).joint.image)
-    assert recorded == [(64, 48)]
+def test_one_graph_plays_every_camera_of_a_size(trained, captured):
+    for k in range(WARM_UPS + 3):
+        camera = translated(scenes.camera(), 0.1 * k, 0.1 * k)
+        assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
+    assert len(captured) == 1
 
 
-def test_each_size_is_recorded_once(player, recorded):
+def test_each_size_is_captured_once(trained, captured):
     sizes = [(64, 48), (32, 24)]
-    assert not player.is_recorded(sizes[0])
-    for size in sizes * 2:
-        assert player.play(scenes.camera(*size)).shape == (size[1], size[0], 3)
-    assert recorded == sizes
-    assert player.is_recorded(sizes[0])
+    for size in sizes * (WARM_UPS + 2):
+        assert trained.play(scenes.camera(*size)).shape == (size[1], size[0], 3)
+    assert len(captured) == 2
+    assert all(trained.is_captured(size) for size in sizes)
 
 
-def test_the_oldest_of_many_recordings_goes(player, recorded):
-    sizes = [(32 + 2 * k, 24) for k in range(MAX_RECORDINGS + 1)]
+def test_the_oldest_of_too_many_graphs_is_dropped(trained, captured):
+    sizes = [(32 + 2 * k, 24) for k in range(MAX_GRAPHS + 1)]
     for size in sizes:
-        player.play(scenes.camera(*size))
-    assert [player.is_recorded(size) for size in sizes] == [False] + [True] * MAX_RECORDINGS
+        for _ in range(WARM_UPS + 1):
+            trained.play(scenes.camera(*size))
+    assert [trained.is_captured(size) for size in sizes] == [False] + [True] * MAX_GRAPHS
 
 
-def test_on_the_cpu_nothing_is_recorded(player):
+def test_nothing_is_captured_on_the_cpu(trained):
     camera = scenes.camera(time=0.4)
-    assert torch.equal(player.play(camera), player(camera, False).joint.image)
-    assert not player.is_recorded(camera.size)
+    for _ in range(WARM_UPS + 1):
+        assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
+    assert not trained.is_captured(camera.size)
 
 
-def test_without_the_residual_static_gaussians_have_their_own_colours(player):
-    plain, relit = player.splats(0.5, residual=False), player.splats(0.5)
-    num = len(player.scene.static)
-    assert torch.equal(plain.sh[:num, 0], player.scene.static.sh[:, 0])
-    assert not torch.equal(relit.sh[:num, 0], plain.sh[:num, 0])
-    assert torch.equal(relit.means, plain.means)
+def test_a_given_time_replaces_that_of_the_camera(trained):
+    at_time = trained.render(scenes.camera(time=0.7)).joint.image
+    assert torch.equal(trained.render(scenes.camera(), time=0.7).joint.image, at_time)
+    assert not torch.equal(trained.render(scenes.camera()).joint.image, at_time)
+
+
+def test_without_the_residual_static_gaussians_have_their_own_colors(trained):
+    plain, changed = trained.splats(0.5, residual=False), trained.splats(0.5)
+    num = len(trained.scene.static)
+    assert torch.equal(plain.sh[:num, 0], trained.scene.static.sh[:, 0])
+    assert not torch.equal(changed.sh[:num, 0], plain.sh[:num, 0])
+    assert torch.equal(changed.means, plain.means)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,6 +24,7 @@ from . import metrics
 from .lpips import Lpips
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """What is evaluated: ``TrainedScene`` is one."""
 
@@ -39,17 +40,17 @@ class Renderer(Protocol):
 
 
 STATIC_ALPHA = 0.05
-"""A pixel counts as static for the flicker score where the dynamic image is fainter than this in both frames."""
+"""A pixel counts as static for the flicker score where the dynamic image's alpha is lower than this in both frames."""
 
 FLICKER_FRAMES = 30
 TIMED_FRAMES = 30
 TIMED_SECONDS = 0.5
-"""Frames are timed in rounds of so many, for so long."""
+"""Frames are timed in rounds of ``TIMED_FRAMES``, for at least ``TIMED_SECONDS`` [s]."""
 
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """One view's figures; None where they could not be measured.
+    """Metrics of one view; None where they could not be measured.
 
     Images are clamped to [0, 1] and not rounded to 8 bits. ``_static`` and ``_dynamic`` are over the pixels of that
     region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures.
@@ -70,14 +71,14 @@ class ViewMetrics:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Figures of all views and of the whole.
+    """Metrics of all views, and of the scene as a whole.
 
     Attributes:
-        views: One entry a view.
+        views: One entry per view.
         flicker: Mean absolute change between consecutive renderings of the static region through the middle camera of
-            the evaluation, held fixed; None with fewer than two moments. There is no truth of a fixed camera in a
+            the evaluation, held fixed; None with fewer than two times. There is no ground truth of a fixed camera in a
             capture of a moving one, so changes that are real (shadows) count too.
-        fps: Joint images a second, everything that depends on time included.
+        fps: Joint images per second, including everything that depends on time.
         lpips_net: Network of LPIPS; None when it was not measured.
     """
 
@@ -87,7 +88,7 @@ class Evaluation:
     lpips_net: str | None
 
     def summary(self) -> dict[str, Any]:
-        """Means over the views that have a figure; None where none has."""
+        """Means over the views that have a value; None where none has."""
         means = {f.name: _mean([getattr(v, f.name) for v in self.views]) for f in fields(ViewMetrics)[2:]}
         return {
             **means,
@@ -161,10 +162,10 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
     )
 
 
-def _at_times(camera: Camera, cameras: Sequence[Camera], most: int) -> list[Camera]:
-    """One camera at consecutive times of others."""
+def _at_times(camera: Camera, cameras: Sequence[Camera], max_count: int) -> list[Camera]:
+    """One camera at the first ``max_count`` times of other cameras."""
     times = sorted({c.time for c in cameras})
-    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, moment) for moment in times[:most]]
+    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, time) for time in times[:max_count]]
 
 
 def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | None:
@@ -183,7 +184,7 @@ def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float |
 
 
 def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:
-    """Frames a second by the clock, after one to warm up, through one camera after the other."""
+    """Frames per second of wall time, after one warm-up frame, cycling through the cameras."""
     device = cameras[0].viewmat.device
 
     def play_all() -> None:
@@ -203,7 +204,7 @@ def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> f
 
 
 def write_views(path: Path, evaluation: Evaluation) -> None:
-    """Writes one line a view as CSV; nothing between commas is "not measured"."""
+    """Writes one line per view as CSV; an empty field was not measured."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [f.name for f in fields(ViewMetrics)], lineterminator="\n")
     writer.writeheader()

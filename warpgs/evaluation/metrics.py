@@ -1,4 +1,4 @@
-"""How good a picture is: PSNR, SSIM, flicker; whole or within a region. LPIPS is in ``lpips``."""
+"""Image quality: PSNR, SSIM, flicker; whole or within a region. LPIPS is in ``lpips``."""
 
 import math
 
@@ -36,7 +36,7 @@ def ssim(
 
 
 def masked_ssim(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], region: Bool[Tensor, "H W"]) -> float:
-    """mSSIM as DyCheck means it: what lies outside the region enters no window.
+    """mSSIM of DyCheck: pixels outside the region enter no window.
 
     Both images are set to zero outside, and the mean runs over the region's pixels; NaN if it is empty.
     """

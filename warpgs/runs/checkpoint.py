@@ -1,4 +1,4 @@
-"""Checkpoints: safetensors files, written so that a crash at any moment leaves a whole one behind."""
+"""Checkpoints: safetensors files, written so that a crash at any time leaves a complete one."""
 
 import json
 import os
@@ -23,7 +23,7 @@ FOLDER = "checkpoints"
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a checkpoint says about itself beside its tensors.
+    """Plain values of a checkpoint, beside its tensors.
 
     Attributes:
         iteration: Iterations done.
@@ -171,7 +171,7 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
     """The scene of a checkpoint, on the CPU.
 
     Raises:
-        ValueError: If tensors are missing, not finite, or of other shapes than the config says; the message names the
+        ValueError: If tensors are missing, not finite, or do not have the shapes of the config; the message names the
             file.
     """
     state = {

@@ -1,0 +1,76 @@
+"""``import warpgs``, ``python -m warpgs`` and ``warpgs --help``: public, typed, and quick to start."""
+
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import warpgs
+from warpgs.cli import COMMANDS
+
+HEAVY = {"torch", "warp", "cv2", "pycolmap", "viser", "scipy", "skimage", "av", "tensorboard"}
+"""Packages that take longer to import than a user waits for a help text."""
+
+
+def run(*arguments):
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+
+
+def imported_by(program):
+    """The heavy packages that a program imports."""
+    code = f"import sys\ntry:\n    {program}\nexcept SystemExit:\n    pass\nprint(*sys.modules, file=sys.stderr)"
+    return HEAVY & set(run("-c", code).stderr.split())
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    assert imported_by("import warpgs") == set()
+
+
+@pytest.mark.parametrize("name", sorted({"Camera", "RenderSettings", "Splats", "load_capture", "open_run", "render"}))
+def test_public_names_are_exported_and_documented(name):
+    assert name in warpgs.__all__
+    assert name in dir(warpgs)
+    assert callable(getattr(warpgs, name))
+    assert getattr(warpgs, name).__doc__
+
+
+def test_render_is_the_function_whatever_was_imported_before():
+    import warpgs.rendering
+
+    assert warpgs.render is warpgs.rendering.render
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        warpgs.no_such_name  # noqa: B018
+
+
+def test_the_version_is_that_of_the_installed_package():
+    assert warpgs.__version__ == importlib.metadata.version("warpgs")
+    assert run("-m", "warpgs", "--version").stdout == f"warpgs {warpgs.__version__}\n"
+
+
+def test_the_package_is_typed():
+    assert (Path(warpgs.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS, "train"])
+def test_help_imports_nothing_heavy(command):
+    arguments = [command, "--help"] if command else ["--help"]
+    assert imported_by(f"from warpgs.cli import main; main({arguments})") == set()
+
+
+def test_train_is_a_command_and_a_script():
+    script = Path(__file__).parents[1] / "train.py"
+    by_command, by_script = run("-m", "warpgs", "train", "--help"), run(str(script), "--help")
+    assert by_command.returncode == by_script.returncode == 0
+    assert by_command.stdout.replace("warpgs train", "train.py").split() == by_script.stdout.split()
+
+
+def test_a_command_refuses_wrong_input_in_one_line(tmp_path):
+    ended = run("-m", "warpgs", "eval", str(tmp_path))
+    assert ended.returncode == 2
+    assert ended.stderr.strip().splitlines()[-1].startswith("warpgs: ")
+    assert "Traceback" not in ended.stderr
