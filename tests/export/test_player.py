@@ -82,8 +82,8 @@ def test_the_page_requests_nothing_and_reports_no_errors(browser, page):
 
 def test_moving_the_camera_changes_the_image_and_reset_restores_it(browser, page):
     first = shown(browser, page, "time=0.5")
-    for move in ("orbit.turn(0.4, 0.2)", "orbit.shift(0.1, 0)", "orbit.approach(0.7)"):
-        browser.value(f"delete document.body.dataset.state, {move}, touch()")
+    for move in ("orbit.rotate(0.4, 0.2)", "orbit.pan(0.1, 0)", "orbit.zoom(0.7)"):
+        browser.value(f"delete document.body.dataset.state, {move}, update()")
         browser.until(SETTLED)
         assert psnr(browser.screenshot(), first) < 35
         browser.value("delete document.body.dataset.state, home()")
@@ -93,7 +93,7 @@ def test_moving_the_camera_changes_the_image_and_reset_restores_it(browser, page
 
 def test_an_orbited_view_matches_the_renderer(browser, page, baked):
     shown(browser, page, "time=0.5")
-    browser.value("delete document.body.dataset.state, orbit.turn(0.7, -0.4), touch()")
+    browser.value("delete document.body.dataset.state, orbit.rotate(0.7, -0.4), update()")
     browser.until(SETTLED)
     seen = browser.value("orbit.camera")
     rotation, position = torch.tensor(seen["rotation"]), torch.tensor(seen["position"])
