@@ -1,5 +1,5 @@
-"""Warp kernels, installed as ``warpgs.kernels``. They launch nothing: ``warpgs.ops`` does.
+"""Warp kernels, installed as ``warpgs.kernels`` and launched by ``warpgs.ops``.
 
-Every kernel takes ``first`` as its first parameter, the index of the launch's first thread, so that a launch can be
-cut into shards that run on several CPU cores at once.
+The first parameter of every kernel is ``first``, the index of the launch's first thread, so that a launch can be split
+into shards that run on several CPU cores at once.
 """

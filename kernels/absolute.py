@@ -1,9 +1,9 @@
-"""The slope of an absolute value, for the ways back of L1 losses."""
+"""The derivative of an absolute value, for the backward passes of L1 losses."""
 
 import warp as wp
 
 
 @wp.func
-def slope_of_abs(x: float) -> float:
-    """d|x| / dx; 0 at 0 and for NaN, as torch has it at 0."""
+def abs_derivative(x: float) -> float:
+    """d|x| / dx; 0 at 0, as in torch, and for NaN."""
     return wp.where(x > 0.0, 1.0, 0.0) - wp.where(x < 0.0, 1.0, 0.0)

@@ -1,15 +1,15 @@
-"""From what the optimizer holds, and what the networks say, to Gaussians that can be drawn (paper Eq. 8, 10, 11).
+"""Activation of raw Gaussians with the outputs of the two networks applied (paper Eq. 8, 10, 11).
 
-Of each Gaussian, with offsets δμ, δr, δs of the deformation and residuals of the appearance network, where there are
-any:
+For each Gaussian, with offsets δμ, δr, δs from the deformation network and residuals from the appearance network, if
+there are any:
 
     mean = μ + δμ,   quat = (1 + δr) · q,   scale = exp(log s + δs),   opacity = σ(logit + Δlogit),   sh = w⁰ + Δw
 
-So A Σ Aᵀ = A R S² Rᵀ Aᵀ with A = R(1 + δr) · R exp(δs) Rᵀ: the rotation is multiplied from the left (Hamilton product
-of quaternions (w, x, y, z)), the log-scales are added to.
+So A Σ Aᵀ = A R S² Rᵀ Aᵀ with A = R(1 + δr) · R exp(δs) Rᵀ: the rotation offset is multiplied from the left (Hamilton
+product of quaternions (w, x, y, z)), the scale offset is added to the log-scales.
 
-Adjoint: v_μ = v_δμ = v_mean; v_δs = v_log_s = v_scale · scale; v_logit = v_opacity · o (1 − o); and of a product
-q = a b of quaternions v_a = v_q b*, v_b = a* v_q, with the conjugate *.
+Gradient: v_μ = v_δμ = v_mean; v_δs = v_log_s = v_scale · scale; v_logit = v_opacity · o (1 − o); for a product
+q = a b of quaternions, v_a = v_q b* and v_b = a* v_q, where * is the conjugate.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ IDENTITY = wp.constant(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
 @wp.func
 def product(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """Hamilton product of quaternions (w, x, y, z): first b turns, then a."""
+    """Hamilton product of quaternions (w, x, y, z): the rotation b followed by the rotation a."""
     return wp.vec4(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -34,8 +34,8 @@ def conjugate(a: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def turn_of(offsets: wp.array2d[float], i: int) -> wp.vec4:
-    """1 + δr."""
+def rotation_offset(offsets: wp.array2d[float], i: int) -> wp.vec4:
+    """The quaternion 1 + δr of Gaussian ``i``."""
     return IDENTITY + wp.vec4(offsets[i, 3], offsets[i, 4], offsets[i, 5], offsets[i, 6])
 
 
@@ -62,7 +62,7 @@ def activate_fwd(
     logit = logit_opacities[i]
     if offsets.shape[0] > 0:
         mean += wp.vec3(offsets[i, 0], offsets[i, 1], offsets[i, 2])
-        quat = product(turn_of(offsets, i), quat)
+        quat = product(rotation_offset(offsets, i), quat)
         log_scale += wp.vec3(offsets[i, 7], offsets[i, 8], offsets[i, 9])
     if logit_residuals.shape[0] > 0:
         logit += logit_residuals[i]
@@ -100,13 +100,13 @@ def activate_bwd(
     v_log_scales[i] = v_log_scale
     v_logits[i] = v_out_opacities[row] * opacity * (1.0 - opacity)
     if offsets.shape[0] > 0:
-        v_turn = product(v_quat, conjugate(quats[i]))
+        v_rotation = product(v_quat, conjugate(quats[i]))
         for k in range(3):
             v_offsets[i, k] = v_mean[k]
             v_offsets[i, 7 + k] = v_log_scale[k]
         for k in range(4):
-            v_offsets[i, 3 + k] = v_turn[k]
-        v_quat = product(conjugate(turn_of(offsets, i)), v_quat)
+            v_offsets[i, 3 + k] = v_rotation[k]
+        v_quat = product(conjugate(rotation_offset(offsets, i)), v_quat)
     v_quats[i] = v_quat
 
 
@@ -119,7 +119,7 @@ def join_sh_fwd(
     residuals: wp.array2d[wp.vec3],
     sh: wp.array2d[wp.vec3],
 ):
-    """One coefficient of all three colours, one thread each."""
+    """One thread for each Gaussian and basis, which writes that coefficient of all three colours."""
     thread = first + wp.tid()
     bases = sh.shape[1]
     i = thread // bases

@@ -1,8 +1,9 @@
-"""Adam (Kingma and Ba 2015, algorithm 1), one number a thread.
+"""Adam (Kingma and Ba 2015, algorithm 1), one parameter per thread.
 
 m ← β₁ m + (1 − β₁) g,   v ← β₂ v + (1 − β₂) g²,   p ← p − rate · m / (1 − β₁ᵗ) / (√(v / (1 − β₂ᵗ)) + ε)
 
-1 − β and log β come from the host in double precision: of a β near 1, single precision keeps few of their digits.
+1 − β and log β are computed on the host in double precision: for a β near 1, single precision would keep few of their
+digits.
 """
 
 import warp as wp
@@ -10,7 +11,7 @@ import warp as wp
 
 @wp.func
 def one_minus_power(log_base: float, exponent: float) -> float:
-    """1 − baseᵉ, also where the power is so near to 1 that the difference would lose its digits."""
+    """1 − base ** exponent, by a series where the power is so close to 1 that the difference would lose its digits."""
     x = log_base * exponent
     if x > -0.03:
         return -x * (1.0 + x * (0.5 + x * (1.0 / 6.0 + x / 24.0)))
@@ -24,10 +25,10 @@ def adam_step(
     rate: wp.array[float],
     step: wp.array[float],
     beta1: float,
-    share1: float,
+    one_minus_beta1: float,
     log_beta1: float,
     beta2: float,
-    share2: float,
+    one_minus_beta2: float,
     log_beta2: float,
     epsilon: float,
     parameters: wp.array[float],
@@ -36,8 +37,8 @@ def adam_step(
 ):
     i = first + wp.tid()
     g = gradients[i]
-    m = beta1 * means[i] + share1 * g
-    v = beta2 * squares[i] + share2 * g * g
+    m = beta1 * means[i] + one_minus_beta1 * g
+    v = beta2 * squares[i] + one_minus_beta2 * g * g
     means[i] = m
     squares[i] = v
     mean = m / one_minus_power(log_beta1, step[0])

@@ -1,8 +1,9 @@
-"""Blocks of pixels: which pixels a lane group composites, and how it fetches the Gaussians that matter to them.
+"""Blocks of pixels: which pixels a lane group composites, and how it fetches the Gaussians that reach into them.
 
-A lane group owns a block; each lane owns ``pixels`` (columns, rows) of it, a lane layout's width or height apart. The
-lanes fetch one Gaussian each, test it against the block and put the survivors on the stage, in order; then all lanes
-composite the survivors one by one. On CPU the one lane owns the whole block and has no stage.
+A lane group owns a block; each lane owns ``pixels`` (columns, rows) of it, spaced by the width and the height of the
+lane layout. The lanes fetch one Gaussian each, test it against the block and put the survivors into the staging buffer,
+in order; then all lanes composite the survivors one by one. On CPU the single lane owns the whole block and needs no
+staging buffer.
 """
 
 import functools
@@ -15,13 +16,12 @@ from .lanes import lane_ballot, lane_rank, lane_sync, stage_put
 from .rows import GEOMETRY_PARTS, row_load
 
 Counter = wp.types.vector(length=1, dtype=int)
-"""A number that an inner loop counts with: Warp carries a plain one from iteration to iteration by copies."""
+"""An int that an inner loop modifies: Warp would carry a plain int from iteration to iteration by copies."""
 
 
 @functools.cache
 def state_types(num_channels: int, num_pixels: int) -> tuple[type, type, type, type]:
-    """Vector types of what a lane holds: a float, an int and a colour for each of its pixels, and one Gaussian's
-    features."""
+    """Vector types of a lane's state: a float, an int and a colour per pixel, and the features of one Gaussian."""
     return (
         wp.types.vector(length=num_pixels, dtype=float),
         wp.types.vector(length=num_pixels, dtype=int),
@@ -31,20 +31,23 @@ def state_types(num_channels: int, num_pixels: int) -> tuple[type, type, type, t
 
 
 def module_options(pixels_per_lane: int) -> dict[str, object]:
-    """Compile options of a compositing kernel: a lane's few pixels on CUDA are unrolled into registers, the CPU lane's
-    whole tile is looped over. (Warp's own level is 3 on CUDA and 2 on CPU.)"""
+    """Compile options of a compositing kernel.
+
+    On CUDA, loops over a lane's few pixels are unrolled into registers; on CPU, where a lane owns a whole tile, they
+    are not. (Warp's default optimization level is 3 on CUDA and 2 on CPU.)
+    """
     return {"fast_math": True, "optimization_level": 3, "max_unroll": 16 if pixels_per_lane <= 8 else 4}
 
 
 @wp.func
 def blocks_of_tile(block_width: int, block_height: int) -> int:
-    """How many blocks a tile is cut into."""
+    """Number of blocks in a tile."""
     return (TILE_SIZE / block_width) * (TILE_SIZE / block_height)
 
 
 @wp.func
 def block_corner(block: int, width: int, block_width: int, block_height: int) -> wp.vec3i:
-    """Tile index, left and top [px] of an image's block; the blocks of a tile follow each other."""
+    """Tile index, left and top [px] of a block of an image; the blocks of a tile are consecutive."""
     tile = block / blocks_of_tile(block_width, block_height)
     block_of_tile = block % blocks_of_tile(block_width, block_height)
     blocks_x = TILE_SIZE / block_width
@@ -55,23 +58,23 @@ def block_corner(block: int, width: int, block_width: int, block_height: int) ->
 
 
 @wp.func
-def is_joint(image: int, looked: int) -> bool:
-    """Whether a branch's image of a block is the joint image, bit for bit.
+def equals_joint(image: int, joint_state: int) -> bool:
+    """Whether a branch's image of a block equals the joint image, bit for bit.
 
-    It is where the joint image, before all of its pixels were opaque, looked at that branch's Gaussians alone.
+    This holds if the joint image evaluated Gaussians of that branch only, before all of its pixels were opaque.
 
     Args:
         image: 1 static, 2 dynamic.
-        looked: Bit m is set where the joint image looked at a Gaussian of image m, bit 0 once it is finished.
+        joint_state: Bit m is set if the joint image evaluated a Gaussian of image m, bit 0 once it is complete.
     """
-    return looked == 1 or looked == 1 + (1 << image)
+    return joint_state == 1 or joint_state == 1 + (1 << image)
 
 
 @wp.func
 def tile_list(
     image: int, tile: int, tile_ranges: wp.array[wp.vec2i], branch_lengths: wp.array[wp.vec2i], half: int
 ) -> wp.vec3i:
-    """A tile's list of Gaussians in one image: where it begins, which way it runs, and its length (``split_tiles``)."""
+    """Begin, direction (1 or -1) and length of a tile's list of Gaussians in one image; see ``split_tiles``."""
     tile_range = tile_ranges[tile]
     lengths = wp.vec2i(0, 0)
     if image > 0:
@@ -96,14 +99,16 @@ def block_box(corner: wp.vec3i, block_width: int, block_height: int, width: int,
 
 @wp.func
 def stage_survivors(g: int, tag: int, box: wp.vec4, rows: wp.array2d[wp.vec4], lane: int, stage: wp.uint64):
-    """Puts the lane group's Gaussians that reach into the block on the stage, each with its index and a tag.
+    """Puts those Gaussians of the lane group that reach into the block into the staging buffer, with index and tag.
 
     Args:
         g: This lane's Gaussian, or -1 for none.
-        tag: A number that goes with it.
+        tag: An int to store with it.
+        box: From ``block_box``.
+        stage: From ``stage_address``.
 
     Returns:
-        The ballot of survivors and, for the CPU's single lane, its own three parts: [x, y, a, b],
+        The ballot of survivors and, for the single lane of the CPU, its own three parts: [x, y, a, b],
         [c, log2 opacity, g, tag] (the last two as bits), [feature 0..3].
     """
     own0 = wp.vec4(0.0)

@@ -1,13 +1,13 @@
-"""The reverse walk of alpha compositing (see ``compositing_fwd``).
+"""Backward pass of alpha compositing (see ``compositing_fwd``), by a traversal in reverse order.
 
-With the cotangents g of the image and h of alpha, and R_i = Σ_{j>i} alpha_j T_j (feature_j · g) + T_end (background · g
-- h) gathered while walking back to front,
+With the gradients g of the image and h of alpha, and R_i = Σ_{j>i} alpha_j T_j (feature_j · g) + T_end (background · g
+- h) accumulated back to front,
 
     v_feature_i = Σ_p alpha_i T_i g,      v_alpha_i = T_i (feature_i · g) - R_i / (1 - alpha_i),
 
-and v_alpha_i reaches the Gaussian's six geometric numbers through the moments of s = alpha_i v_alpha_i over its
+and the gradients of the Gaussian's six geometric values follow from the moments of s = alpha_i v_alpha_i over its
 pixels: Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy². ``rows`` turns them into gradients, once per Gaussian.
-T_i is rebuilt from T_end by dividing by 1 - alpha_i, which ALPHA_MAX keeps away from zero.
+T_i is recomputed from T_end by dividing by 1 - alpha_i, which ALPHA_MAX keeps away from zero.
 """
 
 import functools
@@ -18,7 +18,7 @@ from .blocks import (
     block_box,
     block_corner,
     blocks_of_tile,
-    is_joint,
+    equals_joint,
     module_options,
     stage_survivors,
     state_types,
@@ -47,20 +47,20 @@ from .tiles import DYNAMIC
 
 @wp.func_native(
     """
-    const float* values = image == 0 ? joint.data : image == 1 ? of_static.data : of_dynamic.data;
+    const float* values = image == 0 ? joint.data : image == 1 ? static_values.data : dynamic_values.data;
     return values ? values[(size_t)pixel * channels + channel] : 0.0f;
     """
 )
-def read_of(
+def read_gradient(
     image: int,
     joint: wp.array[float],
-    of_static: wp.array[float],
-    of_dynamic: wp.array[float],
+    static_values: wp.array[float],
+    dynamic_values: wp.array[float],
     pixel: int,
     channels: int,
     channel: int,
 ) -> float:
-    """A channel of what arrived at a pixel of an image; zero where the image's array is not there."""
+    """A channel of the gradient at a pixel of an image; zero if the array of that image is missing."""
     ...
 
 
@@ -68,17 +68,17 @@ def read_of(
 def make_composite_bwd(
     num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absolute: bool
 ) -> wp.Kernel:
-    """Reverse walk, with as many threads as the forward kernel.
+    """Backward kernel, launched with as many threads as the forward kernel.
 
     Args:
         num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
-        absolute: Whether the absolute-value variant of the means' gradient is gathered too.
+        absolute: Whether the absolute-value variant of the gradient of the means is accumulated, too.
 
-    The kernel adds to ``gradients`` [N, gradient_stride], which starts at zero. Cotangents arrive image by image, and
-    an array that is not there is zero everywhere; bit m of ``arrived`` says whether there are any of image m.
+    The kernel adds to ``gradients`` [N, gradient_stride], which is initially zero. Each image has its own arrays of
+    gradients; a missing array stands for zeros, and bit m of ``images_with_gradient`` is set if image m has any
+    gradient.
 
-    The walk knows depth as one more channel, D = Σ_i alpha_i T_i depth_i. What was made of it is, wherever something
-    was drawn (elsewhere nobody asks),
+    Depth is one more channel of the traversal, D = Σ_i alpha_i T_i depth_i. Wherever alpha is above MIN_ALPHA,
 
         depth = D / alpha,      v_D = v_depth / alpha,      v_alpha += -v_depth D / alpha².
     """
@@ -88,7 +88,7 @@ def make_composite_bwd(
     scalars, integers, colors, features_vector = state_types(C, P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
-    # Without the loop that Warp would put around an index; which kernels gain from that is in docs/performance.md.
+    # Without the grid-stride loop that Warp would add; docs/performance.md lists the kernels that this makes faster.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
@@ -104,7 +104,7 @@ def make_composite_bwd(
         depth: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
-        looked: wp.array[int],
+        joint_state: wp.array[int],
         v_image_joint: wp.array[float],
         v_image_static: wp.array[float],
         v_image_dynamic: wp.array[float],
@@ -114,39 +114,39 @@ def make_composite_bwd(
         v_depth_joint: wp.array[float],
         v_depth_static: wp.array[float],
         v_depth_dynamic: wp.array[float],
-        arrived: int,
+        images_with_gradient: int,
         gradients: wp.array2d[float],
     ):
         thread = first + wp.tid()
         lane = thread % lane_count()
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
-        # The images of a tile follow each other, as much of what they read and add to is the same.
+        # The images of a tile are consecutive, because they read and add to mostly the same memory.
         group = thread / lane_count()
         blocks = blocks_of_tile(block_width, block_height)
-        walked = group / blocks % wp.static(images)  # the image
+        own_image = group / blocks % wp.static(images)
         block = group / (blocks * wp.static(images)) * blocks + group % blocks
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
-            return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        source = walked  # the image whose list is gone back along
-        gone_back = 1 << walked
+            return  # this block of an edge tile is outside the image; its whole lane group returns
+        list_image = own_image  # the image whose list is traversed
+        image_bits = 1 << own_image  # the images whose gradients are propagated, as bits
         if wp.static(images > 1):
             for m in range(1, wp.static(images)):
-                if is_joint(m, looked[block]):
-                    # One way back serves both, as their cotangents add up. Absolute values do not: those are of each
-                    # image's pixels, so that there each image is gone back alone.
+                if equals_joint(m, joint_state[block]):
+                    # One traversal serves both images, because their gradients add up. Absolute values do not: they
+                    # are taken for the pixels of each image, so that each image needs its own traversal.
                     if wp.static(not absolute):
-                        if walked == 0:
-                            gone_back = gone_back | (1 << m)
-                        if walked == m:
+                        if own_image == 0:
+                            image_bits = image_bits | (1 << m)
+                        if own_image == m:
                             return
-                    elif walked == m:
-                        source = 0
-        gone_back = gone_back & arrived
-        if gone_back == 0:
+                    elif own_image == m:
+                        list_image = 0
+        image_bits = image_bits & images_with_gradient
+        if image_bits == 0:
             return
-        isects = tile_list(source, corner[0], tile_ranges, branch_lengths, half)
+        isects = tile_list(list_image, corner[0], tile_ranges, branch_lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -165,26 +165,28 @@ def make_composite_bwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     pixel = y * width + x
-                    T[k] = transmittance[source * height * width + pixel]
-                    n[k] = last[source * height * width + pixel]
+                    T[k] = transmittance[list_image * height * width + pixel]
+                    n[k] = last[list_image * height * width + pixel]
                     n_max = wp.max(n_max, n[k])
-                    for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
-                        if (gone_back & (1 << m)) != 0:
-                            behind = -read_of(m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel, 1, 0)
+                    for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                        if (image_bits & (1 << m)) != 0:
+                            v_transmittance = -read_gradient(
+                                m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel, 1, 0
+                            )
                             for c in range(wp.static(num_features)):
-                                v = read_of(
+                                v = read_gradient(
                                     m, v_image_joint, v_image_static, v_image_dynamic, pixel, wp.static(num_features), c
                                 )
                                 v_color[k * wp.static(C) + c] += v
                                 if background.shape[0] > 0:
-                                    behind += background[m * background_stride + c] * v
+                                    v_transmittance += background[m * background_stride + c] * v
                             if wp.static(with_depth):
-                                v_depth = read_of(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
-                                v_drawn = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
-                                v_color[k * wp.static(C) + wp.static(num_features)] += v_drawn
-                                behind += v_drawn * depth[m * height * width + pixel]
-                            R[k] += T[k] * behind
-        n_max = lane_max(n_max)  # from here on the lane group's
+                                v_depth = read_gradient(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
+                                v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
+                                v_color[k * wp.static(C) + wp.static(num_features)] += v_depth_sum
+                                v_transmittance += v_depth_sum * depth[m * height * width + pixel]
+                            R[k] += T[k] * v_transmittance
+        n_max = lane_max(n_max)  # from here on, that of the lane group
 
         stage = stage_address()
         base = (n_max - 1) / lane_count() * lane_count()
@@ -197,8 +199,8 @@ def make_composite_bwd(
                     own_g = own_g & ~DYNAMIC
             ballot, own0, own1, own2 = stage_survivors(own_g, index + 1, box, rows, lane, stage)
             count = lane_bit_count(ballot)
-            for back in range(count):
-                slot = count - 1 - back
+            for step in range(count):
+                slot = count - 1 - step
                 row0 = stage_get(stage, slot, 0, own0)
                 row1 = stage_get(stage, slot, 1, own1)
                 quad = stage_get(stage, slot, 2, own2)
@@ -212,7 +214,7 @@ def make_composite_bwd(
                 threshold = row1[1] - LOG2_ALPHA_MIN
                 half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
                 sums = sums_vector()
-                touched = int(0)
+                contributes = int(0)
                 for j in range(
                     span_begin(row0[1] - half_size[1] - y0, wp.static(rows_per_lane)),
                     span_end(row0[1] + half_size[1] - y0, wp.static(rows_per_lane)),
@@ -232,16 +234,16 @@ def make_composite_bwd(
                             v_alpha = float(0.0)
                             k = j * wp.static(columns) + i
                             if position <= n[k]:
-                                touched = 1
+                                contributes = 1
                                 t = T[k] * scale
                                 w = alpha * t
-                                seen = float(0.0)
+                                v_weight = float(0.0)
                                 for c in range(wp.static(C)):
                                     v = v_color[k * wp.static(C) + c]
-                                    seen += features[c] * v
+                                    v_weight += features[c] * v
                                     sums[c] += w * v
-                                v_alpha = t * seen - R[k] * scale
-                                R[k] = R[k] + w * seen
+                                v_alpha = t * v_weight - R[k] * scale
+                                R[k] = R[k] + w * v_weight
                                 T[k] = t
                             if unclamped <= ALPHA_MAX:
                                 s = alpha * v_alpha
@@ -254,7 +256,7 @@ def make_composite_bwd(
                                 if wp.static(absolute):
                                     sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
                                     sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
-                if lane_any(touched) != 0:
+                if lane_any(contributes) != 0:
                     lane_add(sums, gradients, g)
             lane_sync()
             base -= lane_count()

@@ -1,6 +1,6 @@
 """Alpha compositing, front to back (paper Eq. 4).
 
-Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
+A pixel p composites the Gaussians of its tile in depth order; with d = mean2d - p,
 
     alpha_i = min(ALPHA_MAX, opacity_i exp(-½ dᵀ conic_i d)),  skipped below ALPHA_MIN,
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
@@ -8,14 +8,14 @@ Pixel p sees the Gaussians of its tile in depth order; with d = mean2d - p,
 
 Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, MIN_ALPHA).
 
-Three images (0 joint, 1 static Gaussians only, 2 dynamic Gaussians only) come out of one launch. Each image has lane
-groups of its own, which walk a list of their own: state for one image leaves room for more groups on a multiprocessor,
-and no group passes over what is not its image's. Where the joint image of a block needed one branch's Gaussians alone,
-that branch's image is the same, and the joint image's group writes both. The joint image's groups come first in the
-launch, so that most of a branch's find in ``looked`` that there is nothing left to do. Who comes too early to find it
-draws the same bits again.
+With branches, one launch makes three images: 0 joint, 1 static Gaussians only, 2 dynamic Gaussians only. Each image has
+its own lane groups, which traverse its own lists: with the state of a single image more groups fit on a multiprocessor,
+and no group has to skip Gaussians of another image. Where the joint image of a block evaluated Gaussians of one branch
+only, the image of that branch is the same, and the group of the joint image writes both. The groups of the joint image
+come first in the launch, so that most groups of a branch read in ``joint_state`` that nothing is left to do. A group
+that runs before this is known writes the same bits again.
 
-A transmittance is kept negative once its pixel is done.
+The transmittance of a pixel is negated once the pixel is complete.
 """
 
 import functools
@@ -27,7 +27,7 @@ from .blocks import (
     block_box,
     block_corner,
     blocks_of_tile,
-    is_joint,
+    equals_joint,
     module_options,
     stage_survivors,
     state_types,
@@ -62,21 +62,21 @@ def make_composite_fwd(
 
     Args:
         num_features: Channels of an image, at least 1.
-        with_depth: Whether Gaussians have their depth as one more channel.
-        images: 1 or 3, see above; ``branch_lengths``, ``half`` and ``looked`` are only used for 3.
-        pixels: Columns and rows of pixels that a lane owns.
-        statistics: Whether ``contributed`` and ``weights`` are written; they speak of the joint image.
+        with_depth: Whether the depth of the Gaussians is one more channel.
+        images: 1 or 3, see above; ``branch_lengths``, ``half`` and ``joint_state`` are only used with 3.
+        pixels: Columns and rows of the pixels that a lane owns.
+        statistics: Whether ``contributed`` and ``weights`` are written; they describe the joint image.
 
-    The kernel's ``background`` has ``num_features`` values, those of the next image ``background_stride`` further on.
-    ``looked`` has one value for each block of an image, zero at first; see ``is_joint``. ``transmittance`` and
-    ``last``, for the way back, are those of each image's own walk: where an image is the joint one there may be none.
+    The kernel's ``background`` has ``num_features`` values per image, ``background_stride`` apart. ``joint_state`` has
+    one value for each block of an image, initially zero; see ``equals_joint``. ``transmittance`` and ``last`` are saved
+    for the backward pass by the traversal of each image; they may be unset where an image equals the joint image.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, P)
-    # With branches, the lowest two bits of a Gaussian's tag say which is its, and those of a pixel's all that it has
-    # looked at; the rest is the position in the list. (Of lists of one branch nobody asks.)
+    # With branches, the lowest two bits of a Gaussian's tag encode its branch, and those of a pixel's tag all branches
+    # that it has evaluated; the other bits are the position in the list. (In lists of one branch they are not used.)
     branch_bits = 3 if images > 1 else 0
 
     @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
@@ -96,7 +96,7 @@ def make_composite_fwd(
         alpha_image: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
-        looked: wp.array[int],
+        joint_state: wp.array[int],
         contributed: wp.array[wp.uint8],
         weights: wp.array[float],
     ):
@@ -105,19 +105,19 @@ def make_composite_fwd(
         block_width = lane_columns() * wp.static(columns)
         block_height = lane_rows() * wp.static(rows_per_lane)
         num_blocks = tile_ranges.shape[0] * blocks_of_tile(block_width, block_height)
-        walked = thread / lane_count() / num_blocks  # the image
+        own_image = thread / lane_count() / num_blocks
         block = thread / lane_count() % num_blocks
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
-            return  # a block of an edge tile that lies outside the image; its whole lane group leaves
-        isects = tile_list(walked, corner[0], tile_ranges, branch_lengths, half)
+            return  # this block of an edge tile is outside the image; its whole lane group returns
+        isects = tile_list(own_image, corner[0], tile_ranges, branch_lengths, half)
         if wp.static(images > 1):
-            if walked > 0:
-                # In a tile without Gaussians of the other branch it is known beforehand. Lanes may read ``looked`` at
-                # different moments, and so they vote.
+            if own_image > 0:
+                # In a tile without Gaussians of the other branch it is known in advance. Lanes may read ``joint_state``
+                # at different times, so they vote.
                 all_isects = tile_list(0, corner[0], tile_ranges, branch_lengths, half)
-                if lane_any(int(isects[2] == all_isects[2] or is_joint(walked, looked[block]))) != 0:
-                    return  # the joint image's lane group writes this one
+                if lane_any(int(isects[2] == all_isects[2] or equals_joint(own_image, joint_state[block]))) != 0:
+                    return  # the lane group of the joint image writes this image, too
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -190,7 +190,7 @@ def make_composite_fwd(
                                     T[k] = t_next
                                     n[k] = tag | (n[k] & wp.static(branch_bits))
                                     weight += w
-                if wp.static(statistics) and walked == 0:
+                if wp.static(statistics) and own_image == 0:
                     weight = lane_sum(weight)
                     if lane == 0 and weight > 0.0:
                         contributed[g] = wp.uint8(1)
@@ -198,14 +198,14 @@ def make_composite_fwd(
             lane_sync()
             base += lane_count()
 
-        finished = int(1)
+        own_state = int(1)
         if wp.static(images > 1):
-            seen = int(0)
+            branches_seen = int(0)
             for k in range(wp.static(P)):
-                seen = seen | (n[k] & wp.static(branch_bits))
-            finished = 1 | 2 * lane_or(seen)
-            if walked == 0 and lane == 0:
-                looked[block] = finished
+                branches_seen = branches_seen | (n[k] & wp.static(branch_bits))
+            own_state = 1 | 2 * lane_or(branches_seen)
+            if own_image == 0 and lane == 0:
+                joint_state[block] = own_state
         for j in range(wp.static(rows_per_lane)):
             for i in range(wp.static(columns)):
                 x = pixel_x + i * lane_columns()
@@ -213,11 +213,11 @@ def make_composite_fwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     t = wp.abs(T[k])
-                    own_pixel = (walked * height + y) * width + x
+                    own_pixel = (own_image * height + y) * width + x
                     transmittance[own_pixel] = t
                     last[own_pixel] = n[k] / wp.static(branch_bits + 1)
-                    for m in range(walked, wp.where(walked == 0, wp.static(images), walked + 1)):
-                        if m == walked or is_joint(m, finished):
+                    for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                        if m == own_image or equals_joint(m, own_state):
                             p = (m * height + y) * width + x
                             alpha_image[p] = 1.0 - t
                             for c in range(wp.static(num_features)):
@@ -226,7 +226,7 @@ def make_composite_fwd(
                                     value += t * background[m * background_stride + c]
                                 image[p, c] = value
                             if wp.static(num_features < C):
-                                drawn = color[k * wp.static(C) + wp.static(num_features)]
-                                depth[p] = drawn / wp.max(1.0 - t, MIN_ALPHA)
+                                depth_sum = color[k * wp.static(C) + wp.static(num_features)]
+                                depth[p] = depth_sum / wp.max(1.0 - t, MIN_ALPHA)
 
     return composite_fwd

@@ -1,20 +1,20 @@
 """Depth against aligned monocular depth (paper Eq. 14).
 
-Monocular depth is inverse and known up to a scale and an offset, target = 1 / (scale inverse + offset). Per pixel,
+Monocular depth is inverse depth up to a scale and an offset, so target = 1 / (scale inverse + offset). For each pixel,
 
-    error = |depth - target|,      v_depth = v sign(depth - target),
+    error = |depth - target|,      v_depth = v sign(depth - target).
 
-and both are 0 where there is nothing to compare: outside the region, where less than half of the light comes from what
-was drawn, and where the target is unknown (NaN fails the comparison) or next to infinity.
+Both are 0 in pixels that are not compared: outside the region, where the rendered opacity is at most a half, and where
+the target is unknown (NaN fails the comparison) or close to infinity.
 """
 
 import warp as wp
 
-from .absolute import slope_of_abs
+from .absolute import abs_derivative
 from .constants import MIN_INVERSE_DEPTH
 
-OPAQUE = wp.constant(0.5)
-"""Opacity that a pixel must exceed to have a depth to speak of."""
+MIN_OPACITY = wp.constant(0.5)
+"""A pixel is compared if its opacity exceeds this."""
 
 
 @wp.func
@@ -26,10 +26,10 @@ def depth_difference(
     region: wp.array[wp.uint8],
     p: int,
 ) -> float:
-    """Depth minus target; 0 where there is nothing to compare."""
+    """Depth minus target; 0 in pixels that are not compared."""
     result = float(0.0)
     aligned = alignment[0] * inverse_depth[p] + alignment[1]
-    if region[p] != wp.uint8(0) and alpha[p] > OPAQUE and aligned > MIN_INVERSE_DEPTH:
+    if region[p] != wp.uint8(0) and alpha[p] > MIN_OPACITY and aligned > MIN_INVERSE_DEPTH:
         result = depth[p] - 1.0 / aligned
     return result
 
@@ -61,7 +61,7 @@ def depth_error_bwd(
     v_sum: wp.array[float],
     v_depth: wp.array[float],
 ):
-    """``v_sum`` [1]: cotangent of the sum of all errors, times ``scale``."""
+    """One thread for each pixel; ``v_sum`` [1] times ``scale`` is the gradient of the sum of all errors."""
     p = first + wp.tid()
     difference = depth_difference(depth, alpha, inverse_depth, alignment, region, p)
-    v_depth[p] = scale * v_sum[0] * slope_of_abs(difference)
+    v_depth[p] = scale * v_sum[0] * abs_derivative(difference)

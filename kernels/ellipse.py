@@ -1,7 +1,7 @@
-"""Where a splat is visible: the ellipse a dx² + b dx dy + c dy² <= t around its centre.
+"""The ellipse a dx² + b dx dy + c dy² <= t around its centre in which a splat is visible.
 
-The coefficients are those of a splat's row (see ``rows``) and t = log2 opacity - log2 ALPHA_MIN, so that inside the
-ellipse alpha >= ALPHA_MIN: this is the opacity-aware extent, exact, not a multiple of the standard deviation.
+The coefficients are those of a splat's row (see ``rows``) and t = log2 opacity - log2 ALPHA_MIN, so that alpha >=
+ALPHA_MIN exactly inside the ellipse: an opacity-aware extent instead of a multiple of the standard deviation.
 """
 
 import warp as wp
@@ -9,6 +9,7 @@ import warp as wp
 
 @wp.func
 def ellipse_value(a: float, b: float, c: float, dx: float, dy: float) -> float:
+    """a dx² + b dx dy + c dy²."""
     return dx * (a * dx + b * dy) + c * dy * dy
 
 
@@ -23,10 +24,10 @@ def ellipse_half_size(a: float, b: float, c: float, t: float) -> wp.vec2:
 def ellipse_meets_box(
     a: float, b: float, c: float, t: float, x_min: float, y_min: float, x_max: float, y_max: float
 ) -> bool:
-    """Whether the ellipse reaches into a box, whose corners are relative to the ellipse's centre.
+    """Whether the ellipse reaches into a box, given by its corners relative to the ellipse's centre.
 
-    The form is convex, so its least value over the box lies at the centre or on an edge that faces the centre: the
-    nearest vertical and the nearest horizontal edge are minimised in closed form and the better one is taken.
+    The form is convex, so its minimum over the box lies at the centre or on an edge that faces the centre: it is
+    minimised in closed form over the nearest vertical and the nearest horizontal edge, and the smaller value is taken.
     """
     dx = wp.clamp(0.0, x_min, x_max)
     dy = wp.clamp(0.0, y_min, y_max)
@@ -37,7 +38,7 @@ def ellipse_meets_box(
 
 @wp.func
 def ellipse_span(a: float, b: float, c: float, t: float, dy: float) -> wp.vec2:
-    """The interval of dx inside the ellipse at one height dy; empty (first above second) where the line misses it."""
+    """The interval of dx inside the ellipse at a height dy; empty (first above second) if the line misses it."""
     half_b = 0.5 * b * dy
     discriminant = half_b * half_b - a * (c * dy * dy - t)
     if not (discriminant >= 0.0):
@@ -51,8 +52,8 @@ def ellipse_span(a: float, b: float, c: float, t: float, dy: float) -> wp.vec2:
 def ellipse_slab(a: float, b: float, c: float, t: float, half_size: wp.vec2, y_min: float, y_max: float) -> wp.vec2:
     """The interval of dx that the ellipse covers within the slab y_min <= dy <= y_max.
 
-    The leftmost and the rightmost point of the ellipse lie at dy = ± half_width b / (2c); where such a height is
-    outside the slab, the nearest height of the slab that the ellipse reaches takes its place.
+    The leftmost and the rightmost point of the ellipse lie at dy = ± half_width b / (2c); if that height is outside the
+    slab, the nearest height of the slab that the ellipse reaches is used instead.
     """
     low = wp.max(y_min, -half_size[1])
     high = wp.min(y_max, half_size[1])

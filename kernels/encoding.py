@@ -2,10 +2,10 @@
 
     γ(p) = (p, sin(2⁰ π p) … sin(2ᴸ⁻¹ π p), cos(2⁰ π p) … cos(2ᴸ⁻¹ π p)) with p = (mean - center) / half_size
 
-Columns: the D values, then D L sines, a value's frequencies together, then the cosines in the same order; D is 3 for
-positions, then 1 for time. Whole periods are taken off 2ᵏ p before π comes in, and both are exact: every frequency is
-as precise as the first. It has no adjoint: positions get no gradient from the networks, as in Deformable-3DGS, and time
-is given.
+Columns: the D values, then D L sines with the frequencies of a value side by side, then the cosines in the same order;
+first for positions (D = 3), then for time (D = 1). Whole periods are subtracted from 2ᵏ p before it is multiplied by π.
+Both steps are exact, so that every frequency is as precise as the first. There is no backward pass: positions get no
+gradient from the networks, as in Deformable-3DGS, and time is given.
 """
 
 import functools
@@ -14,15 +14,16 @@ import math
 import warp as wp
 
 CUDA_LANES_LOG2 = 3
-"""Logarithm of the number of threads that share the frequencies of a value on CUDA."""
+"""Base-2 logarithm of the number of threads that share the frequencies of one value on CUDA."""
 
 
 @functools.cache
 def make_encode(half: bool) -> wp.Kernel:
     """Kernel that writes the columns of x, y, z or t of a row, in half or single precision.
 
-    2^``lanes_log2`` threads share them, a frequency each: neighbours on CUDA, where they write what lies side by side,
-    one thread on CPU. The angles are in [-π, π], where CUDA's fast sine is right to 2⁻²¹: plenty for half precision.
+    2^``lanes_log2`` threads share these columns, one frequency at a time: neighbouring threads on CUDA, which write
+    neighbouring addresses, and one thread on CPU. ``begin_column`` is the first column of the encoding. The angles are
+    in [-π, π], where CUDA's fast sine has an error of at most 2⁻²¹, enough for half precision.
     """
     number = wp.float16 if half else wp.float32
 
@@ -35,7 +36,7 @@ def make_encode(half: bool) -> wp.Kernel:
         half_size: wp.array[float],
         position_bands: int,
         time_bands: int,
-        room: int,
+        begin_column: int,
         lanes_log2: int,
         encoding: wp.array2d[number],
     ):
@@ -46,7 +47,7 @@ def make_encode(half: bool) -> wp.Kernel:
         axis = (thread >> lanes_log2) & 3
         dims = 3
         bands = position_bands
-        begin = room
+        begin = begin_column
         p = time[0]
         if axis < 3:
             p = (means[row, axis] - center[axis]) / half_size[axis]
@@ -54,7 +55,7 @@ def make_encode(half: bool) -> wp.Kernel:
             axis = 0
             dims = 1
             bands = time_bands
-            begin = room + 3 + 6 * position_bands
+            begin = begin_column + 3 + 6 * position_bands
             for column in range(begin + 1 + 2 * bands + lane, encoding.shape[1], lanes):
                 encoding[row, column] = number(0.0)
         if lane == 0:

@@ -1,8 +1,8 @@
-"""Lane groups: one kernel source that is fast on CUDA and right on CPU.
+"""Lane groups: one kernel source that is fast on CUDA and correct on CPU.
 
-On CUDA a lane group is a warp: 32 lanes laid out as 8 by 4, which vote, shuffle and share a small stage in shared
-memory. On CPU a group is one lane: votes and sums are the identity, and the stage hands back the lane's own value.
-A kernel launches ``lane_count()`` threads for each group, in blocks of ``BLOCK_DIM`` threads.
+On CUDA a lane group is a warp: 32 lanes laid out as 8 by 4, which vote, shuffle and share a small staging buffer in
+shared memory. On CPU a group is one lane: votes and sums are the identity, and the staging buffer returns the lane's
+own value. A kernel launches ``lane_count()`` threads for each group, in blocks of ``BLOCK_DIM`` threads.
 """
 
 import warp as wp
@@ -14,11 +14,11 @@ WARP_COLUMNS, WARP_ROWS = 8, 4
 """Layout of the lanes of a group on CUDA."""
 
 BLOCK_DIM = 128
-"""Threads of a block for every kernel that uses the stage; the stage is sized by it."""
+"""Threads of a CUDA block in every kernel that uses the staging buffer, whose size depends on it."""
 
 
 def native(cuda: str, cpu: str) -> str:
-    """A native snippet that differs between CUDA and CPU."""
+    """A native snippet with separate code for CUDA and CPU."""
     return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
 
 
@@ -60,13 +60,13 @@ def lane_sum(x: float) -> float: ...
 
 @wp.func_native(native("return __popc(mask);", "return (int)mask;"))
 def lane_bit_count(mask: wp.uint32) -> int:
-    """How many bits of a ballot are set."""
+    """Number of bits that are set in a ballot."""
     ...
 
 
 @wp.func_native(native("return __popc(mask & ((1u << lane) - 1u));", "return 0;"))
 def lane_rank(mask: wp.uint32, lane: int) -> int:
-    """How many lanes below ``lane`` have their bit set in a ballot."""
+    """Number of lanes below ``lane`` whose bit is set in a ballot."""
     ...
 
 
@@ -78,7 +78,7 @@ def lane_lowest(mask: wp.uint32) -> int:
 
 @wp.func_native(native("return __shfl_sync(0xffffffffu, x, lane);", "return x;"))
 def lane_broadcast(x: int, lane: int) -> int:
-    """``x`` of one lane."""
+    """The value of ``x`` in lane ``lane``."""
     ...
 
 
@@ -104,8 +104,8 @@ def lane_sum_before(x: int, lane: int) -> int:
 def lane_sync(): ...
 
 
-# The stage: 32 slots of three vec4 for each of the four lane groups of a block, in shared memory. The address is
-# handed around as an integer because a shared array is only visible in the function that declares it.
+# The staging buffer: 32 slots of three vec4 for each of the four lane groups of a block, in shared memory. Its address
+# is passed around as an integer because a shared array is only visible in the function that declares it.
 @wp.func_native(
     native(
         "__shared__ float4 stage[4 * 32 * 3]; return (unsigned long long)(stage + (threadIdx.x >> 5) * 96);",
@@ -125,12 +125,12 @@ def stage_put(stage: wp.uint64, slot: int, part: int, value: wp.vec4): ...
     )
 )
 def stage_get(stage: wp.uint64, slot: int, part: int, own: wp.vec4) -> wp.vec4:
-    """What a lane put into ``slot``; on CPU, where there is one lane, its ``own`` value."""
+    """The value that a lane put into ``slot``; on CPU, with its single lane, ``own``."""
     ...
 
 
-# A lane's own pixels, of which the CPU's single lane has a whole tile: there the loop over them is cut to the span
-# that a Gaussian covers, while on CUDA the bounds are constants and the loop unrolls into registers.
+# Loops over a lane's own pixels: on CPU, where the single lane owns a whole tile, the loop is restricted to the span
+# that a Gaussian covers; on CUDA the bounds are constants, so that the loop unrolls into registers.
 @wp.func_native(native("return 0;", "return low <= 0.0f ? 0 : (low >= (float)size ? size : (int)ceilf(low));"))
 def span_begin(low: float, size: int) -> int:
     """First index of [0, size) that is at least ``low``; on CUDA always 0."""
@@ -147,9 +147,9 @@ def span_end(high: float, size: int) -> int:
 def exp2(x: float) -> float: ...
 
 
-# Sums of K values over 32 lanes at little more than one shuffle a value instead of five: at each of the five steps a
-# lane sends the half of its values that its partner keeps, so that each lane ends with K/32 totals. They lie side by
-# side: the totals [index, index + held).
+# Sums of K values over 32 lanes with little more than one shuffle per value instead of five: in each of the five steps
+# a lane sends the half of its values that its partner keeps, so that each lane ends with K/32 totals, which are
+# adjacent: the totals [index, index + held).
 def make_lane_add(length: int):
     """A vector type of ``length`` floats and a function ``lane_add(values, target, row)`` that adds the lane group's
     sum of each value to ``target[row]``, which is a row of contiguous floats."""

@@ -1,4 +1,4 @@
-"""EWA projection of 3D Gaussians to splats (Zwicker et al. 2001; 3DGS Eq. 5; paper Eq. 3), with its adjoint.
+"""EWA projection of 3D Gaussians to splats (Zwicker et al. 2001; 3DGS Eq. 5; paper Eq. 3) and its backward pass.
 
 With the camera's rotation W and translation, t = W mean + translation, depth z = t_z, u = t_x / z, v = t_y / z:
 
@@ -10,7 +10,7 @@ With the camera's rotation W and translation, t = W mean + translation, depth z 
 
 Σ itself is never formed: cov2d = B Bᵀ is positive semidefinite by construction.
 
-Adjoint: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
+Gradient: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
     v_a = -(A² v_A + A B v_B + B² v_C),  v_c = -(B² v_A + B C v_B + C² v_C),
     v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C)
 for the conic (A, B, C).
@@ -31,12 +31,12 @@ mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
 
 LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
 MAX_EXTENT = wp.constant(1.0e8)
-"""Half extent [px] past which a splat is culled: it must fit an int32, and float32 no longer tells its pixels apart."""
+"""Half extent [px] above which a splat is culled: it must fit an int32, and float32 does not resolve such pixels."""
 
 
 @wp.func
 def clamped_slope(slope: float, size: float, focal: float, center: float) -> float:
-    """x / z, kept within FIELD_OF_VIEW_MARGIN of the image, beyond which the local affine map means nothing."""
+    """x / z, clamped to FIELD_OF_VIEW_MARGIN around the image, beyond which the local affine approximation fails."""
     margin = FIELD_OF_VIEW_MARGIN * 0.5 * size / focal
     return wp.clamp(slope, -center / focal - margin, (size - center) / focal + margin)
 
@@ -184,11 +184,11 @@ def project_bwd(
     to_image = jacobian * rotation
     q = quats[i]
     s = scales[i]
-    turn = quaternion_to_rotation(q)
-    shape = turn * wp.diag(s)
+    orientation = quaternion_to_rotation(q)
+    shape = orientation * wp.diag(s)
     spread = to_image * shape
 
-    # What has no cotangent comes as an empty array.
+    # Outputs without a gradient have an empty array.
     conic = conics[i]
     v_conic = wp.vec3(0.0)
     if v_conics.shape[0] > 0:
@@ -211,12 +211,12 @@ def project_bwd(
         det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
         compensation = wp.sqrt(det_sharp / det)
         # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
-        # finite for needles and discs seen edge on, whose compensated opacity is below ALPHA_MIN long before.
+        # finite for needles and for discs seen edge-on, whose compensated opacity is far below ALPHA_MIN.
         factor = v_opacity * opacities[i] * 0.5 / (wp.max(compensation, 1.0e-6) * det)
-        kept = 1.0 - compensation * compensation
-        v_a += factor * (c_sharp * kept - LOW_PASS * compensation * compensation)
-        v_c += factor * (a_sharp * kept - LOW_PASS * compensation * compensation)
-        v_b -= factor * 2.0 * b * kept
+        remainder = 1.0 - compensation * compensation
+        v_a += factor * (c_sharp * remainder - LOW_PASS * compensation * compensation)
+        v_c += factor * (a_sharp * remainder - LOW_PASS * compensation * compensation)
+        v_b -= factor * 2.0 * b * remainder
         v_opacity = v_opacity * compensation
     v_opacities[i] = v_opacity
 
@@ -230,9 +230,9 @@ def project_bwd(
     )
     v_shape = wp.transpose(to_image) * v_spread
     v_scales[i] = wp.vec3(
-        turn[0, 0] * v_shape[0, 0] + turn[1, 0] * v_shape[1, 0] + turn[2, 0] * v_shape[2, 0],
-        turn[0, 1] * v_shape[0, 1] + turn[1, 1] * v_shape[1, 1] + turn[2, 1] * v_shape[2, 1],
-        turn[0, 2] * v_shape[0, 2] + turn[1, 2] * v_shape[1, 2] + turn[2, 2] * v_shape[2, 2],
+        orientation[0, 0] * v_shape[0, 0] + orientation[1, 0] * v_shape[1, 0] + orientation[2, 0] * v_shape[2, 0],
+        orientation[0, 1] * v_shape[0, 1] + orientation[1, 1] * v_shape[1, 1] + orientation[2, 1] * v_shape[2, 1],
+        orientation[0, 2] * v_shape[0, 2] + orientation[1, 2] * v_shape[1, 2] + orientation[2, 2] * v_shape[2, 2],
     )
     v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
 
@@ -240,7 +240,7 @@ def project_bwd(
     v_mean2d = wp.vec2(0.0)
     if v_means2d.shape[0] > 0:
         v_mean2d = v_means2d[i]
-    # Through the slopes: the centre uses t_x / z itself, the Jacobian its clamped value, constant where it is clamped.
+    # The centre depends on the slope t_x / z itself, the Jacobian on the clamped slope, constant where it is clamped.
     v_u = fx * v_mean2d[0]
     v_v = fy * v_mean2d[1]
     if u == slope_u:

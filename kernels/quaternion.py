@@ -1,8 +1,9 @@
-"""Rotation matrices of quaternions (w, x, y, z), which need not be normalised.
+"""Rotation matrices of quaternions (w, x, y, z), which are normalised here.
 
     R = [[1-2(y²+z²), 2(xy-wz), 2(xz+wy)], [2(xy+wz), 1-2(x²+z²), 2(yz-wx)], [2(xz-wy), 2(yz+wx), 1-2(x²+y²)]]
 
-of q / |q|. Gradient: v_q̂ from the derivatives of the nine entries, then v_q = (v_q̂ - q̂ (q̂ · v_q̂)) / |q|.
+for the components of q̂ = q / |q|. Gradient: v_q̂ from the derivatives of the nine entries, then
+v_q = (v_q̂ - q̂ (q̂ · v_q̂)) / |q|.
 """
 
 import warp as wp
@@ -10,7 +11,7 @@ import warp as wp
 
 @wp.func
 def quaternion_to_rotation(q: wp.vec4) -> wp.mat33:
-    """Rotation of q / |q|; the caller has made sure that q is not zero."""
+    """Rotation matrix of q / |q|; q must not be zero."""
     n = q / wp.length(q)
     w = n[0]
     x = n[1]
@@ -31,7 +32,7 @@ def quaternion_to_rotation(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quaternion_to_rotation_bwd(q: wp.vec4, v: wp.mat33) -> wp.vec4:
-    """Gradient of the quaternion, given the gradient ``v`` of its rotation matrix."""
+    """Gradient of the quaternion from the gradient ``v`` of its rotation matrix."""
     inverse_length = 1.0 / wp.length(q)
     n = q * inverse_length
     w = n[0]

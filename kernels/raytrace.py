@@ -1,17 +1,17 @@
-"""Ray tracing of a few simple bodies with soft shadows, for the built-in scene.
+"""Ray tracing of a few simple bodies with soft shadows, for the synthetic scene.
 
 A body is a unit shape in its own space, x_body = A x_world + b. A ray o + t d becomes (A o + b) + t (A d) there, with
-the same t. Unit shapes: the sphere |x| = 1; the cube max |x_i| = 1, seen from outside or from inside (a room); the
-torus around z, of radii 1 and TUBE, which is found by marching along its distance
+the same t. Unit shapes: the sphere |x| = 1; the cube max |x_i| = 1, seen from outside or from inside; the torus
+around z, of radii 1 and TUBE, which is intersected by sphere tracing of its distance function
 
     f(x) = |(|x_xy| − 1, x_z)| − TUBE
 
-in steps of f (A is a rotation and a scale then). A normal n_body turns into Aᵀ n_body. Shading is Lambert's and
-Blinn's, over a hemispherical ambient light.
+in steps of f (A must then be a rotation and a uniform scale). A normal n_body becomes Aᵀ n_body. Shading is Lambert's
+and Blinn's, with a hemispherical ambient light.
 
-Light comes from a parallelogram: every sample of a pixel looks at its own point of it, at (2u − 1, 2v − 1) half axes.
-Pixels share their samples, which would show as rings in soft shadows; so (u, v) is shifted, modulo 1, from pixel to
-pixel by interleaved gradient noise (Jimenez 2014), whose values differ as much as they can between neighbours:
+The light is a parallelogram: every sample of a pixel uses its own point of it, at (2u − 1, 2v − 1) half axes. All
+pixels use the same samples, which would show as rings in soft shadows; so (u, v) is shifted, modulo 1, by interleaved
+gradient noise (Jimenez 2014), whose values differ strongly between neighbouring pixels:
 
     noise(x, y) = frac(52.9829189 · frac(0.06711056 x + 0.00583715 y)).
 """
@@ -23,11 +23,11 @@ CUBE = wp.constant(1)
 TORUS = wp.constant(2)
 
 TUBE = wp.constant(0.3)
-MARCH_STEPS = wp.constant(160)
-MARCH_CLOSE = wp.constant(2.0e-4)
+MAX_TRACING_STEPS = wp.constant(160)
+HIT_DISTANCE = wp.constant(2.0e-4)
 FAR = wp.constant(1.0e6)
 SHADOW_OFFSET = wp.constant(1.0e-3)
-"""Start of shadow rays above their surface [world units], so that it does not shade itself."""
+"""Distance of the start of shadow rays from their surface [world units], so that it does not shadow itself."""
 
 AMBIENT_UP = wp.constant(0.42)
 AMBIENT_DOWN = wp.constant(0.24)
@@ -44,7 +44,7 @@ def torus_distance(p: wp.vec3) -> float:
 
 @wp.func
 def hit_sphere(o: wp.vec3, d: wp.vec3) -> float:
-    """Smallest t > 0 of a hit from outside, FAR without one; so for every shape."""
+    """Smallest t > 0 of a hit from outside, FAR without a hit, as for every shape."""
     a = wp.dot(d, d)
     b = wp.dot(o, d)
     root = b * b - a * (wp.dot(o, o) - 1.0)
@@ -79,7 +79,7 @@ def hit_cube(o: wp.vec3, d: wp.vec3) -> float:
 
 @wp.func
 def hit_torus(o: wp.vec3, d: wp.vec3) -> float:
-    # Only the part of the ray inside the ball around the torus is marched.
+    # Only the part of the ray inside the bounding sphere of the torus is traced.
     a = wp.dot(d, d)
     b = wp.dot(o, d)
     root = b * b - a * (wp.dot(o, o) - (1.0 + TUBE) * (1.0 + TUBE))
@@ -88,11 +88,11 @@ def hit_torus(o: wp.vec3, d: wp.vec3) -> float:
     t = wp.max((-b - wp.sqrt(root)) / a, 0.0)
     leave = (-b + wp.sqrt(root)) / a
     speed = wp.sqrt(a)
-    for _step in range(MARCH_STEPS):
+    for _step in range(MAX_TRACING_STEPS):
         if t > leave:
             return FAR
         distance = torus_distance(o + t * d)
-        if distance < MARCH_CLOSE:
+        if distance < HIT_DISTANCE:
             return t
         t += distance / speed
     return FAR
@@ -100,7 +100,7 @@ def hit_torus(o: wp.vec3, d: wp.vec3) -> float:
 
 @wp.func
 def into_body(bodies: wp.array3d[float], body: int, p: wp.vec3, w: float) -> wp.vec3:
-    """A p + w b of a body."""
+    """A p + w b for the transform (A, b) of a body."""
     x = bodies[body, 0, 0] * p[0] + bodies[body, 0, 1] * p[1] + bodies[body, 0, 2] * p[2] + bodies[body, 0, 3] * w
     y = bodies[body, 1, 0] * p[0] + bodies[body, 1, 1] * p[1] + bodies[body, 1, 2] * p[2] + bodies[body, 1, 3] * w
     z = bodies[body, 2, 0] * p[0] + bodies[body, 2, 1] * p[1] + bodies[body, 2, 2] * p[2] + bodies[body, 2, 3] * w
@@ -108,20 +108,20 @@ def into_body(bodies: wp.array3d[float], body: int, p: wp.vec3, w: float) -> wp.
 
 
 @wp.func
-def hit_body(kind: int, o: wp.vec3, d: wp.vec3) -> float:
-    if kind == SPHERE:
+def hit_body(shape: int, o: wp.vec3, d: wp.vec3) -> float:
+    if shape == SPHERE:
         return hit_sphere(o, d)
-    if kind == CUBE:
+    if shape == CUBE:
         return hit_cube(o, d)
     return hit_torus(o, d)
 
 
 @wp.func
-def body_normal(kind: int, p: wp.vec3) -> wp.vec3:
-    """Outward direction, of any length, at a point of a unit shape."""
-    if kind == SPHERE:
+def body_normal(shape: int, p: wp.vec3) -> wp.vec3:
+    """Outward normal, of any length, at a point of a unit shape."""
+    if shape == SPHERE:
         return p
-    if kind == CUBE:
+    if shape == CUBE:
         x = wp.abs(p[0])
         y = wp.abs(p[1])
         z = wp.abs(p[2])
@@ -135,8 +135,8 @@ def body_normal(kind: int, p: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def soft_checks(p: wp.vec3, frequency: float) -> float:
-    """Chequers in [0, 1] with soft borders, of unit wavelength over 1 / frequency."""
+def soft_checkerboard(p: wp.vec3, frequency: float) -> float:
+    """A checkerboard in [0, 1] with soft edges and the given angular frequency."""
     wave = wp.sin(frequency * p[0] + 0.4) * wp.sin(frequency * p[1] + 0.9) * wp.sin(frequency * p[2] + 1.3)
     return 0.5 + 0.5 * wave / (wp.abs(wave) + 0.06)
 
@@ -150,7 +150,7 @@ def noise(x: float, y: float) -> float:
 
 @wp.func
 def lamp_point(lamp: wp.array2d[float], u: float, v: float) -> wp.vec3:
-    """Point of the lamp at (u, v), of which the fractions count."""
+    """Point of the lamp at (u, v) modulo 1."""
     a = 2.0 * (u - wp.floor(u)) - 1.0
     b = 2.0 * (v - wp.floor(v)) - 1.0
     center = wp.vec3(lamp[0, 0], lamp[0, 1], lamp[0, 2])
@@ -158,12 +158,12 @@ def lamp_point(lamp: wp.array2d[float], u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def nearest_body(kinds: wp.array[int], bodies: wp.array3d[float], o: wp.vec3, d: wp.vec3):
+def nearest_body(shapes: wp.array[int], bodies: wp.array3d[float], o: wp.vec3, d: wp.vec3):
     """(t, body) of the first hit; (FAR, −1) without one."""
     nearest = float(FAR)
     body = int(-1)
-    for k in range(kinds.shape[0]):
-        t = hit_body(kinds[k], into_body(bodies, k, o, 1.0), into_body(bodies, k, d, 0.0))
+    for k in range(shapes.shape[0]):
+        t = hit_body(shapes[k], into_body(bodies, k, o, 1.0), into_body(bodies, k, d, 0.0))
         if t < nearest:
             nearest = t
             body = k
@@ -171,16 +171,16 @@ def nearest_body(kinds: wp.array[int], bodies: wp.array3d[float], o: wp.vec3, d:
 
 
 @wp.func
-def is_blocked(kinds: wp.array[int], bodies: wp.array3d[float], start: wp.vec3, to_light: wp.vec3) -> bool:
-    for k in range(kinds.shape[0]):
-        if hit_body(kinds[k], into_body(bodies, k, start, 1.0), into_body(bodies, k, to_light, 0.0)) < 1.0:
+def is_blocked(shapes: wp.array[int], bodies: wp.array3d[float], start: wp.vec3, to_light: wp.vec3) -> bool:
+    for k in range(shapes.shape[0]):
+        if hit_body(shapes[k], into_body(bodies, k, start, 1.0), into_body(bodies, k, to_light, 0.0)) < 1.0:
             return True
     return False
 
 
 @wp.func
 def world_normal(bodies: wp.array3d[float], body: int, n: wp.vec3) -> wp.vec3:
-    """Aᵀ n of a body, of length 1."""
+    """Aᵀ n for the transform (A, b) of a body, normalised."""
     x = bodies[body, 0, 0] * n[0] + bodies[body, 1, 0] * n[1] + bodies[body, 2, 0] * n[2]
     y = bodies[body, 0, 1] * n[0] + bodies[body, 1, 1] * n[1] + bodies[body, 2, 1] * n[2]
     z = bodies[body, 0, 2] * n[0] + bodies[body, 1, 2] * n[1] + bodies[body, 2, 2] * n[2]
@@ -189,7 +189,7 @@ def world_normal(bodies: wp.array3d[float], body: int, n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def shade(
-    kinds: wp.array[int],
+    shapes: wp.array[int],
     bodies: wp.array3d[float],
     colors: wp.array2d[wp.vec3],
     frequencies: wp.array[float],
@@ -200,26 +200,26 @@ def shade(
 ) -> wp.vec3:
     """Colour of a body's point, seen from the direction ``view`` and lit from ``source``."""
     local = into_body(bodies, body, point, 1.0)
-    normal = world_normal(bodies, body, body_normal(kinds[body], local))
+    normal = world_normal(bodies, body, body_normal(shapes[body], local))
     if wp.dot(normal, view) < 0.0:
-        normal = -normal  # a room is seen from inside
+        normal = -normal  # a cube may be seen from inside
     start = point + SHADOW_OFFSET * normal
     to_light = source - start
     light = wp.normalize(to_light)
-    lit = wp.max(wp.dot(normal, light), 0.0)
-    if lit > 0.0 and is_blocked(kinds, bodies, start, to_light):
-        lit = 0.0
-    checks = soft_checks(local, frequencies[body])
+    diffuse = wp.max(wp.dot(normal, light), 0.0)
+    if diffuse > 0.0 and is_blocked(shapes, bodies, start, to_light):
+        diffuse = 0.0
+    checks = soft_checkerboard(local, frequencies[body])
     color = checks * colors[body, 0] + (1.0 - checks) * colors[body, 1]
     ambient = AMBIENT_DOWN + (AMBIENT_UP - AMBIENT_DOWN) * (0.5 + 0.5 * normal[2])
     gloss = wp.pow(wp.max(wp.dot(normal, wp.normalize(light + view)), 0.0), GLOSS)
-    return (ambient + DIFFUSE * lit) * color + wp.vec3(SHINE * gloss * lit)
+    return (ambient + DIFFUSE * diffuse) * color + wp.vec3(SHINE * gloss * diffuse)
 
 
 @wp.kernel(enable_backward=False)
 def raytrace_fwd(
     first: int,
-    kinds: wp.array[int],
+    shapes: wp.array[int],
     bodies: wp.array3d[float],
     colors: wp.array2d[wp.vec3],
     frequencies: wp.array[float],
@@ -243,20 +243,20 @@ def raytrace_fwd(
     shift_v = noise(row, column)
     total = wp.vec3(0.0)
     num_samples = samples.shape[0]
-    # Sample −1 goes through the pixel's centre and gives depth and body; the others give the colour.
+    # Sample −1 passes through the pixel's centre and gives depth and body; the others give the colour.
     for index in range(-1, num_samples):
         sample = wp.vec4(0.5, 0.5, 0.0, 0.0)
         if index >= 0:
             sample = samples[index]
         u = (column + sample[0] - K[0, 2]) / K[0, 0]
         v = (row + sample[1] - K[1, 2]) / K[1, 1]
-        direction = right * u + down * v + forward  # so that t is the depth
-        t, body = nearest_body(kinds, bodies, origin, direction)
+        direction = right * u + down * v + forward  # so t is the depth
+        t, body = nearest_body(shapes, bodies, origin, direction)
         if index < 0:
             depth[pixel] = t
             hits[pixel] = body
         elif body >= 0:
             source = lamp_point(lamp, sample[2] + shift_u, sample[3] + shift_v)
             view = -wp.normalize(direction)
-            total += shade(kinds, bodies, colors, frequencies, body, origin + t * direction, view, source)
+            total += shade(shapes, bodies, colors, frequencies, body, origin + t * direction, view, source)
     image[pixel] = total / float(num_samples)

@@ -3,11 +3,11 @@
     [x, y, a, b], [c, log2 opacity, 0, 0], [feature 0..3], [feature 4..7] …
 
 with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so that
-log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is not drawn (culled, or with a value that is not
-finite) has log2 opacity NEVER_DRAWN.
+log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, or with a value that is not
+finite) has log2 opacity CULLED_LOG2_OPACITY.
 
-``unpack`` is the adjoint: the reverse walk leaves, per Gaussian, the gradients of its features and the moments of
-s = alpha v_alpha over its pixels, and
+``unpack`` is the backward pass: for each Gaussian, the backward pass of compositing leaves the gradients of its
+features and the moments of s = alpha v_alpha over its pixels, and
 
     v_mean2d  = -conic Σ s d,                v_opacity = Σ s / opacity,
     v_conic_xx = -½ Σ s dx²,  v_conic_xy = -Σ s dx dy,  v_conic_yy = -½ Σ s dy².
@@ -17,7 +17,7 @@ import functools
 
 import warp as wp
 
-from .constants import ALPHA_MIN, CULLED_DEPTH, LOG2_E, NEVER_DRAWN
+from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LOG2_E
 from .lanes import native
 
 GEOMETRY_PARTS = wp.constant(2)
@@ -30,7 +30,7 @@ NUM_ABSOLUTE = 2
 """Σ |s (conic d)_x| and Σ |s (conic d)_y|, the absolute-value variant of the gradient of the mean."""
 
 
-# Warp's vec4 is aligned to 4 bytes, so its loads and stores are four; rows are aligned to 16 and want one.
+# Warp's vec4 is aligned to 4 bytes, so a load or store takes four instructions; rows are aligned to 16: one is enough.
 @wp.func_native(
     native(
         "const float4 v = *(const float4*)&wp::index(rows, i, part); return wp::vec4(v.x, v.y, v.z, v.w);",
@@ -50,12 +50,12 @@ def row_store(rows: wp.array2d[wp.vec4], i: int, part: int, value: wp.vec4): ...
 
 
 def row_parts(num_channels: int) -> int:
-    """vec4 values in a row with ``num_channels`` features."""
+    """Number of vec4 values in a row with ``num_channels`` features."""
     return GEOMETRY_PARTS + (num_channels + 3) // 4
 
 
 def gradient_stride(num_channels: int) -> int:
-    """Floats in a Gaussian's gradient row: features, moments, absolute sums, padded to 16 bytes."""
+    """Number of floats in a Gaussian's gradient row: features, moments, absolute sums, padded to 16 bytes."""
     return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
 
 
@@ -72,9 +72,9 @@ def pack(
     gaussian_from_rank: wp.array[int],
     norms: wp.array[wp.vec2],
 ):
-    """Writes the geometry of the rows of splats, one thread each.
+    """Writes the geometry part of the rows, one thread for each splat.
 
-    It also writes what the depth sort starts from, a key and the splat's own index, and clears ``norms``.
+    It also writes the input of the depth sort, a key and the splat's own index, and sets ``norms`` to zero.
     """
     i = first + wp.tid()
     mean = means2d[i]
@@ -82,15 +82,15 @@ def pack(
     opacity = opacities[i]
     radius = radii[i]
     depth = depths[i]
-    # A sum is finite only where all of its terms are, and a comparison with NaN fails.
+    # A sum is finite only if all of its terms are, and a comparison with NaN fails.
     total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
-    drawn = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
-    drawn = drawn and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+    visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
+    visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
     key = CULLED_DEPTH
     row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
-    row1 = wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0)
-    if drawn and wp.isfinite(total):
-        key = wp.cast(depth, wp.int32)  # the bits of positive floats are in the order of the floats
+    row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
+    if visible and wp.isfinite(total):
+        key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
         row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
         row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
     row_store(rows, i, 0, row0)
@@ -102,9 +102,9 @@ def pack(
 
 @functools.cache
 def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the features of the rows, one thread each; depth, if wanted, is the channel after them.
+    """Kernel that writes the features of the rows, one thread for each splat; depth is an optional last channel.
 
-    A splat with a feature that is not finite is not drawn from then on.
+    A splat with a feature that is not finite is marked as culled.
     """
     num_channels = num_features + int(with_depth)
 
@@ -127,7 +127,7 @@ def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
             total += value[0] + value[1] + value[2] + value[3]
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
         if not wp.isfinite(total):
-            row_store(rows, i, 1, wp.vec4(1.0, NEVER_DRAWN, 0.0, 0.0))
+            row_store(rows, i, 1, wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0))
 
     return pack_features
 
@@ -137,10 +137,11 @@ sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE, dtype=float)
 
 @functools.cache
 def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that turns gradient rows into the gradients of what packing read, one thread each.
+    """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat.
 
-    ``gradients`` has one slice for each CPU shard; on CUDA there is one. ``norms`` gets the length of the gradient of
-    the mean and its absolute-value variant, both scaled per axis by ``half_width`` and ``half_height``.
+    ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``norms`` receives the length of
+    the gradient of the mean and of its absolute-value variant, both scaled per axis by ``half_width`` and
+    ``half_height``.
     """
     num_channels = num_features + int(with_depth)
 
@@ -175,7 +176,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
             for shard in range(gradients.shape[0]):
                 total += gradients[shard, i, wp.static(num_channels) + k]
             s[k] = total
-        if rows[i, 1][1] == NEVER_DRAWN:
+        if rows[i, 1][1] == CULLED_LOG2_OPACITY:
             v_means2d[i] = wp.vec2(0.0)
             v_conics[i] = wp.vec3(0.0)
             v_opacities[i] = 0.0

@@ -3,7 +3,7 @@
     colour = max(0, ½ + Σ_k Y_k(d) coefficient_k),   d = (mean - viewpoint) / |mean - viewpoint|
 
 Gradient: v_coefficient_k = Y_k(d) v, and through the direction v_d = Σ_k ∇Y_k(d) (coefficient_k · v),
-v_mean = (v_d - d (d · v_d)) / |mean - viewpoint|. Where max(0, ·) cuts, v is zero.
+v_mean = (v_d - d (d · v_d)) / |mean - viewpoint|. Where max(0, ·) clamps, v is zero.
 """
 
 import math
@@ -27,7 +27,7 @@ bases_vector = wp.types.vector(length=NUM_BASES, dtype=float)
 
 @wp.func
 def sh_bases(d: wp.vec3) -> bases_vector:
-    """Y_0 … Y_15 in direction d of length 1."""
+    """Y_0 … Y_15 for a direction d of length 1."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -56,7 +56,7 @@ def sh_bases(d: wp.vec3) -> bases_vector:
 
 @wp.func
 def sh_direction_bwd(d: wp.vec3, v: bases_vector) -> wp.vec3:
-    """Σ_k v_k ∇Y_k(d), the polynomials above taken as functions of all of space."""
+    """Σ_k v_k ∇Y_k(d), with the polynomials above extended to all of space."""
     x = d[0]
     y = d[1]
     z = d[2]
@@ -118,7 +118,7 @@ def sh_fwd(
         if wp.isfinite(color[0] + color[1] + color[2]):
             color = wp.max(color, wp.vec3(0.0))
         else:
-            color = wp.vec3(wp.nan)  # so that the Gaussian is left out as a whole instead of turning black
+            color = wp.vec3(wp.nan)  # so that the Gaussian is culled instead of turning black
     colors[i] = color
 
 

@@ -1,24 +1,25 @@
 """Structural similarity (Wang et al. 2004) as 3DGS uses it: 11×11 Gaussian window, σ = 1.5, zero padding, per channel;
-alone, or in one pass with the absolute difference that losses have beside it.
+alone, or in one pass with the absolute difference of the L1 loss.
 
 With x, y the two images (each times a mask, if there is one) and E[·] the windowed mean, μ_x = E[x], μ_y = E[y],
 σ_x² = E[x²] - μ_x², σ_xy = E[xy] - μ_x μ_y:
 
     SSIM = (2 μ_x μ_y + C1)(2 σ_xy + C2) / ((μ_x² + μ_y² + C1)(σ_x² + σ_y² + C2)),  C1 = 0.01², C2 = 0.03².
 
-What is written for each pixel and channel is, with three weights,
+With three weights, the kernel writes for each pixel and channel
 
     value = base + l1 |x - y| + similarity SSIM.
 
-Gradient with respect to x, with ∂ taken at fixed other moments and v the cotangent of the sum of all values:
+Gradient with respect to x, where each ∂ holds the other windowed means fixed and v is the gradient of the sum of all
+values:
 
     v_x = v (l1 sign(x - y) + similarity (E[∂SSIM/∂μ_x] + 2 x E[∂SSIM/∂E[x²]] + y E[∂SSIM/∂E[xy]])),
 
-for the window is symmetric. Where each pixel has a cotangent of its own, the three ∂ are multiplied by it beforehand.
+because the window is symmetric. If every pixel has its own gradient, the three ∂ are multiplied by it beforehand.
 
 The window is separable. One thread slides down a strip of one column and channel: it filters each new line
-horizontally and adds the result to the eleven lines that it reaches vertically, so a pixel costs 22 taps instead of
-121 and needs no shared memory. Images are [H, W, C], so neighbouring threads read neighbouring addresses.
+horizontally and adds the result to the eleven lines that it reaches vertically, so that a pixel costs 22 taps instead
+of 121 and no shared memory is needed. Images are [H, W, C], so neighbouring threads read neighbouring addresses.
 """
 
 import functools
@@ -26,15 +27,15 @@ import math
 
 import warp as wp
 
-from .absolute import slope_of_abs
+from .absolute import abs_derivative
 
 WINDOW = 11
 RADIUS = 5
 STRIP = 16
-"""Pixels of one column that a thread handles; the lines above and below it are filtered again."""
+"""Pixels of one column per thread; the lines above and below a strip are filtered once more."""
 
-STRIP_OF_SMALL = 4
-"""The same on CUDA in small images, which else have too few threads to keep a GPU busy."""
+SMALL_IMAGE_STRIP = 4
+"""As ``STRIP``, for small images on CUDA, which would otherwise have too few threads to keep a GPU busy."""
 
 C1 = wp.constant(0.01**2)
 C2 = wp.constant(0.03**2)
@@ -45,11 +46,11 @@ TAPS = wp.constant(window_vector(*[tap / sum(_TAPS) for tap in _TAPS]))
 
 
 @wp.func
-def advanced(pending: window_vector, value: float) -> window_vector:
-    """The vertical filter's eleven unfinished outputs after one more line; element 0 is finished by it.
+def shift_and_add(pending: window_vector, value: float) -> window_vector:
+    """The eleven pending outputs of the vertical filter after one more line, which completes element 0.
 
-    Element j belongs to the line j - RADIUS below the new one, where the new line has tap 2 RADIUS - j. Moving up and
-    adding are one multiply-add, so the ring costs nothing.
+    Element j belongs to the line j - RADIUS below the new one, where the new line has tap 2 RADIUS - j. Shifting and
+    adding are one multiply-add, so that no ring buffer is needed.
     """
     result = window_vector()
     for j in range(WINDOW - 1):
@@ -58,8 +59,8 @@ def advanced(pending: window_vector, value: float) -> window_vector:
     return result
 
 
-# Pixels outside the image read their nearest neighbour and are then set to zero: a load without a branch, so that a
-# window's loads are all in flight at once.
+# Pixels outside the image read their nearest neighbour and are then set to zero: without a branch, all loads of a
+# window can be in flight at once.
 @wp.func
 def sample(image: wp.array3d[float], mask: wp.array2d[wp.uint8], y: int, x: int, c: int) -> float:
     """A pixel; zero outside the image's columns."""
@@ -124,17 +125,17 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
                     sum_xx += tap * p * p
                     sum_yy += tap * q * q
                     sum_xy += tap * p * q
-            pending_x = advanced(pending_x, sum_x)
-            pending_y = advanced(pending_y, sum_y)
-            pending_xx = advanced(pending_xx, sum_xx)
-            pending_yy = advanced(pending_yy, sum_yy)
-            pending_xy = advanced(pending_xy, sum_xy)
+            pending_x = shift_and_add(pending_x, sum_x)
+            pending_y = shift_and_add(pending_y, sum_y)
+            pending_xx = shift_and_add(pending_xx, sum_xx)
+            pending_yy = shift_and_add(pending_yy, sum_yy)
+            pending_xy = shift_and_add(pending_xy, sum_xy)
             y = line - RADIUS
             if y >= top:
                 mu_x = pending_x[0]
                 mu_y = pending_y[0]
                 luminance = mu_x * mu_x + mu_y * mu_y + C1
-                # Rounding can leave a flat window's variance slightly negative; C2 keeps the quotient finite.
+                # Rounding can make the variance of a flat window slightly negative; C2 keeps the quotient finite.
                 contrast = pending_xx[0] - mu_x * mu_x + pending_yy[0] - mu_y * mu_y + C2
                 cross_luminance = 2.0 * mu_x * mu_y + C1
                 cross_contrast = 2.0 * (pending_xy[0] - mu_x * mu_y) + C2
@@ -172,7 +173,7 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
         v_sum: wp.array[float],
         v_image: wp.array3d[float],
     ):
-        """``v_sum`` [1]: cotangent of the sum of all values."""
+        """``v_sum`` [1]: gradient of the sum of all values."""
         thread = first + wp.tid()
         height = image.shape[0]
         width = image.shape[1]
@@ -196,15 +197,15 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
                     sum_mean += tap * partials[0, line, column, c]
                     sum_square += tap * partials[1, line, column, c]
                     sum_cross += tap * partials[2, line, column, c]
-            pending_mean = advanced(pending_mean, sum_mean)
-            pending_square = advanced(pending_square, sum_square)
-            pending_cross = advanced(pending_cross, sum_cross)
+            pending_mean = shift_and_add(pending_mean, sum_mean)
+            pending_square = shift_and_add(pending_square, sum_square)
+            pending_cross = shift_and_add(pending_cross, sum_cross)
             y = line - RADIUS
             if y >= top:
                 p = pixel(image, mask, y, x, c)
                 q = pixel(target, mask, y, x, c)
-                steepness = pending_mean[0] + 2.0 * p * pending_square[0] + q * pending_cross[0]
-                value = v_sum[0] * (l1 * slope_of_abs(p - q) + similarity * steepness)
+                slope = pending_mean[0] + 2.0 * p * pending_square[0] + q * pending_cross[0]
+                value = v_sum[0] * (l1 * abs_derivative(p - q) + similarity * slope)
                 if wp.static(with_mask):
                     if mask[y, x] == wp.uint8(0):
                         value = 0.0

@@ -1,50 +1,50 @@
-"""Tile binning: which Gaussians each tile has to look at, front to back.
+"""Tile binning: the list of Gaussians that each tile composites, front to back.
 
 Gaussians are sorted by depth once (N keys of 32 bits); in that order each writes one intersection per tile that its
-ellipse really meets; a stable sort by tile index (M keys, only the bits that a tile index needs) then leaves every
-tile's intersections in depth order.
+ellipse exactly intersects; a stable sort by tile index (M keys, only the bits that a tile index needs) then leaves the
+intersections of every tile in depth order.
 
-The buffers hold ``capacity`` intersections. The true number M is only known on the device, so nothing waits for it:
-intersections that do not exist have the tile index ``num_tiles`` and sort to the end, and when M > capacity every
-tile looks at all Gaussians in depth order instead, which is slow but draws the same image. M is written to ``demand``
-in host memory, from where the next call sizes its buffers.
+The buffers hold ``capacity`` intersections. The actual number M is only known on the device, and the host does not wait
+for it: unused intersections have the tile index ``num_tiles`` and are sorted to the end, and if M > capacity every tile
+composites all Gaussians in depth order instead, which is slower but gives the same image. M is written to ``demand`` in
+host memory, which the next call reads to size its buffers.
 
-For images of one branch alone, intersections say of which branch their Gaussian is, and ``split_tiles`` makes two lists
-of each tile's.
+For images of one branch alone, an intersection stores the branch of its Gaussian, and ``split_tiles`` splits the list
+of each tile into two.
 """
 
 import warp as wp
 
-from .constants import LOG2_ALPHA_MIN, NEVER_DRAWN, TILE_SIZE
+from .constants import CULLED_LOG2_OPACITY, LOG2_ALPHA_MIN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
 from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
 from .rows import row_load
 
 SLACK = wp.constant(0.01)
-"""Pixels by which spans are widened, well above what float32 can lose at 8K, so that no intersection is missed."""
+"""Spans are widened by this [px], well above the rounding error of float32 at 8K, so that no intersection is missed."""
 
 
 MANY_TILES = wp.constant(24)
-"""Intersections above which a Gaussian's are written by a whole lane group instead of one thread."""
+"""A Gaussian with more intersections than this is written by a whole lane group instead of one thread."""
 
 
 DYNAMIC = wp.constant(1 << 30)
-"""Bit of an intersection whose Gaussian is dynamic, where there are branches; the others are the Gaussian's index. To
-look the branch up for every intersection would be to read all over memory."""
+"""With branches, this bit of an intersection is set if its Gaussian is dynamic; the other bits are the Gaussian's
+index. Looking the branch up for every intersection would read scattered memory."""
 
 MAX_WITH_BRANCHES = 1 << 29
-"""Gaussians that there must be fewer of with branches: a place in a list shares an int with two bits."""
+"""With branches, the number of Gaussians must be below this: a list position shares an int with two other bits."""
 
 
-LOOKS = wp.constant(4)
-"""Intersections that a lane looks at in one go when tiles are split: they are on their way together."""
+BATCH_SIZE = wp.constant(4)
+"""Intersections that a lane loads at once when tiles are split, so that the loads overlap."""
 
-Looks = wp.types.vector(length=LOOKS, dtype=int)
+Batch = wp.types.vector(length=BATCH_SIZE, dtype=int)
 
 
 @wp.func
 def make_isect(g: int, is_dynamic: wp.array[wp.uint8]) -> int:
-    """What stands for a Gaussian in its intersections; without branches it is its index."""
+    """The int that represents a Gaussian in its intersections; without branches it is its index."""
     isect = g
     if is_dynamic.shape[0] > 0:
         isect = g | (int(is_dynamic[g] != wp.uint8(0)) * DYNAMIC)
@@ -53,15 +53,15 @@ def make_isect(g: int, is_dynamic: wp.array[wp.uint8]) -> int:
 
 @wp.func
 def tile_index(position: float, num_tiles: int) -> int:
-    """Tile of a pixel coordinate, clamped to one beyond the image on either side."""
+    """Tile of a pixel coordinate, clamped to at most one tile outside the image."""
     return int(wp.clamp(wp.floor(position / float(TILE_SIZE)), -1.0, float(num_tiles)))
 
 
 @wp.func
 def tile_rows(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tiles_y: int) -> wp.vec2i:
-    """First and one past the last row of tiles that hold a pixel centre of the ellipse's bounding box.
+    """First and one past the last row of tiles with a pixel centre in the ellipse's bounding box.
 
-    Tile k holds pixel centres from 16 k + 0.5 to 16 k + 15.5, so the box is narrowed by half a pixel on both sides.
+    Tile k has pixel centres from 16 k + 0.5 to 16 k + 15.5, so the box is shrunk by half a pixel on both sides.
     """
     low = tile_index(row0[1] - half_size[1] + 0.5 - SLACK, tiles_y)
     high = tile_index(row0[1] + half_size[1] - 0.5 + SLACK, tiles_y)
@@ -70,7 +70,7 @@ def tile_rows(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tiles_y: int) ->
 
 @wp.func
 def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, tiles_x: int) -> wp.vec2i:
-    """First and one past the last tile that the ellipse meets in one row of tiles."""
+    """First and one past the last tile that the ellipse intersects in one row of tiles."""
     top = float(tile_y * TILE_SIZE) + 0.5 - row0[1]
     slab = ellipse_slab(
         row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN, half_size, top - SLACK, top + float(TILE_SIZE - 1) + SLACK
@@ -94,7 +94,7 @@ def count_tiles(
     count = int(0)
     row0 = row_load(rows, g, 0)
     row1 = row_load(rows, g, 1)
-    if row1[1] != NEVER_DRAWN:
+    if row1[1] != CULLED_LOG2_OPACITY:
         half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
         span_y = tile_rows(row0, row1, half_size, tiles_y)
         for y in range(span_y[0], span_y[1]):
@@ -130,7 +130,7 @@ def emit_isects(
     isect = int(0)
     end = int(0)
     g = int(0)
-    gaussian = int(0)  # as it stands in intersections
+    gaussian = int(0)  # see make_isect
     if thread < num_gaussians:
         g = gaussian_from_rank[thread]
         gaussian = make_isect(g, is_dynamic)
@@ -146,7 +146,7 @@ def emit_isects(
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             for x in range(span_x[0], span_x[1]):
-                # The count came from another kernel, whose rounding may differ: never write past it.
+                # The count is from another kernel, whose rounding may differ: never write past it.
                 if isect < end:
                     tile_from_isect[isect] = y * tiles_x + x
                     gaussian_from_isect[isect] = gaussian
@@ -155,8 +155,8 @@ def emit_isects(
             tile_from_isect[isect] = tiles_x * tiles_y
             gaussian_from_isect[isect] = gaussian
             isect += 1
-    # Gaussians with many tiles are written by the whole lane group, one after the other: a thread on its own would
-    # keep everyone waiting for the few that cover the image.
+    # Gaussians with many tiles are written by the whole lane group, one after the other: with a single thread, the
+    # whole launch would wait for the few Gaussians that cover the image.
     ballot = lane_ballot(many)
     while ballot != wp.uint32(0):
         writer = lane_lowest(ballot)
@@ -204,7 +204,7 @@ def tile_ranges(
     gaussian_from_isect: wp.array[int],
     ranges: wp.array2d[int],
 ):
-    """Runs ``max(capacity, num_tiles) + 1`` threads over the sorted intersections."""
+    """Launched with ``max(capacity, num_tiles) + 1`` threads over the sorted intersections."""
     thread = first + wp.tid()
     if end_of_rank[num_gaussians - 1] > wp.int64(capacity):
         if thread < num_gaussians:
@@ -221,7 +221,7 @@ def tile_ranges(
         before = tile_from_isect[thread - 1]
     if thread < capacity:
         here = tile_from_isect[thread]
-    # A tile's range begins where the tile index first reaches it, which for empty tiles is where the next one begins.
+    # A tile's range begins where the tile index first reaches it; for an empty tile, that is where the next one begins.
     for tile in range(before, here):
         if tile >= 0:
             ranges[tile, 1] = thread
@@ -239,9 +239,9 @@ def split_tiles(
 ):
     """Splits each tile's list by branch, ``lane_count()`` threads for each tile.
 
-    In the second half of ``gaussian_from_isect``, which begins at ``half`` and where a tile has as much room as in the
-    first, its static Gaussians follow each other from the begin of that room on, its dynamic ones from its end back,
-    both front to back. ``lengths`` says how many there are of each.
+    The second half of ``gaussian_from_isect`` begins at ``half`` and has the same ranges as the first. The static
+    Gaussians of a tile are stored from the begin of its range upwards, the dynamic ones from its end downwards, both
+    front to back. ``lengths`` is the number of each.
     """
     thread = first + wp.tid()
     lane = thread % lane_count()
@@ -252,11 +252,11 @@ def split_tiles(
     num_dynamic = int(0)
     base = begin + lane
     while base - lane < end:
-        isects = Looks(-1)
-        for k in range(LOOKS):
+        isects = Batch(-1)
+        for k in range(BATCH_SIZE):
             if base + k * lane_count() < end:
                 isects[k] = gaussian_from_isect[base + k * lane_count()]
-        for k in range(LOOKS):
+        for k in range(BATCH_SIZE):
             g = isects[k] & ~DYNAMIC
             is_static = isects[k] == g
             is_dynamic = isects[k] >= 0 and not is_static
@@ -268,7 +268,7 @@ def split_tiles(
                 gaussian_from_isect[half + end - 1 - num_dynamic - lane_rank(dynamic_ballot, lane)] = g
             num_static += lane_bit_count(static_ballot)
             num_dynamic += lane_bit_count(dynamic_ballot)
-        base += LOOKS * lane_count()
+        base += BATCH_SIZE * lane_count()
     if lane == 0:
         lengths[tile, 0] = num_static
         lengths[tile, 1] = num_dynamic

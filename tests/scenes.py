@@ -1,4 +1,4 @@
-"""Small random scenes away from every cut-off, and how results are compared."""
+"""Small random scenes away from all cut-offs, and comparisons of results."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ def generator(seed: int = 3) -> torch.Generator:
 
 
 def make_camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
-    """Turned and moved, with two focal lengths and a principal point off the middle."""
+    """Rotated and shifted, with two focal lengths and an off-centre principal point."""
     turn = torch.tensor(0.2)
     viewmat = torch.eye(4)
     viewmat[0, 0] = viewmat[2, 2] = torch.cos(turn)
@@ -29,7 +29,7 @@ def make_camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
 
 
 def make_splats(num: int = 60, seed: int = 3, channels: int | None = None, degree: int = 3) -> Splats:
-    """With harmonics of a degree or, if a number of channels is given, with plain colours."""
+    """Random splats with spherical harmonics or, if ``channels`` is given, with colours."""
     g = generator(seed)
     corner, size = torch.tensor([-2.0, -1.5, 1.5]), torch.tensor([4.0, 3.0, 4.0])
     means = torch.rand(num, 3, generator=g) * size + corner
@@ -51,13 +51,13 @@ def float_tensors(splats: Splats) -> dict[str, Tensor]:
 
 
 def as_leaves(splats: Splats) -> Splats:
-    """A copy whose tensors want gradients."""
+    """A copy whose tensors require gradients."""
     leaves = {name: t.detach().clone().requires_grad_() for name, t in float_tensors(splats).items()}
     return dataclasses.replace(splats, **leaves)
 
 
 def as_doubles(splats: Splats) -> dict[str, Tensor]:
-    """Double precision copies that want gradients, as the reference takes them."""
+    """Copies in double precision that require gradients, for the reference."""
     return {name: t.detach().double().requires_grad_() for name, t in float_tensors(splats).items()}
 
 
@@ -65,31 +65,31 @@ def gradients(splats: Splats) -> dict[str, Tensor]:
     return {name: t.grad for name, t in float_tensors(splats).items()}
 
 
-def chosen(splats: Splats, index: Tensor) -> Splats:
-    """The Gaussians of an index or mask."""
+def select(splats: Splats, index: Tensor) -> Splats:
+    """The Gaussians at an index or mask."""
     named = {name: getattr(splats, name) for name in Splats.tensor_names()}
     return dataclasses.replace(splats, **{name: t[index].contiguous() for name, t in named.items() if t is not None})
 
 
 def random_like(tensors: Iterable[Tensor], seed: int = 11) -> list[Tensor]:
-    """A random cotangent for each tensor."""
+    """A random tensor of the same shape for each tensor, such as a gradient of an output."""
     g = generator(seed)
     return [torch.randn(t.shape, generator=g) for t in tensors]
 
 
-def pulled(values: Iterable[Tensor], cotangents: Iterable[Tensor]) -> Tensor:
-    """The scalar whose gradient is the cotangents pulled back."""
-    return sum((v * c).sum() for v, c in zip(values, cotangents, strict=True))
+def weighted_sum(values: Iterable[Tensor], weights: Iterable[Tensor]) -> Tensor:
+    """Σ value · weight, the scalar whose gradient with respect to the values is the weights."""
+    return sum((v * w).sum() for v, w in zip(values, weights, strict=True))
 
 
 def error(actual: Tensor, expected: Tensor) -> float:
-    """Largest absolute difference."""
+    """Maximum absolute difference."""
     assert actual.shape == expected.shape
     return (actual - expected).abs().max().item()
 
 
 def relative_error(actual: Tensor, expected: Tensor) -> float:
-    """Length of the difference relative to the length of what is expected, which must not be zero."""
+    """Norm of the difference relative to the norm of the expected tensor, which must not be zero."""
     assert actual.shape == expected.shape
     assert expected.norm() > 0
     return ((actual - expected).norm() / expected.norm()).item()

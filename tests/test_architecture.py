@@ -1,4 +1,4 @@
-"""The rules that keep the packages apart, read from the sources."""
+"""Rules of the architecture, checked on the sources."""
 
 import ast
 from pathlib import Path
@@ -27,7 +27,7 @@ ORDER = [
     "bench export viewer report",
     "cli",
 ]
-"""The rooms of the package: each may import from its own line and from those above it."""
+"""The layers of the package: each may import from its own line and from those above it."""
 
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 40
@@ -57,26 +57,26 @@ def imports(path: Path) -> list[str]:
     return names
 
 
-def group(parts: list[str]) -> int | None:
+def layer(parts: list[str]) -> int | None:
     if len(parts) < 2:
         return None
     return next((k for k, names in enumerate(ORDER) if parts[1] in names.split()), None)
 
 
-def test_every_module_has_its_room_in_the_order():
+def test_every_module_belongs_to_a_layer():
     assert FILES
     assert [
-        str(p) for p in FILES if p.name not in ("__init__.py", "__main__.py") and group(module_name(p)) is None
+        str(p) for p in FILES if p.name not in ("__init__.py", "__main__.py") and layer(module_name(p)) is None
     ] == []
 
 
 @PATHS
-def test_a_module_imports_only_from_its_left(path):
-    own = group(module_name(path))
+def test_a_module_imports_only_from_its_layer_and_lower_ones(path):
+    own = layer(module_name(path))
     for name in imports(path):
         parts = name.split(".")
         if parts[0] == "warpgs" and own is not None:
-            found = group(parts)
+            found = layer(parts)
             assert found is not None, name
             assert found <= own, name
 
@@ -118,11 +118,18 @@ def defines_kernels(path: Path) -> bool:
     return any(name.startswith("wp.kernel") for name in decorators)
 
 
-def test_every_file_of_kernels_has_an_op_of_the_same_name():
-    kernels = [p for p in (ROOT / "kernels").glob("*.py") if defines_kernels(p)]
-    ops = {p.stem for p in (ROOT / "warpgs" / "ops").glob("*.py")}
-    assert len(kernels) > 5
-    assert {p.stem.removesuffix("_fwd").removesuffix("_bwd") for p in kernels} <= ops
+KERNEL_FILES = [p for p in (ROOT / "kernels").glob("*.py") if defines_kernels(p)]
+OPS = sorted({p.stem.removesuffix("_fwd").removesuffix("_bwd") for p in KERNEL_FILES})
+
+
+def test_there_are_kernels():
+    assert len(OPS) > 5
+
+
+@pytest.mark.parametrize("name", OPS)
+def test_every_file_of_kernels_has_an_op_a_reference_and_a_test(name):
+    for path in ("warpgs/ops/{}.py", "tests/reference/{}.py", "tests/ops/test_{}.py"):
+        assert (ROOT / path.format(name)).is_file(), path.format(name)
 
 
 @pytest.mark.parametrize("path", [p for p in FILES if "warpgs" in p.relative_to(ROOT).parts], ids=lambda p: p.stem)

@@ -1,4 +1,4 @@
-"""How a render behaves as a node of torch's autograd: twice, changed in place, freed."""
+"""A render as an autograd node: repeated backward passes, in-place changes, freed memory."""
 
 import gc
 import weakref
@@ -8,7 +8,7 @@ import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs.config import RenderSettings
-from warpgs.ops.projection import project
+from warpgs.ops.projection import Geometry, View, project
 from warpgs.ops.sh import spherical_harmonics
 from warpgs.rendering import render
 from warpgs.runtime import tape
@@ -16,7 +16,7 @@ from warpgs.runtime import tape
 CAMERA = make_camera()
 
 
-def test_going_back_twice_gives_the_same_gradients():
+def test_two_backward_passes_give_the_same_gradients():
     splats = as_leaves(make_splats())
     loss = render(splats, CAMERA).joint.image.square().sum()
     tensors = list(float_tensors(splats).values())
@@ -26,7 +26,7 @@ def test_going_back_twice_gives_the_same_gradients():
         assert torch.equal(a, b)
 
 
-def test_going_back_adds_to_gradients_that_are_there():
+def test_a_backward_pass_adds_to_existing_gradients():
     splats = as_leaves(make_splats())
     loss = render(splats, CAMERA).joint.image.square().sum()
     loss.backward(retain_graph=True)
@@ -37,7 +37,7 @@ def test_going_back_adds_to_gradients_that_are_there():
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])
-def test_a_parameter_changed_in_place_before_going_back_is_an_error(name):
+def test_a_parameter_changed_in_place_before_the_backward_pass_is_an_error(name):
     splats = as_leaves(make_splats())
     loss = render(splats, CAMERA).joint.image.sum()
     with torch.no_grad():
@@ -52,7 +52,7 @@ def render_layers(splats, background):
 
 
 @pytest.mark.parametrize("name", ["radii", "depth", "alpha"])
-def test_an_output_that_the_way_back_reads_may_not_be_changed_before(name):
+def test_an_output_that_the_backward_pass_reads_must_not_be_changed_before(name):
     splats, background = as_leaves(make_splats()), torch.zeros(3, requires_grad=True)
     layers = render_layers(splats, background)
     loss = layers["image"].sum() + layers["depth"].sum()
@@ -63,7 +63,7 @@ def test_an_output_that_the_way_back_reads_may_not_be_changed_before(name):
 
 
 @pytest.mark.parametrize("name", ["image", "alpha"])
-def test_other_outputs_may_be_changed_and_gradients_know(name):
+def test_other_outputs_may_be_changed_and_gradients_are_correct(name):
     found = []
     for multiply in (torch.mul, torch.Tensor.mul_):
         splats = as_leaves(make_splats())
@@ -72,11 +72,11 @@ def test_other_outputs_may_be_changed_and_gradients_know(name):
     assert torch.equal(*found)
 
 
-def test_so_it_is_with_outputs_of_ops():
+def test_outputs_of_ops_that_backward_reads_must_not_be_changed():
     splats = as_leaves(make_splats())
-    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
+    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     for change in ("conics", "radii"):
-        projected = project(*geometry, CAMERA.viewmat, CAMERA.K, CAMERA.size)
+        projected = project(geometry, View(CAMERA.viewmat, CAMERA.K, *CAMERA.size))
         with torch.no_grad():
             getattr(projected, change).mul_(2)
         with pytest.raises(RuntimeError, match="modified by an inplace operation"):
@@ -86,7 +86,7 @@ def test_so_it_is_with_outputs_of_ops():
         colors.clamp_(max=0.5).sum().backward()
 
 
-def test_gradients_go_on_to_what_the_parameters_came_from():
+def test_gradients_continue_to_the_inputs_of_the_parameters():
     splats = make_splats()
     raw = splats.scales.log().requires_grad_()
     leaf = as_leaves(splats)
@@ -97,24 +97,24 @@ def test_gradients_go_on_to_what_the_parameters_came_from():
 
 
 @pytest.fixture
-def runs(monkeypatch):
-    """Weak references to every run that is made, while nothing but reference counts frees memory."""
-    seen = []
-    make = tape.Run.__init__
+def contexts(monkeypatch):
+    """Weak references to every ``OpContext``, while only reference counts free memory."""
+    references = []
+    make = tape.OpContext.__init__
 
     def made(self, *args, **options):
-        seen.append(weakref.ref(self))
+        references.append(weakref.ref(self))
         make(self, *args, **options)
 
-    monkeypatch.setattr(tape.Run, "__init__", made)
+    monkeypatch.setattr(tape.OpContext, "__init__", made)
     gc.collect()
     gc.disable()
-    yield seen
+    yield references
     gc.enable()
 
 
 @pytest.mark.parametrize("backward", [False, True])
-def test_a_render_is_freed_with_its_images(runs, backward):
+def test_a_render_is_freed_with_its_images(contexts, backward):
     splats = as_leaves(make_splats())
     for _ in range(3):
         image = render(splats, CAMERA).joint.image
@@ -123,11 +123,11 @@ def test_a_render_is_freed_with_its_images(runs, backward):
         freed = weakref.ref(image)
         del image
         assert freed() is None
-    assert len(runs) == 3
-    assert [run() for run in runs] == [None] * 3
+    assert len(contexts) == 3
+    assert [reference() for reference in contexts] == [None] * 3
 
 
-def test_a_render_without_gradients_keeps_nothing(runs):
+def test_a_render_without_gradients_is_freed_at_once(contexts):
     with torch.no_grad():
         render(make_splats(), CAMERA)
-    assert [run() for run in runs] == [None]
+    assert [reference() for reference in contexts] == [None]

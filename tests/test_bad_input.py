@@ -1,11 +1,11 @@
-"""What nobody should pass: it is refused by name, or the image and all gradients stay finite."""
+"""Invalid input is refused by name, or the image and all gradients stay finite."""
 
 import dataclasses
 
 import pytest
 import torch
 
-from tests.scenes import GEOMETRY, as_leaves, chosen, float_tensors, gradients, make_camera, make_splats
+from tests.scenes import GEOMETRY, as_leaves, float_tensors, gradients, make_camera, make_splats, select
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
@@ -33,8 +33,8 @@ def odd(**values) -> Splats:
     return splats
 
 
-def drawn(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
-    """The image, after a look at it and at all gradients."""
+def render_image(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
+    """The image, after checking that it and all gradients are finite."""
     splats = as_leaves(splats)
     image = render(splats, camera, torch.full((3,), 0.2)).joint.image
     image.square().sum().backward()
@@ -63,7 +63,7 @@ def test_a_wrong_number_of_gaussians_is_refused_by_name(name):
         lambda t: t.tolist(),
         lambda t: t.numpy(),
     ],
-    ids=["axis more", "scalar", "double", "half", "int", "not contiguous", "list", "array"],
+    ids=["extra axis", "scalar", "double", "half", "int", "not contiguous", "list", "array"],
 )
 def test_a_tensor_that_does_not_fit_is_refused_by_name(name, spoil):
     with pytest.raises(ValueError, match=f"^{name} must"):
@@ -77,18 +77,18 @@ def test_a_wrong_width_is_refused_by_name(name):
 
 
 @pytest.mark.parametrize("bases", [0, 2, 15, 25])
-def test_harmonics_of_no_degree_are_refused(bases):
+def test_a_wrong_number_of_bases_is_refused(bases):
     with pytest.raises(ValueError, match="sh must have shape"):
         changed("sh", torch.ones(60, bases, 3))
 
 
 @pytest.mark.parametrize("degree", [-1, 4, 1.5])
-def test_a_degree_that_the_harmonics_do_not_hold_is_refused(degree):
+def test_a_degree_above_that_of_the_harmonics_is_refused(degree):
     with pytest.raises(ValueError, match="sh_degree"):
         changed("sh_degree", degree)
 
 
-def test_colours_and_harmonics_together_or_neither_are_refused():
+def test_both_or_neither_of_colours_and_harmonics_are_refused():
     with pytest.raises(ValueError, match="exactly one of colors and sh"):
         changed("colors", torch.ones(60, 3))
     with pytest.raises(ValueError, match="exactly one of colors and sh"):
@@ -132,7 +132,7 @@ def test_a_camera_matrix_that_does_not_fit_is_refused(name, shape):
 
 @pytest.mark.parametrize("name", ["width", "height"])
 @pytest.mark.parametrize("value", [-1, 32769, 12.0, True, None])
-def test_an_image_size_that_makes_no_sense_is_refused(name, value):
+def test_an_invalid_image_size_is_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} must be"):
         dataclasses.replace(CAMERA, **{name: value})
 
@@ -145,33 +145,33 @@ def test_images_of_two_sizes_are_not_compared():
 
 
 @pytest.mark.parametrize("size", [(0, 0), (0, 7), (7, 0), (1, 1)])
-def test_an_image_without_or_with_one_pixel_can_be_drawn(size):
-    assert drawn(make_splats(), make_camera(*size)).shape == (size[1], size[0], 3)
+def test_images_with_zero_or_one_pixel_can_be_rendered(size):
+    assert render_image(make_splats(), make_camera(*size)).shape == (size[1], size[0], 3)
 
 
 @pytest.mark.parametrize("num", [0, 1])
-def test_none_or_one_gaussian_can_be_drawn(num):
-    drawn(make_splats(num))
+def test_zero_or_one_gaussian_can_be_rendered(num):
+    render_image(make_splats(num))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("entry", ["one", "all"])
 @pytest.mark.parametrize("name", TENSORS)
-def test_a_gaussian_that_is_not_finite_leaves_the_image_as_if_it_were_not_there(name, entry, value):
+def test_a_gaussian_that_is_not_finite_leaves_the_image_unchanged(name, entry, value):
     splats = make_splats()
     tensor = getattr(splats, name).clone()
     (tensor if entry == "all" else tensor.view(60, -1)[:, 0])[ODD] = value
-    image = drawn(dataclasses.replace(splats, **{name: tensor}))
-    assert torch.equal(image, drawn(chosen(splats, ~ODD)))
+    image = render_image(dataclasses.replace(splats, **{name: tensor}))
+    assert torch.equal(image, render_image(select(splats, ~ODD)))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 @pytest.mark.parametrize("channel", [0, 2])
-def test_a_colour_that_is_not_finite_leaves_the_image_as_if_it_were_not_there(channel, value):
+def test_a_colour_that_is_not_finite_leaves_the_image_unchanged(channel, value):
     splats = make_splats(channels=3)
-    expected = drawn(chosen(splats, ~ODD))
+    expected = render_image(select(splats, ~ODD))
     splats.colors[ODD, channel] = value
-    assert torch.equal(drawn(splats), expected)
+    assert torch.equal(render_image(splats), expected)
 
 
 @pytest.mark.parametrize(
@@ -189,13 +189,13 @@ def test_a_colour_that_is_not_finite_leaves_the_image_as_if_it_were_not_there(ch
     ],
     ids=str,
 )
-def test_a_gaussian_that_cannot_be_drawn_leaves_the_image_as_if_it_were_not_there(values):
-    assert torch.equal(drawn(odd(**values)), drawn(chosen(make_splats(), ~ODD)))
+def test_an_invalid_gaussian_leaves_the_image_unchanged(values):
+    assert torch.equal(render_image(odd(**values)), render_image(select(make_splats(), ~ODD)))
 
 
-def test_a_gaussian_exactly_at_the_camera_is_not_drawn():
+def test_a_gaussian_exactly_at_the_camera_is_culled():
     center = -CAMERA.viewmat[:3, :3].T @ CAMERA.viewmat[:3, 3]
-    assert torch.equal(drawn(odd(means=center)), drawn(chosen(make_splats(), ~ODD)))
+    assert torch.equal(render_image(odd(means=center)), render_image(select(make_splats(), ~ODD)))
 
 
 @pytest.mark.parametrize(
@@ -237,6 +237,6 @@ def test_gaussians_that_cover_the_image_show_their_colour_everywhere():
 
 
 @pytest.mark.parametrize("name", ["viewmat", "K"])
-def test_a_camera_that_is_not_finite_draws_the_background(name):
+def test_a_camera_that_is_not_finite_renders_the_background(name):
     camera = dataclasses.replace(CAMERA, **{name: torch.full_like(getattr(CAMERA, name), float("nan"))})
-    assert torch.equal(drawn(make_splats(), camera), torch.full((37, 50, 3), 0.2))
+    assert torch.equal(render_image(make_splats(), camera), torch.full((37, 50, 3), 0.2))

@@ -1,4 +1,4 @@
-"""Numbers that training would stumble over later are refused at once, by name."""
+"""Numbers out of range are refused by name before training starts."""
 
 import dataclasses
 
@@ -45,14 +45,14 @@ def test_a_number_out_of_its_range_is_refused_by_name(name, value):
         scaled(changed(name, value))
 
 
-@pytest.mark.parametrize(("degree", "of_appearance"), [(4, 0), (1, 2)])
-def test_degrees_of_harmonics_that_do_not_fit_are_refused(degree, of_appearance):
+@pytest.mark.parametrize(("degree", "appearance_degree"), [(4, 0), (1, 2)])
+def test_inconsistent_sh_degrees_are_refused(degree, appearance_degree):
     config = changed("model.sh_degree", degree)
     with pytest.raises(ValueError, match=r"appearance_degree <= model\.sh_degree <= 3"):
-        validate(changed("model.appearance_degree", of_appearance, config))
+        validate(changed("model.appearance_degree", appearance_degree, config))
 
 
-def test_a_schedule_of_pretraining_alone_is_refused():
+def test_a_schedule_with_only_pretraining_is_refused():
     schedule = dataclasses.replace(TrainConfig().schedule, stage1=0, stage2=0)
     with pytest.raises(ValueError, match="nothing to train"):
         validate(dataclasses.replace(TrainConfig(), schedule=schedule))

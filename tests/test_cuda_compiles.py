@@ -1,4 +1,4 @@
-"""Every kernel compiles for CUDA, also on a machine without a GPU."""
+"""Every kernel compiles for CUDA, even on a machine without a GPU."""
 
 import importlib
 
@@ -10,7 +10,7 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
 from warpgs.kernels.rows import make_pack_features, make_unpack
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
-from warpgs.ops.compositing import CUDA_PIXELS, CUDA_PIXELS_OF_SMALL
+from warpgs.ops.compositing import CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS
 
 ARCH = 90
 
@@ -21,7 +21,7 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-MODULES = ["activation", "adam", "covariance", "depth_error", "projection", "raytrace", "relu", "rows", "sh", "tiles"]
+MODULES = ["activation", "adam", "covariance", "depth_error", "mlp", "projection", "raytrace", "rows", "sh", "tiles"]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -49,7 +49,7 @@ def test_ssim_compiles(make, with_mask, tmp_path):
 @pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])
 @pytest.mark.parametrize("flag", [False, True])
 @pytest.mark.parametrize("images", [1, 3])
-@pytest.mark.parametrize("pixels", [CUDA_PIXELS, CUDA_PIXELS_OF_SMALL])
+@pytest.mark.parametrize("pixels", [CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS])
 def test_compositing_compiles(make, flag, images, pixels, tmp_path):
     assert_compiles(make(3, flag, images, pixels, flag).module, tmp_path)
 

@@ -1,4 +1,4 @@
-"""A whole training of a small built-in scene on the CPU reaches the image quality that it should."""
+"""Training a small built-in scene on the CPU reaches the expected image quality."""
 
 import json
 import subprocess
@@ -26,11 +26,11 @@ def test_held_out_views_reach_21_db(metrics):
     assert metrics["psnr"] > 21.0
 
 
-def test_both_regions_are_learnt(metrics):
+def test_both_regions_are_learned(metrics):
     assert metrics["psnr_static"] > 22.0
     assert metrics["psnr_dynamic"] > 16.5
 
 
 def test_the_static_region_changes_with_time(metrics):
-    """Shadows move, so its appearance has to; without the appearance network flicker is 2e-4."""
+    """Shadows move; without the appearance network flicker is 2e-4."""
     assert metrics["flicker"] > 1e-3

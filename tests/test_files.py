@@ -1,8 +1,9 @@
-"""Files are whole or not there, and none is read that never ends."""
+"""Files are complete or absent, and only regular files of bounded size are read."""
 
 import errno
 import json
 import os
+import struct
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from warpgs.files import (
     partial_path,
+    read_array,
     read_bounded,
     remove_numbered,
     write_array,
@@ -42,12 +44,12 @@ def test_parts_are_written_one_after_the_other(path):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_folders_above_are_made(tmp_path):
+def test_parent_folders_are_created(tmp_path):
     write_text(tmp_path / "x" / "y" / "a.txt", "Tür")
     assert (tmp_path / "x" / "y" / "a.txt").read_bytes() == "Tür".encode()
 
 
-def test_a_file_that_can_not_be_written_leaves_the_old_one_and_is_named(path, monkeypatch):
+def test_a_failed_write_leaves_the_old_file_and_names_it(path, monkeypatch):
     monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match=rf"^{path} could not be written: No space left on device$"):
         write_text(path, "new")
@@ -63,27 +65,28 @@ def test_ctrl_c_leaves_the_old_file_and_nothing_else(path, monkeypatch):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_files_of_one_stem_are_written_in_different_places(tmp_path):
+def test_files_that_differ_in_their_suffix_have_different_partial_paths(tmp_path):
     assert partial_path(tmp_path / "a.png") != partial_path(tmp_path / "a.mp4")
 
 
-def test_a_file_below_a_file_is_named(path):
+def test_the_error_names_a_file_whose_parent_is_a_file(path):
     with pytest.raises(OSError, match=rf"^{path / 'b'} could not be written: "):
         write_text(path / "b", "new")
 
 
-def test_a_file_is_read_up_to_its_limit(path):
+def test_a_file_larger_than_the_maximum_is_refused(path):
     assert read_bounded(path, 3) == b"old"
     with pytest.raises(ValueError, match=rf"{path} has 3 bytes, more than the maximum of 2"):
         read_bounded(path, 2)
 
 
-@pytest.mark.parametrize("kind", ["folder", "missing", "device"])
-def test_only_regular_files_are_read(tmp_path, kind):
-    path = {"folder": tmp_path, "missing": tmp_path / "a", "device": tmp_path / "zero"}[kind]
+@pytest.mark.parametrize("read", [read_bounded, read_array])
+@pytest.mark.parametrize("case", ["folder", "missing", "device"])
+def test_only_regular_files_are_read(tmp_path, case, read):
+    path = {"folder": tmp_path, "missing": tmp_path / "a", "device": tmp_path / "zero"}[case]
     (tmp_path / "zero").symlink_to("/dev/zero")
     with pytest.raises(ValueError, match=rf"{path} is (not a file|missing)"):
-        read_bounded(path, 10)
+        read(path, 10)
 
 
 def test_numbered_files_are_removed_up_to_the_first_gap(tmp_path):
@@ -96,7 +99,7 @@ def test_numbered_files_are_removed_up_to_the_first_gap(tmp_path):
 WRITERS = [(write_png, np.zeros((4, 5, 3), np.uint8)), (write_json, {"a": 1}), (write_array, np.zeros(3))]
 
 
-def test_pictures_keep_their_colours_and_depths(tmp_path):
+def test_images_keep_their_channels_and_bit_depth(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
     grey = np.random.default_rng(0).integers(0, 65536, (4, 5), dtype=np.uint16)
     write_png(tmp_path / "deep/rgb.png", rgb)
@@ -113,7 +116,7 @@ def test_arrays_and_json_are_read_back(tmp_path):
 
 
 @pytest.mark.parametrize(("write", "values"), WRITERS)
-def test_a_full_disk_is_told_with_the_files_name(write, values, tmp_path):
+def test_a_full_disk_is_reported_with_the_name_of_the_file(write, values, tmp_path):
     partial_path(tmp_path / "file").symlink_to("/dev/full")
     with pytest.raises(OSError, match="file could not be written: No space left on device"):
         write(tmp_path / "file", values)
@@ -122,3 +125,46 @@ def test_a_full_disk_is_told_with_the_files_name(write, values, tmp_path):
 def test_numbers_that_are_not_finite_are_null_in_json(tmp_path):
     write_json(tmp_path / "a.json", {"a": [float("nan"), 1.0], "b": float("inf")})
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": None}
+
+
+def test_a_png_that_cannot_be_written_leaves_the_old_one(path, monkeypatch):
+    monkeypatch.setattr(os, "replace", full_disk)
+    with pytest.raises(OSError, match=rf"{path} could not be written: No space left on device$"):
+        write_png(path, np.zeros((4, 5, 3), np.uint8))
+    assert path.read_bytes() == b"old"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_array_is_read_with_its_type(tmp_path):
+    for dtype in (np.float16, np.float64, np.int32, np.uint8):
+        write_array(tmp_path / "a.npy", np.arange(6, dtype=dtype).reshape(2, 3))
+        values = read_array(tmp_path / "a.npy", 6)
+        assert (values.dtype, values.tolist()) == (dtype, [[0, 1, 2], [3, 4, 5]])
+
+
+def test_an_array_header_that_claims_more_than_the_file_holds_is_refused(tmp_path):
+    write_array(tmp_path / "p.npy", np.zeros((4, 3), np.float32))
+    data = (tmp_path / "p.npy").read_bytes().replace(b"(4, 3), }" + b" " * 9, b"(4000000000, 3), }")
+    (tmp_path / "p.npy").write_bytes(data)
+    with pytest.raises(ValueError, match=r"p\.npy is damaged"):
+        read_array(tmp_path / "p.npy", 10**12)
+
+
+def test_an_array_larger_than_the_maximum_is_refused(tmp_path):
+    write_array(tmp_path / "p.npy", np.zeros((4, 3)))
+    with pytest.raises(ValueError, match="has 12 numbers, more than the maximum of 11"):
+        read_array(tmp_path / "p.npy", 11)
+
+
+def test_an_array_of_objects_is_never_unpickled(tmp_path):
+    np.save(tmp_path / "p.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"not a \.npy file of numbers"):
+        read_array(tmp_path / "p.npy", 10)
+
+
+@pytest.mark.parametrize("header", [b"{", b"{'descr': '<f4', 'fortran_order': False, 'shape': (True,)}"])
+def test_a_damaged_array_header_is_refused(tmp_path, header):
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.ljust(117) + b"\n" + b"\0" * 64
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(ValueError, match="is damaged or not"):
+        read_array(tmp_path / "a.npy", 100)

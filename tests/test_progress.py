@@ -1,4 +1,4 @@
-"""Progress is for people: where nobody looks, nothing is drawn."""
+"""Progress bars are shown on terminals only."""
 
 import os
 import select
@@ -9,11 +9,11 @@ from warpgs import progress as module
 from warpgs.progress import progress
 
 
-def drawn_on_a_terminal(monkeypatch, **options):
-    """What a terminal is sent while two items are gone through."""
+def shown_on_a_terminal(monkeypatch, **options):
+    """The output on a terminal during an iteration over two items."""
     screen, end = os.openpty()
     monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(rich, "_console", None)  # the one that there is has seen no terminal
+    monkeypatch.setattr(rich, "_console", None)  # the existing console has detected that there is no terminal
     with open(end, "w") as stream, monkeypatch.context() as patch:
         patch.setattr(module.sys, "stdout", stream)
         list(progress([1, 2], "counting", **options))
@@ -22,18 +22,18 @@ def drawn_on_a_terminal(monkeypatch, **options):
     return sent
 
 
-def test_items_come_in_their_order():
+def test_items_keep_their_order():
     assert list(progress([3, 1, 2], "counting")) == [3, 1, 2]
 
 
-def test_a_terminal_shows_a_bar_under_its_label(monkeypatch):
-    assert "counting" in drawn_on_a_terminal(monkeypatch)
+def test_a_terminal_shows_a_bar_with_its_label(monkeypatch):
+    assert "counting" in shown_on_a_terminal(monkeypatch)
 
 
-def test_a_terminal_stays_empty_if_it_should_be_quiet(monkeypatch):
-    assert drawn_on_a_terminal(monkeypatch, quiet=True) == ""
+def test_quiet_shows_nothing_on_a_terminal(monkeypatch):
+    assert shown_on_a_terminal(monkeypatch, quiet=True) == ""
 
 
-def test_what_is_no_terminal_gets_neither_a_bar_nor_colours_nor_empty_lines(capsys):
+def test_nothing_is_written_if_stdout_is_not_a_terminal(capsys):
     list(progress([1, 2], "counting"))
     assert capsys.readouterr().out == ""

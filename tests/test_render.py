@@ -13,16 +13,16 @@ from tests.scenes import (
     WIDTH,
     as_doubles,
     as_leaves,
-    chosen,
     error,
     float_tensors,
     generator,
     gradients,
     make_camera,
     make_splats,
-    pulled,
     random_like,
     relative_error,
+    select,
+    weighted_sum,
 )
 from warpgs.config import RenderSettings
 from warpgs.rendering import render
@@ -43,13 +43,13 @@ def outputs(rendering):
 def reference_outputs(splats, behind, branches=True, antialias=False):
     masks = (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,)
     doubles = as_doubles(splats)
-    results = [reference(doubles, CAMERA, behind, drawn=mask, antialias=antialias) for mask in masks]
+    results = [reference(doubles, CAMERA, behind, selected=mask, antialias=antialias) for mask in masks]
     return doubles, [r[0] for r in results] + [r[1] for r in results], results[0][2]
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("channels", [None, 3])
-def test_images_statistics_and_gradients_are_those_of_the_reference(channels, antialias):
+def test_images_statistics_and_gradients_equal_the_reference(channels, antialias):
     splats = as_leaves(make_splats(channels=channels))
     behind, behind64 = background().requires_grad_(), background().double().requires_grad_()
     result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, antialias=antialias))
@@ -58,9 +58,9 @@ def test_images_statistics_and_gradients_are_those_of_the_reference(channels, an
         assert error(actual, wanted) < 2e-6
     assert relative_error(result.weights, weights.sum((1, 2))) < 2e-6
     assert torch.equal(result.contributed, weights.sum((1, 2)) > 0)
-    cotangents = random_like(expected)
-    pulled(outputs(result), cotangents).backward()
-    pulled(expected, cotangents).backward()
+    v_outputs = random_like(expected)
+    weighted_sum(outputs(result), v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
     for name, gradient in gradients(splats).items():
         assert relative_error(gradient, doubles[name].grad) < 1e-5, name
     assert relative_error(behind.grad, behind64.grad) < 1e-5
@@ -73,13 +73,13 @@ def test_each_image_may_have_its_own_background(depth):
     result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, depth=depth))
     doubles = as_doubles(splats)
     masks = (None, ~splats.is_dynamic, splats.is_dynamic)
-    drawn = [reference(doubles, CAMERA, b, drawn=m) for b, m in zip(behind64, masks, strict=True)]
-    expected = [d[0] for d in drawn] + [d[1] for d in drawn]
+    results = [reference(doubles, CAMERA, b, selected=m) for b, m in zip(behind64, masks, strict=True)]
+    expected = [r[0] for r in results] + [r[1] for r in results]
     for actual, wanted in zip(outputs(result), expected, strict=True):
         assert error(actual, wanted) < 2e-6
-    cotangents = random_like(expected)
-    pulled(outputs(result), cotangents).backward()
-    pulled(expected, cotangents).backward()
+    v_outputs = random_like(expected)
+    weighted_sum(outputs(result), v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
     for name, gradient in gradients(splats).items():
         assert relative_error(gradient, doubles[name].grad) < 1e-5, name
     assert relative_error(behind.grad, behind64.grad) < 1e-5
@@ -94,19 +94,19 @@ def test_the_joint_image_is_the_same_with_and_without_branches():
 
 
 def smooth_splats():
-    """So wide that each is drawn in every pixel, so faint that none is hidden: no cut-off makes the image jump."""
+    """Gaussians so wide that each contributes to every pixel, and so faint that no cut-off makes the image jump."""
     splats = make_splats(12)
     return dataclasses.replace(splats, scales=10 * splats.scales.clamp(min=0.2), opacities=0.1 + 0.3 * splats.opacities)
 
 
-def test_a_scene_without_cut_offs_draws_every_gaussian_in_every_pixel():
+def test_in_the_smooth_scene_every_gaussian_contributes_to_every_pixel():
     _, _, weights = reference_outputs(smooth_splats(), background().double())
     assert weights.min() > 1e-4
 
 
 @pytest.mark.parametrize("branches", [False, True])
 @pytest.mark.parametrize("name", [*GEOMETRY, "sh"])
-def test_gradients_predict_what_a_small_step_does(name, branches):
+def test_gradients_predict_the_effect_of_a_small_step(name, branches):
     """Central differences along the gradient; the step is small against the scene, large against float32."""
     splats = as_leaves(smooth_splats())
     settings = EVERYTHING if branches else None
@@ -126,21 +126,21 @@ def test_gradients_predict_what_a_small_step_does(name, branches):
 
 
 @pytest.mark.parametrize("channels", [1, 5])
-def test_any_number_of_channels_can_be_drawn(channels):
+def test_any_number_of_channels_can_be_rendered(channels):
     splats = as_leaves(make_splats(channels=channels))
     result = render(splats, CAMERA, background(channels))
     doubles, expected, _ = reference_outputs(splats, background(channels).double(), branches=False)
     assert error(result.joint.image, expected[0]) < 2e-6
-    cotangents = random_like(expected[:1])
-    pulled([result.joint.image], cotangents).backward()
-    pulled(expected[:1], cotangents).backward()
+    v_outputs = random_like(expected[:1])
+    weighted_sum([result.joint.image], v_outputs).backward()
+    weighted_sum(expected[:1], v_outputs).backward()
     for name, gradient in gradients(splats).items():
         assert relative_error(gradient, doubles[name].grad) < 1e-5, name
 
 
 @pytest.mark.parametrize("branches", [False, True])
-@pytest.mark.parametrize("arrives", [lambda k: True, lambda k: k % 2 == 0, lambda k: k % 2 == 1, lambda k: k == 0])
-def test_depth_is_the_mean_of_what_was_drawn_and_gradients_come_from_wherever_something_arrives(branches, arrives):
+@pytest.mark.parametrize("has_gradient", [lambda k: True, lambda k: k % 2 == 0, lambda k: k % 2 == 1, lambda k: k == 0])
+def test_depth_and_gradients_of_any_subset_of_outputs_equal_the_reference(branches, has_gradient):
     splats = as_leaves(make_splats(channels=3))
     rendering = render(splats, CAMERA, background(), RenderSettings(depth=True, branches=branches))
     plain = render(splats, CAMERA, background(), RenderSettings(branches=branches))
@@ -153,9 +153,9 @@ def test_depth_is_the_mean_of_what_was_drawn_and_gradients_come_from_wherever_so
     behind = torch.cat([background(), torch.zeros(1)]).double()
     actual, expected, smooth = [], [], []
     for mask in (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,):
-        drawn, alpha, _ = reference({**doubles, "colors": colors}, CAMERA, behind, drawn=mask)
-        expected += [drawn[..., :3], alpha, drawn[..., 3] / alpha.clamp_min(1e-6)]
-        smooth += [1.0, 1.0, alpha.detach()]  # depth is not where it is divided by an alpha near 0
+        image, alpha, _ = reference({**doubles, "colors": colors}, CAMERA, behind, selected=mask)
+        expected += [image[..., :3], alpha, image[..., 3] / alpha.clamp_min(1e-6)]
+        smooth += [1.0, 1.0, alpha.detach()]  # depth is not smooth where alpha is near 0
     for layer in (rendering.joint, rendering.static, rendering.dynamic)[: 3 if branches else 1]:
         assert not layer.depth[layer.alpha == 0].any()
         actual += [layer.image, layer.alpha, layer.depth]
@@ -164,8 +164,8 @@ def test_depth_is_the_mean_of_what_was_drawn_and_gradients_come_from_wherever_so
     weights = [(w * s).float() for w, s in zip(random_like(expected), smooth, strict=True)]
     for values in (actual, expected):
         torch.autograd.backward(
-            [v for k, v in enumerate(values) if arrives(k)],
-            [w.to(values[k].dtype) for k, w in enumerate(weights) if arrives(k)],
+            [v for k, v in enumerate(values) if has_gradient(k)],
+            [w.to(values[k].dtype) for k, w in enumerate(weights) if has_gradient(k)],
         )
     for name in (*GEOMETRY, "colors"):
         wanted = doubles[name].grad
@@ -176,7 +176,7 @@ def test_depth_is_the_mean_of_what_was_drawn_and_gradients_come_from_wherever_so
 
 
 @pytest.mark.parametrize("settings", [RenderSettings(absgrad=True), RenderSettings(absgrad=True, branches=True)])
-def test_gradient_norms_are_those_of_the_screen_space_means(settings, monkeypatch):
+def test_gradient_norms_equal_those_of_the_screen_space_means(settings, monkeypatch):
     splats = as_leaves(make_splats())
     kept = []
     project = reference_projection.project
@@ -191,9 +191,9 @@ def test_gradient_norms_are_those_of_the_screen_space_means(settings, monkeypatc
     result = render(splats, CAMERA, background(), settings)
     assert not result.gradient_norms.any()
     _, expected, _ = reference_outputs(splats, background().double(), branches=settings.branches)
-    cotangents = random_like(expected)
-    pulled(outputs(result), cotangents).backward()
-    pulled(expected, cotangents).backward()
+    v_outputs = random_like(expected)
+    weighted_sum(outputs(result), v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
     means2d_gradient = sum(m.grad for m in kept) * torch.tensor([WIDTH / 2, HEIGHT / 2])
     plain, absolute = result.gradient_norms.unbind(-1)
     assert relative_error(plain, means2d_gradient.norm(dim=-1)) < 1e-5
@@ -203,7 +203,7 @@ def test_gradient_norms_are_those_of_the_screen_space_means(settings, monkeypatc
 
 def test_the_order_of_the_gaussians_does_not_matter():
     splats, order = as_leaves(make_splats()), torch.randperm(60)
-    shuffled = as_leaves(chosen(splats, order))
+    shuffled = as_leaves(select(splats, order))
     images = [render(s, CAMERA).joint.image for s in (splats, shuffled)]
     assert torch.equal(*images)
     for image in images:
@@ -227,7 +227,7 @@ def test_culled_gaussians_leave_the_image_unchanged_and_get_zero_gradients():
     some = as_leaves(dataclasses.replace(splats, means=means))
     image = render(some, CAMERA).joint.image
     image.sum().backward()
-    assert torch.equal(image, render(chosen(splats, ~culled), CAMERA).joint.image)
+    assert torch.equal(image, render(select(splats, ~culled), CAMERA).joint.image)
     for gradient in gradients(some).values():
         assert not gradient[culled].any()
         assert gradient[~culled].any()
@@ -255,7 +255,7 @@ def test_splats_of_one_branch_leave_the_other_image_background(dynamic):
     assert torch.equal(other.image, background().expand(HEIGHT, WIDTH, 3))
 
 
-def test_statistics_keep_nothing_of_the_way_back():
+def test_statistics_do_not_require_gradients():
     rendering = render(as_leaves(make_splats()), CAMERA, background(), EVERYTHING)
     assert rendering.joint.image.requires_grad
     assert not rendering.gradient_norms.requires_grad
@@ -263,18 +263,18 @@ def test_statistics_keep_nothing_of_the_way_back():
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_near_plane_is_in_front(near):
+def test_a_near_plane_must_be_positive_and_finite(near):
     with pytest.raises(ValueError, match="near must be positive and finite"):
         RenderSettings(near=near)
 
 
-def test_branches_need_to_know_the_branch():
+def test_branches_require_is_dynamic():
     splats = dataclasses.replace(make_splats(), is_dynamic=None)
     with pytest.raises(ValueError, match="is_dynamic"):
         render(splats, CAMERA, settings=EVERYTHING)
 
 
-def test_rendering_without_gradients_draws_the_same():
+def test_rendering_without_gradients_gives_the_same_image():
     splats = as_leaves(make_splats())
     with torch.no_grad():
         plain = render(splats, CAMERA).joint.image

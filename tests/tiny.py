@@ -21,14 +21,15 @@ from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
+from warpgs.training.optimizer import GROUPS
 from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
 
 MODEL = ModelConfig(position_bands=2, time_bands=2, depth=2, width=8, skip=1, max_static_points=50, dynamic_points=20)
 
-# Pretraining is iterations 0 to 5, stage I 6 to 21 (growth after 9, 13 and 17, opacities reset after 14, pruned after
-# 11, 17 and 21, moving from 9 on), stage II 22 to 31.
+# Pretraining takes iterations 0 to 5, stage I 6 to 21 (densified after 9, 13 and 17, opacities reset after 14, pruned
+# after 11, 17 and 21, deformed from 9 on), stage II 22 to 31.
 SCHEDULE = Schedule(
     pretrain=6,
     stage1=16,
@@ -58,12 +59,12 @@ CONFIG = TrainConfig(
 
 @contextmanager
 def in_haste():
-    """Without the checks of annotations, and on one thread: both cost more than they bring in runs this small."""
-    threads, were_off = torch.get_num_threads(), jaxtyping.config.jaxtyping_disable
+    """Disables run-time type checks and threads: both cost more time than they save in runs this small."""
+    threads, disabled = torch.get_num_threads(), jaxtyping.config.jaxtyping_disable
     torch.set_num_threads(1)
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
-    jaxtyping.config.update("jaxtyping_disable", were_off)
+    jaxtyping.config.update("jaxtyping_disable", disabled)
     torch.set_num_threads(threads)
 
 
@@ -74,7 +75,7 @@ def quickly():
 
 
 def write(folder: Path) -> Path:
-    """The files of the capture."""
+    """Writes the capture; returns its folder."""
     return builtin_capture(folder, SCENE, quiet=True)
 
 
@@ -88,7 +89,7 @@ def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
 
 
 def finished(folder: Path) -> Path:
-    """A run that went through all stages; its capture is beside it."""
+    """Trains a run through all stages; its capture is in the same folder."""
     data = write(folder / "capture")
     config = dataclasses.replace(CONFIG, data=data, out=folder / "run")
     Run.create(folder / "run", config)
@@ -97,19 +98,24 @@ def finished(folder: Path) -> Path:
     return folder / "run"
 
 
-class StopWhen(Interrupt):
-    """Ctrl-C as soon as something is so."""
+def equal_rates(rate: float) -> dict[str, Tensor]:
+    """One learning rate for every parameter group."""
+    return {name: torch.tensor(rate) for name in GROUPS}
 
-    def __init__(self, is_so: Callable[[], bool]) -> None:
-        self._is_so = is_so
+
+class StopWhen(Interrupt):
+    """Requests a stop as soon as a condition holds."""
+
+    def __init__(self, condition: Callable[[], bool]) -> None:
+        self._condition = condition
 
     @property
-    def wanted(self) -> bool:
-        return self._is_so()
+    def requested(self) -> bool:
+        return self._condition()
 
 
 def state(run: Path) -> dict[str, Tensor]:
-    """All tensors of a run's newest checkpoint: parameters, moments, statistics."""
+    """All tensors of a run's newest checkpoint: parameters, optimizer state, statistics."""
     return checkpoint.load(checkpoint.list_checkpoints(run)[-1]).tensors
 
 
@@ -123,7 +129,7 @@ def edit_metadata(path: Path, change: Callable[[dict[str, Any]], object]) -> Non
 
 
 def differences(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:
-    """Names of the tensors that only one has, or that are not the same bit for bit."""
+    """Names of the tensors that only one has, or that are not bit-identical."""
     return sorted(n for n in a.keys() | b.keys() if n not in a or n not in b or bytes_of(a[n]) != bytes_of(b[n]))
 
 

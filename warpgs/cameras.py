@@ -12,13 +12,16 @@ from .runtime.checks import check_image_size, check_same_device, check_tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at one moment.
+    """A pinhole camera at one time.
 
     Attributes:
         viewmat: [4, 4] rigid world-to-camera transform, OpenCV axes (x right, y down, z forward).
         K: [3, 3] intrinsics [px], pixel centres at +0.5, principal point anywhere, no skew.
         width, height: Size of the image [px].
-        time: Moment in [0, 1].
+        time: Time in [0, 1].
+
+    Raises:
+        ValueError: On a wrong shape, dtype, device or size.
     """
 
     viewmat: Float[Tensor, "4 4"]
@@ -39,31 +42,34 @@ class Camera:
         return self.width, self.height
 
     def to(self, device: torch.device | str) -> "Camera":
+        """A copy on another device."""
         return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
 
     @property
     def position(self) -> Float[Tensor, "3"]:
-        """Centre of the camera in the world."""
+        """[3] centre of the camera in the world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def project(
         self, points: Float[Tensor, "P 3"]
     ) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
-        """Row and column of the pixel that each point falls on, its depth, and whether the camera sees that place.
+        """Projects points of the world to pixels.
 
-        Rows and columns of points outside are clamped into the image.
+        Returns:
+            Row and column of the pixel of each point, clamped to the image; its depth [scene units]; and whether it is
+            in front of the camera and inside the image.
         """
         viewed = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         depth = viewed[:, 2]
         pixels = (viewed @ self.K.T)[:, :2] / depth[:, None].clamp_min(1e-6)
         x, y = pixels.floor().unbind(1)
-        inside = (depth > 1e-6) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-        return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, inside
+        is_visible = (depth > 1e-6) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, is_visible
 
     def unproject(
         self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
     ) -> Float[Tensor, "P 3"]:
-        """Points in the world at a depth behind the centres of pixels."""
+        """[P, 3] points of the world at the centres of pixels, at a depth [scene units]."""
         pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(depth)], 1)
         viewed = (pixels @ torch.linalg.inv(self.K).T) * depth[:, None]
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
@@ -77,19 +83,25 @@ class Camera:
         size: tuple[int, int],
         time: float = 0.0,
     ) -> "Camera":
-        """A camera at ``position`` that sees ``target`` in the middle of an image of ``size`` (width, height).
+        """A camera that sees ``target`` in the middle of its image.
 
-        ``up`` points up in the world; ``focal`` is the focal length [px].
+        Args:
+            position: [3] centre of the camera in the world.
+            target: [3] point of the world.
+            up: [3] direction that is up in the image.
+            focal: Focal length [px].
+            size: (width, height) of the image [px].
+            time: Time in [0, 1].
 
         Raises:
-            ValueError: If the camera would look nowhere, or along ``up``.
+            ValueError: If ``position`` and ``target`` coincide, or the view direction is parallel to ``up``.
         """
         forward = torch.nn.functional.normalize(target - position, dim=0)
         sideways = torch.linalg.cross(forward, up)
         if not sideways.norm() > 1e-6 * up.norm():
             raise ValueError(
                 f"a camera at {position.tolist()} cannot look at {target.tolist()} with {up.tolist()} up: "
-                "there must be a way to go, and not along up"
+                "position and target coincide, or the view direction is parallel to up"
             )
         right = torch.nn.functional.normalize(sideways, dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])

@@ -9,10 +9,11 @@ import tyro
 
 from .bench.command import Bench
 from .config import TrainConfig
-from .errors import is_out_of_memory, one_line, out_of_memory
+from .data.command import Check
+from .errors import run_command
 from .evaluation.command import Eval
 from .export.command import Export
-from .prepare.command import Check, Prepare
+from .prepare.command import Prepare
 from .report.command import Report
 from .training import command as training
 from .video.command import Render
@@ -39,12 +40,6 @@ COMMANDS: dict[str, Callable[..., Command]] = {
 }
 """Every command but ``train``, whose defaults depend on its preset."""
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as in shells."""
-
-ADVICE = "free some, or ask for less: smaller images, fewer Gaussians; --device cpu where a GPU has too little"
-"""What to do without enough memory."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
@@ -58,17 +53,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command: Command = tyro.extras.subcommand_cli_from_dict(
         commands, prog="warpgs", description=__doc__, args=arguments
     )
-    try:
-        command.run()
-    except (ValueError, ImportError, OSError) as error:
-        print(f"warpgs: {one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("warpgs: stopped", file=sys.stderr)
-        return INTERRUPTED
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        print(f"warpgs: {out_of_memory(error)}; {ADVICE}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(command.run)

@@ -1,28 +1,57 @@
-"""Every default, in one place."""
+"""All options and their defaults. Imports neither torch nor NumPy, so that ``--help`` is fast."""
 
 import dataclasses
 import math
 import reprlib
+import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+MAX_VALUE = 10**15
+"""Maximum of every number that has no smaller one."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Range of a number in a config, as metadata of its type: ``depth: Annotated[int, Bounds(min=1)]``.
+
+    Numbers without this metadata have the default range.
+
+    Attributes:
+        min, max: Inclusive limits.
+        positive: Whether 0 is excluded as well.
+    """
+
+    min: int = 0
+    max: int = MAX_VALUE
+    positive: bool = False
+
+    def check(self, name: str, value: float) -> None:
+        """Raises ValueError, naming the option, if the value is out of range or not a number."""
+        if not value >= self.min:
+            raise ValueError(f"{name} must be a number of at least {self.min}, got {value}")
+        if value > self.max:
+            raise ValueError(f"{name} must be a number of at most {self.max}, got {reprlib.repr(value)}")
+        if self.positive and value == 0:
+            raise ValueError(f"{name} must be positive, got 0")
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """What a render computes besides the joint image.
+    """What a render computes in addition to the joint image.
 
     Attributes:
-        branches: Also the images of the static and of the dynamic Gaussians alone, from the same sorted lists.
-        depth: Also depth, as one more channel.
-        statistics: Also whether and how much each Gaussian contributed to the joint image.
-        absgrad: On the way back, also the absolute-value variant of the screen-space gradient norms, summed over the
-            pixels of all images.
-        antialias: Opacity compensation for the low-pass filter (Mip-Splatting).
+        branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
+        depth: Also render depth, as one more channel.
+        statistics: Also compute whether and how much each Gaussian contributed to the joint image.
+        absgrad: In the backward pass, also sum the absolute values of the screen-space gradients over the pixels of all
+            images (AbsGS).
+        antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
-        replay: On CUDA, the main thread's renders that are alike and small are replayed from CUDA graphs: the same
-            results with less waiting for Python, for the memory of a few renders. Recording one waits for the GPU, and
-            no other thread may wait for the whole GPU meanwhile (``ops/replay.py``).
+        replay: On CUDA, replay small renders of the main thread from CUDA graphs: the same results with less launch
+            overhead, at the memory of a few renders. Recording a graph synchronizes the GPU, and no other thread may
+            synchronize it meanwhile (``runtime/replay.py``).
     """
 
     branches: bool = False
@@ -40,32 +69,34 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Sizes of the two networks and of the first Gaussians."""
+    """Sizes of the two networks and of the initial Gaussians."""
 
-    position_bands: int = 10
-    """Frequencies L of the encoding of positions (paper Eq. 6)."""
-    time_bands: int = 10
-    """Frequencies L of the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
-    depth: int = 8
-    """Layers of each network."""
-    width: int = 256
-    """Units of each layer."""
+    position_bands: Annotated[int, Bounds(max=64)] = 10
+    """Number of frequencies L in the encoding of positions (paper Eq. 6)."""
+    time_bands: Annotated[int, Bounds(max=64)] = 10
+    """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
+    depth: Annotated[int, Bounds(min=1, max=64)] = 8
+    """Number of hidden layers of each network."""
+    width: Annotated[int, Bounds(min=1, max=4096)] = 256
+    """Number of units per hidden layer."""
     skip: int = 4
-    """The encoding enters again after this layer."""
+    """Hidden layer after which the encoding is concatenated again."""
+    deformation: str = "mlp"
+    """Deformation model of the dynamic Gaussians (a key of FIELDS in warpgs/model/fields.py)."""
     sh_degree: int = 1
-    """Highest degree of spherical harmonics."""
+    """Maximum degree of spherical harmonics."""
     appearance_degree: int = 0
-    """Highest degree of spherical harmonics that the appearance network changes."""
+    """Maximum degree of spherical harmonics that the appearance network changes."""
     appearance_opacity: bool = False
-    """Whether the appearance network changes opacities, too (paper Eq. 8); off, because seen from one camera at a time
-    they fit shadows by making Gaussians at wrong depths come and go."""
+    """Whether the appearance network also changes opacities (paper Eq. 8). Off by default: with one camera at a time
+    it fits shadows by fading Gaussians at wrong depths in and out."""
     half: bool = True
-    """On CUDA, multiply matrices of the networks in half precision, with sums and weights in single precision; only if
+    """On CUDA, run the networks' matrix products in half precision, with sums and weights in single precision; only if
     ``width`` is a multiple of 8."""
     max_static_points: int = 100_000
-    """Static Gaussians to begin with, at most."""
+    """Maximum number of initial static Gaussians."""
     dynamic_points: int = 20_000
-    """Dynamic Gaussians to begin with."""
+    """Number of initial dynamic Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -73,146 +104,157 @@ class LossConfig:
     """Weights of the loss terms (paper Eq. 9, 12, 14, 15)."""
 
     ssim: float = 0.2
-    """λ_ssim, the share of 1 − SSIM beside L1 in every image loss."""
+    """λ_ssim, the weight of 1 − SSIM next to L1 in every image term."""
     static: float = 1.0
-    """Static image within the static region (Eq. 9)."""
+    """Weight of the static image in the static region (Eq. 9)."""
     dynamic: float = 1.0
-    """Dynamic image against the masked truth (Eq. 12)."""
+    """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
     joint: float = 1.0
-    """Joint image against the whole truth, in stage II."""
+    """Weight of the joint image against the whole ground truth, in stage II."""
     dynamic_background: Literal["black", "random"] = "random"
-    """What the dynamic image is rendered on: black (paper), or another colour in every iteration, so that Gaussians
-    which are black there do not hide behind it."""
+    """Background of the dynamic image: black (paper), or a random colour per iteration, so that black Gaussians cannot
+    hide in front of it."""
     depth: float = 2.0
-    """λ_depth at the start: depth of the static image within the static region (Eq. 14)."""
+    """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14)."""
     depth_dynamic: float = 1.0
-    """The same of the dynamic image within the dynamic region, as a share of λ_depth; 0 in the paper."""
+    """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
-    """λ_depth at the end of the run, reached exponentially."""
+    """Final λ_depth; it decays exponentially."""
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Learning rates of the one Adam; those of Deformable-3DGS where the paper names none."""
+    """Learning rates of Adam; those of Deformable-3DGS where the paper names none."""
 
     means: float = 1.6e-4
-    """Positions, times the extent of the capture; falls to a hundredth over the run, exponentially."""
+    """Positions, relative to the extent of the capture; decays exponentially to 1 % over the run."""
     quats: float = 1e-3
+    """Rotations."""
     scales: float = 5e-3
+    """Logarithms of the scales."""
     opacities: float = 0.05
+    """Logits of the opacities."""
     sh_dc: float = 2.5e-3
+    """Spherical harmonics of degree 0."""
     sh_rest: float = 1.25e-4
-    networks: float = 8e-4
-    networks_end: float = 1.6e-6
-    """Both networks, from the first rate to the second over their stages, exponentially (paper, protocol)."""
+    """Spherical harmonics of higher degrees."""
+    networks: Annotated[float, Bounds(positive=True)] = 8e-4
+    """Initial rate of both networks (paper, training protocol)."""
+    networks_end: Annotated[float, Bounds(positive=True)] = 1.6e-6
+    """Final rate of both networks; it decays exponentially while they are trained."""
 
 
 @dataclass(frozen=True)
 class DensifyConfig:
     """When Gaussians are cloned, split and removed (3DGS, section 5)."""
 
-    every: int = 100
-    """Iterations between densifications; ``--iterations`` leaves it, because it is the size of a statistic."""
+    every: Annotated[int, Bounds(min=1)] = 100
+    """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
     dense_fraction: float = 0.01
-    """Share of the extent above which a Gaussian is split, else cloned."""
+    """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
     min_opacity: float = 0.005
-    """Opacity under which a Gaussian is removed."""
+    """Opacity below which a Gaussian is removed."""
     max_size: float = 0.1
-    """Share of the extent above which a Gaussian is removed once opacities have been reset."""
+    """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
     max_gaussians: int = 3_000_000
-    """No further growth above this many, both branches together."""
+    """Maximum number of Gaussians up to which both branches together grow."""
     visibility: float = 3e-4
-    """τ: static Gaussians whose visibility (paper Eq. 15) is lower are removed."""
+    """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Everything that is counted in iterations; ``--iterations`` scales all of it together.
+    """Everything that is counted in iterations; ``--iterations`` rescales all of it.
 
-    Stage I counts from its own start.
+    Except for the lengths of the stages and ``realign_at``, iterations count from the start of stage I.
     """
 
     pretrain: int = 2_000
-    """Depth-aware pretraining."""
+    """Length of the depth-aware pretraining."""
     stage1: int = 30_000
+    """Length of stage I, in which each branch has its own losses."""
     stage2: int = 40_000
+    """Length of stage II, the joint optimization."""
     realign_at: int = 1_000
-    """Iteration of the pretraining at which monocular depth is aligned again, to the depth rendered so far."""
+    """Iteration of the pretraining at which monocular depth is aligned again, to the rendered depth."""
     densify_from: int = 500
+    """Iteration from which Gaussians are densified."""
     densify_until: int = 15_000
-    reset_every: int = 3_000
-    """Iterations between opacity resets, while densifying."""
-    prune_every: int = 5_000
-    """Iterations of stage I between visibility-driven prunings."""
+    """Iteration until which Gaussians are densified."""
+    reset_every: Annotated[int, Bounds(min=1)] = 3_000
+    """Iterations between opacity resets during densification."""
+    prune_every: Annotated[int, Bounds(min=1)] = 5_000
+    """Iterations between visibility-driven prunings, in stage I."""
     deform_from: int = 3_000
-    """Iteration of stage I from which dynamic Gaussians move."""
+    """Iteration from which dynamic Gaussians are deformed."""
     appearance_from: int = 0
-    """Iteration of stage I from which the appearance network changes static Gaussians. In the paper that is stage II;
-    by then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
+    """Iteration from which the appearance network changes static Gaussians. The paper starts it in stage II; by then
+    moving shadows have become Gaussians at wrong depths (docs/results.md)."""
     warmup: int = 1_000
-    """Iterations over which the rate of a network rises when it begins: at the full rate Adam's first steps, all of one
-    sign, push most units below zero for good, and now and then all of them."""
+    """Iterations over which a network's learning rate rises once it is in use. At the full rate Adam's first steps,
+    all of the same sign, turn most ReLU units off for good, and occasionally all of them."""
     noise_until: int = 20_000
-    """Iteration of stage I at which the noise on time has died away."""
-    sh_degree_every: int = 1_000
-    """Iterations of stage I between the degrees of spherical harmonics, 0 to ``model.sh_degree``."""
+    """Iteration at which the noise on time has decayed to 0."""
+    sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
+    """Iterations between increments of the degree of spherical harmonics, from 0 to ``model.sh_degree``."""
 
 
 @dataclass(frozen=True)
 class MaskPerturbation:
-    """Damage done to the training masks on purpose, to see how much the method needs good ones (paper, robustness).
+    """Deliberate damage to the training masks, to measure robustness against wrong ones (paper, robustness).
 
     Evaluation always uses the true masks.
     """
 
     erode: int = 0
-    """Shrink the dynamic region by this many pixels."""
+    """Erode the dynamic region by this many pixels."""
     dilate: int = 0
-    """Grow the dynamic region by this many pixels."""
+    """Dilate the dynamic region by this many pixels."""
     holes: float = 0.0
-    """Share of the dynamic region to take away as random holes, in [0, 1)."""
+    """Fraction of the dynamic region to remove as random holes, in [0, 1)."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Trains SplitGaussian on a capture, or on the built-in scene when no capture is given."""
+    """Trains SplitGaussian on a capture, or on the built-in scene if no capture is given."""
 
     data: Path | None = None
-    """Folder of the capture; the built-in scene if left out."""
-    dataset: Literal["nerfds", "hypernerf", "iphone"] | None = None
-    """Layout of the capture; recognised from its files if left out."""
-    factor: int | None = None
-    """Downscaling of the pictures (the folder rgb/<factor>x); the dataset's usual one if left out."""
+    """Folder of the capture; the built-in scene if omitted."""
+    dataset: str | None = None
+    """Dataset of the capture: nerfds, hypernerf or iphone; recognized from its files if omitted."""
+    factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
+    """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
     out: Path | None = None
-    """Run folder; runs/<capture>-<preset> if left out, with -2, -3 … behind it where there is one already."""
+    """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
-    """Run folder to go on with, from its newest checkpoint."""
+    """Run folder to continue from its newest checkpoint."""
     preset: Literal["paper", "fast", "quick"] = "paper"
     """Defaults of everything below: paper (72k iterations), fast (one GPU, minutes), quick (two CPU cores, minutes).
-    A capture has paper as its default, the built-in scene quick."""
-    iterations: int | None = None
-    """Iterations in all; scales every schedule together."""
+    The default is paper for a capture and quick for the built-in scene."""
+    iterations: Annotated[int | None, Bounds(min=3)] = None
+    """Total iterations; every schedule is rescaled to it."""
     device: Literal["cuda", "cpu"] | None = None
-    """Where to train; CUDA if there is a GPU."""
+    """Device to train on; CUDA if there is a GPU."""
     seed: int = 0
+    """Seed of all random numbers."""
     dap: bool = True
-    """Depth-aware pretraining, and the depth loss of the stages after it."""
+    """Depth-aware pretraining, and the depth loss in the stages after it."""
     vdp: bool = True
     """Visibility-driven pruning."""
     app: bool = True
     """Appearance network of the static Gaussians, from ``schedule.appearance_from`` on."""
     stage2: bool = True
-    """Joint optimisation; without it, stage I takes its iterations too."""
+    """Joint optimization; without it, its iterations are added to stage I."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
-    """What moves: what the masks say, nothing, or everything."""
+    """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
     static_geometry: bool = False
-    """Whether stage II still optimises positions, sizes and rotations of static Gaussians."""
+    """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
     static_appearance: bool = False
-    """Whether stage II still optimises w⁰, the appearance that residuals are added to."""
+    """Whether stage II still optimizes w⁰, the appearance to which residuals are added."""
     antialias: bool = False
-    """Opacity compensation for the low-pass filter (Mip-Splatting)."""
+    """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     graph: bool = True
     """On CUDA, replay iterations as CUDA graphs."""
     masks: MaskPerturbation = field(default_factory=MaskPerturbation)
@@ -221,12 +263,12 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     schedule: Schedule = field(default_factory=Schedule)
-    checkpoint_every: int = 5_000
+    checkpoint_every: Annotated[int, Bounds(min=1)] = 5_000
     """Iterations between checkpoints."""
-    keep_checkpoints: int = 2
-    """Checkpoints to keep, the newest."""
+    keep_checkpoints: Annotated[int, Bounds(min=1)] = 2
+    """Number of newest checkpoints to keep."""
     resident_bytes: int = 4 << 30
-    """Memory on the device for the training views; captures above it are read from disk as they are needed."""
+    """Maximum memory for training views on the device [bytes]; larger captures are read from disk on demand."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS, for the evaluation at the end."""
 
@@ -276,43 +318,16 @@ PRESETS: dict[str, TrainConfig] = {
         checkpoint_every=500,
     ),
 }
-"""Named defaults."""
-
-
-LEAST = {
-    "factor": 1,
-    "iterations": 3,
-    "checkpoint_every": 1,
-    "keep_checkpoints": 1,
-    "model.depth": 1,
-    "model.width": 1,
-    "densify.every": 1,
-    "schedule.reset_every": 1,
-    "schedule.prune_every": 1,
-    "schedule.sh_degree_every": 1,
-}
-"""Smallest values of numbers that must not be 0; no number of a config is negative."""
-
-MOST = {
-    "factor": 1024,
-    "model.position_bands": 64,
-    "model.time_bands": 64,
-    "model.depth": 64,
-    "model.width": 4096,
-}
-"""Largest values of numbers that memory is taken by before anything else bounds it."""
-
-MAX_VALUE = 10**15
-"""No number of a config is larger."""
+"""Defaults by name."""
 
 
 def validate(config: TrainConfig) -> None:
-    """Refuses numbers that training would stumble over later.
+    """Refuses numbers with which training would fail later.
 
     Raises:
-        ValueError: If one is out of its range; the message names it.
+        ValueError: If a number is out of its range; the message names it.
     """
-    _check_numbers("", config)
+    _check_bounds("", config)
     model, schedule = config.model, config.schedule
     if not model.appearance_degree <= model.sh_degree <= 3:
         raise ValueError(
@@ -321,26 +336,21 @@ def validate(config: TrainConfig) -> None:
         )
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
-    for name in ("networks", "networks_end"):
-        if getattr(config.optim, name) == 0:
-            raise ValueError(f"optim.{name} must be positive, got 0")
 
 
-def _check_numbers(prefix: str, part: Any) -> None:
-    for field_ in dataclasses.fields(part):
-        name, value = prefix + field_.name, getattr(part, field_.name)
+def _check_bounds(prefix: str, config: Any) -> None:
+    """Checks every number of a dataclass, and of those inside, against the bounds beside its field."""
+    for name, hint in typing.get_type_hints(type(config), include_extras=True).items():
+        value = getattr(config, name)
         if dataclasses.is_dataclass(value):
-            _check_numbers(f"{name}.", value)
+            _check_bounds(f"{prefix}{name}.", value)
         elif isinstance(value, int | float):
-            least, most = LEAST.get(name, 0), MOST.get(name, MAX_VALUE)
-            if not value >= least:
-                raise ValueError(f"{name} must be a number of at least {least}, got {value}")
-            if value > most:
-                raise ValueError(f"{name} must be a number of at most {most}, got {reprlib.repr(value)}")
+            bounds = (data for data in getattr(hint, "__metadata__", ()) if isinstance(data, Bounds))
+            next(bounds, Bounds()).check(prefix + name, value)
 
 
 def scaled(config: TrainConfig) -> TrainConfig:
-    """The config with every schedule scaled so that the run takes ``config.iterations``, which is then None.
+    """The config with every schedule rescaled so that the run takes ``config.iterations``, which is None afterwards.
 
     Raises:
         ValueError: If a number of the config is out of its range.
@@ -351,7 +361,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
         return config
     total = schedule.pretrain + schedule.stage1 + schedule.stage2
     factor = config.iterations / total
-    # What is 0 stays 0, what is not stays more; the stage with the most takes what rounding leaves.
+    # What is 0 stays 0, what is positive stays positive; the longest stage absorbs the rounding.
     values = {name: max(min(value, 1), round(value * factor)) for name, value in dataclasses.asdict(schedule).items()}
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)

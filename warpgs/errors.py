@@ -1,18 +1,56 @@
-"""Errors as people read them."""
+"""Errors of commands: one line on stderr and an exit code."""
 
-import torch
+import sys
+from collections.abc import Callable
+
+FAILED = 2
+"""Exit code after wrong options or input, or without enough memory."""
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in shells."""
+
+ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a GPU has too little"
+"""What to do without enough memory, where a command has no advice of its own."""
+
+
+def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str = ADVICE) -> int:
+    """Runs a command and returns its exit code: the int that it returns, 0 if it returns something else.
+
+    ValueError, ImportError, OSError, lack of memory and Ctrl-C end with one line on stderr; for Ctrl-C that is the
+    message of the KeyboardInterrupt, if any. Other errors are bugs and are raised.
+
+    Args:
+        command: The command.
+        prog: Name of the program, which the line starts with.
+        advice: What to do without enough memory.
+    """
+    try:
+        code = command()
+    except (ValueError, ImportError, OSError) as error:
+        sys.stderr.write(f"{prog}: {one_line(error)}\n")
+        return FAILED
+    except KeyboardInterrupt as stop:
+        sys.stderr.write(f"{prog}: {stop or 'stopped'}\n")
+        return INTERRUPTED
+    except Exception as error:
+        if not is_out_of_memory(error):
+            raise
+        sys.stderr.write(f"{prog}: {out_of_memory(error)}; {advice}\n")
+        return FAILED
+    return code if type(code) is int else 0
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, without its line breaks."""
+    """The message of an error without line breaks."""
     return " ".join(str(error).split())
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error is the lack of memory; on the CPU, torch, Warp and OpenCV say so only in words."""
-    return isinstance(error, torch.OutOfMemoryError | MemoryError) or "allocate" in str(error)
+    """Whether an error means lack of memory; on the CPU, only the messages of torch, Warp and OpenCV say so."""
+    # torch.OutOfMemoryError by name, because torch takes a second to import.
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate" in str(error)
 
 
 def out_of_memory(error: BaseException) -> str:
-    """What to say of such an error, before any advice."""
+    """The message for lack of memory, without advice."""
     return f"out of memory ({one_line(error)[:200]})"

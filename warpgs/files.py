@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt
 
 MAX_JSON = 64 << 20
-"""Size of a JSON file [bytes]; metadata.json of a long capture has a few."""
+"""Maximum size of a JSON file [bytes]; metadata.json of a long capture has a few MiB."""
 
 
 def partial_path(path: Path) -> Path:
@@ -25,7 +26,7 @@ def partial_path(path: Path) -> Path:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path to write to, renamed to ``path`` on success; after any error, Ctrl-C too, nothing remains.
+    """A temporary path to write to: renamed to ``path`` on success, removed after any error or Ctrl-C.
 
     Raises:
         OSError: If the file cannot be written; the message names ``path``.
@@ -43,7 +44,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, parts: Iterable[bytes]) -> int:
-    """Writes the concatenation of ``parts``; returns the size of the file [bytes].
+    """Writes ``parts`` one after the other; returns the size of the file [bytes].
 
     Raises:
         OSError: If the file cannot be written; the message names it.
@@ -96,7 +97,7 @@ def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
     Raises:
         OSError: If the file cannot be written; the message names it.
     """
-    data = io.BytesIO()  # numpy's own writing to a file loses the reason of a failure
+    data = io.BytesIO()  # np.save to a file hides why it failed
     np.save(data, values)
     write_bytes(path, [data.getvalue()])
 
@@ -106,23 +107,27 @@ def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
 
     Args:
         path: The file.
-        max_bytes: Its largest size.
-        hint: Why the file is needed, for the message when it is missing.
+        max_bytes: Its maximum size.
+        hint: Why the file is needed, for the message if it is missing.
 
     Raises:
         ValueError: If it is missing, not a regular file (a device would never end) or larger; the message names it.
     """
     try:
-        if not path.exists():
-            raise ValueError(f"{path} is missing{': ' + hint if hint else ''}")
-        if not path.is_file():
-            raise ValueError(f"{path} is not a file")
+        _check_regular(path, hint)
         size = path.stat().st_size
         if size > max_bytes:
             raise ValueError(f"{path} has {size:,} bytes, more than the maximum of {max_bytes:,}")
         return path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _check_regular(path: Path, hint: str = "") -> None:
+    if not path.exists():
+        raise ValueError(f"{path} is missing{': ' + hint if hint else ''}")
+    if not path.is_file():
+        raise ValueError(f"{path} is not a file")
 
 
 def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str, Any]:
@@ -139,6 +144,24 @@ def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str
     if not isinstance(value, dict):
         raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
     return value
+
+
+def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
+    """A .npy file of at most ``max_values`` numbers; pickled objects are refused.
+
+    Raises:
+        ValueError: If the file is missing, truncated or larger, or holds something other than numbers.
+    """
+    _check_regular(path)
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # allocates nothing, whatever the header claims
+    except (ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError) as error:
+        raise ValueError(f"{path} is damaged or not a .npy file of numbers") from error
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise ValueError(f"{path} must be a .npy file of numbers")
+    if array.size > max_values:
+        raise ValueError(f"{path} has {array.size} numbers, more than the maximum of {max_values}")
+    return np.array(array)
 
 
 def remove_numbered(folder: Path, name: Callable[[int], str]) -> None:

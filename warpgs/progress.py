@@ -1,4 +1,4 @@
-"""Progress of anything longer than a second."""
+"""Progress bars."""
 
 import sys
 from collections.abc import Collection, Iterator
@@ -10,5 +10,5 @@ Item = TypeVar("Item")
 
 
 def progress(items: Collection[Item], label: str, quiet: bool = False) -> Iterator[Item]:
-    """The items, under a progress bar where stdout is a terminal."""
+    """Yields the items; shows a progress bar while it does, if stdout is a terminal and ``quiet`` is false."""
     yield from track(items, label, total=len(items), disable=quiet or not sys.stdout.isatty(), transient=True)

@@ -1,8 +1,8 @@
-"""Rendering: splats, camera, background → images."""
+"""Differentiable rendering: splats, camera, background → images."""
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int32
@@ -12,14 +12,14 @@ from .cameras import Camera
 from .config import RenderSettings
 from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
-from .ops.projection import record_projection
+from .ops.projection import Geometry, View, record_projection
 from .ops.rows import Rows
 from .ops.sh import record_sh
 from .ops.tiles import record_tiles
 from .runtime.checks import check_same_device, check_tensor
-from .runtime.replay import repeated
+from .runtime.replay import differentiable_with_replay
 from .runtime.streams import join
-from .runtime.tape import Run, differentiable
+from .runtime.tape import OpContext, differentiable
 
 DEFAULTS = RenderSettings()
 
@@ -28,10 +28,10 @@ class Layer(NamedTuple):
     """One image.
 
     Attributes:
-        image: [H, W, C] over the background.
+        image: [H, W, C] composited over the background.
         alpha: [H, W] opacity, in [0, 1).
-        depth: [H, W] mean depth of what was drawn, weighted by its contribution [scene units]; 0 where nothing was.
-            None unless asked for.
+        depth: [H, W] mean depth of the Gaussians, weighted by their contribution [scene units]; 0 in empty pixels.
+            None unless requested.
     """
 
     image: Float[Tensor, "H W C"]
@@ -41,16 +41,16 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Rendering:
-    """What ``render`` makes.
+    """The result of ``render``.
 
     Attributes:
         joint: All Gaussians.
-        static, dynamic: The Gaussians of one branch alone; None unless asked for.
+        static, dynamic: The Gaussians of one branch alone; None unless requested.
         radii: [N, 2] half sizes on screen [px]; 0 = culled.
         gradient_norms: [N, 2] after the backward pass: length of the screen-space gradient of each mean, plain and (if
-            asked for) with absolute values per pixel, in normalised device coordinates as 3DGS densifies by.
-        contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless asked for.
-        weights: [N] sum of its blend weights over the joint image, without a gradient; None unless asked for.
+            requested) with absolute values per pixel, in normalised device coordinates as in the densification of 3DGS.
+        contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless requested.
+        weights: [N] sum of its blend weights over the joint image, not differentiable; None unless requested.
     """
 
     joint: Layer
@@ -62,57 +62,40 @@ class Rendering:
     weights: Float[Tensor, " N"] | None
 
 
+class _Request(NamedTuple):
+    """Everything but tensors that a render depends on; requests that are equal can share a recording."""
+
+    size: tuple[int, int]
+    num_channels: int
+    settings: RenderSettings
+    sh_degree: int | None
+
+
 def render(
     splats: Splats,
     camera: Camera,
     background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
     settings: RenderSettings | None = None,
 ) -> Rendering:
-    """Renders splats through a camera; differentiable in every splat parameter and in the background.
+    """Renders splats through a camera; differentiable in all parameters of the splats and in the background.
 
     Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have an opacity above 1, a
     parameter that is not finite or a zero quaternion are culled: they leave the image unchanged and get zero gradients.
 
     Args:
-        splats: N Gaussians, N may be 0.
-        camera: On the device of the splats. No gradient flows to it.
-        background: [C] colour behind everything, black by default; with branches also [3, C], behind the joint, the
-            static and the dynamic image.
+        splats: N Gaussians; N may be 0.
+        camera: On the device of the splats; it gets no gradient.
+        background: [C] colour behind everything, black by default; with branches also [3, C], one for each of the
+            joint, the static and the dynamic image.
         settings: What to compute besides the joint image.
 
-    Returns:
-        A ``Rendering``.
-
     Raises:
-        ValueError: If the background does not fit the splats, devices differ, or branches are asked for of splats
+        ValueError: If the background does not fit the splats, devices differ, or branches are requested for splats
             without ``is_dynamic``.
     """
     settings = settings or DEFAULTS
-    C = splats.num_channels
-    if background is not None:
-        is_one_each = settings.branches and isinstance(background, Tensor) and background.ndim == 2
-        check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_one_each else (C,), {})
-    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
-    branch = None
-    if settings.branches:
-        if splats.is_dynamic is None:
-            raise ValueError("branches were asked for, but splats.is_dynamic is None")
-        branch = splats.is_dynamic.view(torch.uint8)
-    degree = None if splats.sh is None else splats.sh_degree
-    if degree is None and splats.sh is not None:
-        degree = round(splats.sh.shape[1] ** 0.5) - 1
-
-    appearance = splats.colors if splats.sh is None else splats.sh
-    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
-    view = [t.detach() if t.requires_grad else t for t in (camera.viewmat, camera.K)]
-    tensors = (*geometry, appearance, background, *view, branch)
-    kind = (camera.size, C, settings, degree)
-    op = partial(_record, *kind, splats.sh_stream)
-    is_empty = 0 in (splats.means.shape[0], *camera.size)
-    if settings.replay and splats.sh_stream is None and not is_empty:
-        outputs = repeated(kind, op, *tensors)
-    else:
-        outputs = differentiable(op, *tensors)
+    _check_inputs(splats, camera, background, settings)
+    outputs = _render(splats, camera, background, settings)
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
     composite = Composite.from_flat(outputs[1:], num_images, settings.depth)
     depths = composite.depths or (None,) * num_images
@@ -122,38 +105,54 @@ def render(
         static=layers[1] if settings.branches else None,
         dynamic=layers[2] if settings.branches else None,
         radii=outputs[0],
-        gradient_norms=composite.norms,
+        gradient_norms=composite.gradient_norms,
         contributed=composite.contributed,
         weights=composite.weights,
     )
 
 
+def _check_inputs(splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings) -> None:
+    C = splats.num_channels
+    if background is not None:
+        is_per_image = settings.branches and isinstance(background, Tensor) and background.ndim == 2
+        check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_per_image else (C,), {})
+    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
+    if settings.branches and splats.is_dynamic is None:
+        raise ValueError("branches were requested, but splats.is_dynamic is None")
+
+
+def _render(splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings) -> tuple[Tensor, ...]:
+    """Radii and a flat ``Composite``, differentiable, from a recording if possible."""
+    degree = None if splats.sh is None else splats.sh_degree
+    if degree is None and splats.sh is not None:
+        degree = round(splats.sh.shape[1] ** 0.5) - 1
+    request = _Request(camera.size, splats.num_channels, settings, degree)
+    branch = None if splats.is_dynamic is None or not settings.branches else splats.is_dynamic.view(torch.uint8)
+    appearance = splats.colors if splats.sh is None else splats.sh
+    view = [t.detach() if t.requires_grad else t for t in (camera.viewmat, camera.K)]
+    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
+    tensors = (*geometry, appearance, background, *view, branch)
+    op = partial(_record, request, splats.sh_stream)
+    is_empty = 0 in (splats.means.shape[0], *camera.size)
+    if settings.replay and splats.sh_stream is None and not is_empty:
+        return differentiable_with_replay(request, op, *tensors)
+    return differentiable(op, *tensors)
+
+
 def _record(
-    size: tuple[int, int],
-    num_channels: int,
-    settings: RenderSettings,
-    sh_degree: int | None,
-    sh_stream: torch.cuda.Stream | None,
-    run: Run,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    appearance: Tensor,
-    background: Tensor | None,
-    viewmat: Tensor,
-    K: Tensor,
-    branch: Tensor | None,
+    request: _Request, sh_stream: torch.cuda.Stream | None, ctx: OpContext, *tensors: Any
 ) -> tuple[Tensor, ...]:
-    """What is done with the tensors of a render; it depends on nothing else than what is given here."""
-    geometry = (means, quats, scales, opacities, viewmat, K)
-    projection = record_projection(run, *geometry, size, settings.near, settings.antialias)
-    rows = Rows(run, projection, num_channels, settings.depth, size)
-    tiles = record_tiles(run, rows, size, branch)
+    """The render as one op: project → bin → composite; it depends on nothing but its arguments."""
+    means, quats, scales, opacities, appearance, background, viewmat, K, branch = tensors
+    size, num_channels, settings, sh_degree = request
+    geometry, view = Geometry(means, quats, scales, opacities), View(viewmat, K, *size)
+    projection = record_projection(ctx, geometry, view, settings.near, settings.antialias)
+    rows = Rows(ctx, projection, num_channels, settings.depth, size)
+    tiles = record_tiles(ctx, rows, size, branch)
     join(sh_stream)
     features = appearance
     if sh_degree is not None:
-        features = record_sh(run, means, appearance, viewmat, projection.radii, sh_degree)
-    rows.add_features(run, features)
-    composite = record_composite(run, rows, tiles, size, background, settings.statistics, settings.absgrad)
+        features = record_sh(ctx, means, appearance, viewmat, projection.radii, sh_degree)
+    rows.add_features(ctx, features)
+    composite = record_composite(ctx, rows, tiles, size, background, settings.statistics, settings.absgrad)
     return (projection.radii, *composite.flat())

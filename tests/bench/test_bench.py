@@ -6,23 +6,27 @@ import pytest
 import torch
 
 from tests import tiny
-from warpgs.bench.command import STAGES, Bench, bench, time_in_turn
+from warpgs.bench.command import Bench
+from warpgs.bench.measure import STAGES, time_in_turn
+from warpgs.bench.run_bench import bench
 from warpgs.bench.scenes import SCENES, Scene, random_splats
 from warpgs.bench.training import measure_steps, random_scene
 from warpgs.cli import main
+from warpgs.runs.run import Run
 
 TINY = Scene("tiny", 48, 32, 100, 3.0)
-OPTIONS = Bench(device="cpu", repeats=2)
+REPEATS = 2
+OPTIONS = Bench(device="cpu", repeats=REPEATS)
 
 
 def report(tmp_path, **options):
     path = tmp_path / "report.json"
-    bench(dataclasses.replace(OPTIONS, json=path, **options), [TINY])
+    bench(dataclasses.replace(OPTIONS, json=path, **options), [TINY], "cpu")
     return json.loads(path.read_text())
 
 
 def error_line(capsys, *arguments):
-    """The only line that a failing command leaves."""
+    """The only line that a failing command prints."""
     assert main(["bench", *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -36,16 +40,16 @@ def test_the_report_names_the_machine_and_the_versions(tmp_path):
     assert machine["torch"] == torch.__version__
 
 
-def test_the_report_has_times_of_all_stages_and_of_the_whole(tmp_path):
+def test_the_report_has_total_times_and_times_of_all_stages(tmp_path):
     (result,) = report(tmp_path)["results"]
     assert set(result["one_image"]) == {"forward_ms", "forward_backward_ms", "stages_ms"}
     assert set(result["one_image"]["stages_ms"]) == set(STAGES)
     assert all(isinstance(ms, float) and ms > 0 for ms in result["one_image"]["stages_ms"].values())
 
 
-def test_what_is_compared_takes_turns():
+def test_compared_steps_alternate():
     calls = []
-    times = time_in_turn({name: functools.partial(calls.append, name) for name in "ab"}, OPTIONS)
+    times = time_in_turn({name: functools.partial(calls.append, name) for name in "ab"}, "cpu", REPEATS)
     assert calls == [*"ab", *"ab", *"ab"]  # the first warms up
     assert set(times) == {"a", "b"}
 
@@ -68,9 +72,9 @@ def test_depth_can_be_measured_with_branches(tmp_path):
     assert set(result["three_images"]["stages_ms"]) == set(STAGES)
 
 
-def test_the_profile_is_a_trace_of_the_kernels_both_ways(tmp_path):
+def test_the_profile_is_a_trace_of_forward_and_backward_kernels(tmp_path):
     path = tmp_path / "trace.json"
-    bench(dataclasses.replace(OPTIONS, profile=path), [TINY])
+    bench(dataclasses.replace(OPTIONS, profile=path), [TINY], "cpu")
     events = json.loads(path.read_text())["traceEvents"]
     kernels = [event for event in events if event["ph"] == "X"]
     assert {"project_fwd", "sort_pairs", "composite_fwd", "composite_bwd", "project_bwd"} <= {
@@ -79,19 +83,20 @@ def test_the_profile_is_a_trace_of_the_kernels_both_ways(tmp_path):
     assert all(k["dur"] > 0 and k["ts"] >= 0 for k in kernels)
 
 
-def test_the_output_is_plain_text_when_it_is_no_terminal(capsys):
-    bench(OPTIONS, [TINY])
+def test_the_output_is_plain_text_if_it_is_not_a_terminal(capsys):
+    bench(OPTIONS, [TINY], "cpu")
     output = capsys.readouterr().out
     assert "tiny: 48x32, 100 Gaussians" in output
+    assert "forward [ms]" in output
     assert output.isascii()
 
 
 @pytest.mark.parametrize("option", [("--against", "gsplat"), ("--graph",)])
-def test_what_needs_cuda_is_refused_on_cpu_with_one_line(capsys, option):
+def test_options_that_need_cuda_are_refused_on_cpu_with_one_line(capsys, option):
     assert " ".join(option) + " needs --device cuda" in error_line(capsys, "--device", "cpu", *option)
 
 
-def test_no_repeats_are_refused_with_one_line(capsys):
+def test_zero_repeats_are_refused_with_one_line(capsys):
     assert "--repeats must be at least 1" in error_line(capsys, "--device", "cpu", "--repeats", "0")
 
 
@@ -113,18 +118,18 @@ def test_unknown_options_end_with_exit_code_2(arguments):
     assert end.value.code == 2
 
 
-def test_the_command_measures_the_scenes_that_were_asked_for(monkeypatch, capsys):
+def test_the_command_measures_the_given_scenes(monkeypatch, capsys):
     monkeypatch.setitem(SCENES, "wide", TINY)
     assert main(["bench", "--device", "cpu", "--repeats", "1", "--scenes", "wide"]) == 0
     assert "tiny: " in capsys.readouterr().out
 
 
-def test_a_seed_stands_for_one_scene():
+def test_a_seed_always_gives_the_same_scene():
     first, second = (random_splats(10, 48, 32, 3.0, seed=5)[0] for _ in range(2))
     assert all(torch.equal(getattr(first, n), getattr(second, n)) for n in ("means", "quats", "scales", "colors"))
 
 
-def test_the_disc_holds_a_fifth_of_the_gaussians():
+def test_the_disc_contains_a_fifth_of_the_gaussians():
     splats, _ = Scene("many", 48, 32, 100_000, 3.0).make("disc", "cpu")
     assert splats.is_dynamic.float().mean().item() == pytest.approx(0.2, abs=0.01)
 
@@ -132,35 +137,35 @@ def test_the_disc_holds_a_fifth_of_the_gaussians():
 # Training -----------------------------------------------------------------------------------------------------------
 
 
-def test_steps_of_both_stages_are_timed():
-    figures = measure_steps(300, (48, 32), "cpu", repeats=1)
-    assert (figures["gaussians"], figures["width"], figures["height"]) == (300, 48, 32)
-    assert figures["stage1_ms"] > 0
-    assert figures["stage2_ms"] > 0
+def test_steps_of_both_stages_are_measured():
+    measured = measure_steps(300, (48, 32), "cpu", repeats=1)
+    assert (measured["gaussians"], measured["width"], measured["height"]) == (300, 48, 32)
+    assert measured["stage1_ms"] > 0
+    assert measured["stage2_ms"] > 0
 
 
-def test_the_scene_to_time_steps_of_has_both_branches_and_the_papers_networks():
+def test_the_scene_for_step_times_has_both_branches_and_the_networks_of_the_paper():
     splats, camera = random_splats(1000, 64, 48, 3.0, 0)
     scene = random_scene(splats, camera)
     assert 100 < len(scene.dynamic) < 300
     assert len(scene.static) + len(scene.dynamic) == 1000
     assert len(scene.deformation.trunk.sizes) == 9
-    again = scene.splats(torch.zeros(1))
-    assert torch.allclose(again.scales.sort(0).values, splats.scales.sort(0).values, rtol=1e-5)
+    activated = scene.splats(torch.zeros(1))
+    assert torch.allclose(activated.scales.sort(0).values, splats.scales.sort(0).values, rtol=1e-5)
 
 
-def test_frames_a_second_of_a_run_are_written(tmp_path, capsys):
+def test_frames_per_second_of_a_run_are_written(tmp_path, capsys):
     data, run = tiny.write(tmp_path), tmp_path / "run"
     trainer = tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, data=data))
     Run.create(run, trainer.config)
     trainer.save()
     assert main(["bench", "--device", "cpu", "--fps", str(run), "--json", str(tmp_path / "out.json")]) == 0
-    figures = json.loads((tmp_path / "out.json").read_text())["fps"]
-    assert figures["frames_per_second"] > 0
-    assert figures["static"] == len(trainer.scene.static)
-    assert "frames a second" in capsys.readouterr().out
+    measured = json.loads((tmp_path / "out.json").read_text())["fps"]
+    assert measured["frames_per_second"] > 0
+    assert measured["static"] == len(trainer.scene.static)
+    assert "frames per second" in capsys.readouterr().out
 
 
-def test_frames_a_second_of_what_is_no_run_are_refused(tmp_path, capsys):
+def test_a_folder_that_is_not_a_run_is_refused(tmp_path, capsys):
     assert main(["bench", "--device", "cpu", "--fps", str(tmp_path)]) == 2
-    assert "is no run folder" in capsys.readouterr().err
+    assert "is not a run folder" in capsys.readouterr().err

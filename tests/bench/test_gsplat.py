@@ -1,4 +1,4 @@
-"""Cross-check against gsplat's own torch reference, which runs on CPU."""
+"""Cross-check against the torch reference of gsplat, which runs on CPU."""
 
 import warnings
 
@@ -8,22 +8,26 @@ import torch
 from tests.reference.covariance import covariance
 from tests.scenes import error, make_camera, make_splats, relative_error
 from warpgs.ops import tiles
-from warpgs.ops.projection import project
+from warpgs.ops.projection import Geometry, View, project
 from warpgs.ops.rows import Rows
 from warpgs.ops.sh import spherical_harmonics
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # gsplat's own, on import
+    warnings.simplefilter("ignore")  # of gsplat itself, on import
     theirs = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed (extra 'gsplat')")
 
 CAMERA = make_camera(80, 60)
+VIEW = View(CAMERA.viewmat, CAMERA.K, *CAMERA.size)
+
+
+def geometry(splats):
+    return Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
 
 
 def splats_and_theirs():
     splats = make_splats(200)
-    geometry = splats.means, splats.quats, splats.scales, splats.opacities
-    ours = project(*geometry, CAMERA.viewmat, CAMERA.K, CAMERA.size)
+    ours = project(geometry(splats), VIEW)
     expected = theirs._fully_fused_projection(
         splats.means.double(),
         covariance(splats.quats.double(), splats.scales.double()),
@@ -39,20 +43,11 @@ def test_projection_agrees():
     splats, ours, (radii, means2d, depths, conics, compensations) = splats_and_theirs()
     seen = (ours.radii > 0).all(-1)
     assert 50 < seen.sum() < 200
-    assert (radii[seen] > 0).all()  # gsplat's box is wider, so it sees at least what is seen here
+    assert (radii[seen] > 0).all()  # gsplat uses larger boxes, so at least these are visible
     assert relative_error(ours.means2d[seen], means2d[seen]) < 1e-6
     assert relative_error(ours.depths[seen], depths[seen]) < 1e-6
     assert relative_error(ours.conics[seen], conics[seen]) < 1e-6
-    antialiased = project(
-        splats.means,
-        splats.quats,
-        splats.scales,
-        splats.opacities,
-        CAMERA.viewmat,
-        CAMERA.K,
-        CAMERA.size,
-        antialias=True,
-    )
+    antialiased = project(geometry(splats), VIEW, antialias=True)
     kept = (antialiased.radii > 0).all(-1)
     assert relative_error(antialiased.opacities[kept], (splats.opacities * compensations)[kept]) < 1e-6
 
@@ -66,10 +61,10 @@ def test_spherical_harmonics_agree(degree):
     assert error(spherical_harmonics(splats.means, splats.sh, CAMERA.viewmat, degree=degree), expected) < 2e-6
 
 
-def test_tiles_are_those_of_the_box_less_those_that_the_ellipse_misses():
+def test_tiles_are_those_of_the_box_that_the_ellipse_intersects():
     _, ours, _ = splats_and_theirs()
-    run = Run(torch.device("cpu"), [])
-    result = tiles.record_tiles(run, Rows(run, ours, 3, False, CAMERA.size), CAMERA.size)
+    ctx = OpContext(torch.device("cpu"), [])
+    result = tiles.record_tiles(ctx, Rows(ctx, ours, 3, False, CAMERA.size), CAMERA.size)
     columns, rows = tiles.num_tiles(*CAMERA.size)
     _, isect_ids, gaussians = theirs._isect_tiles(
         ours.means2d[None], ours.radii[None], ours.depths[None], 16, columns, rows

@@ -1,4 +1,4 @@
-"""Writes small captures in the three layouts."""
+"""Writes small captures of the three datasets."""
 
 import json
 from pathlib import Path
@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 
 SIZE = (40, 24)
-"""(width, height) of the full pictures [px]."""
+"""(width, height) of the full-size images [px]."""
 
 CENTER, SCALE = (0.5, -0.25, 1.0), 0.5
-"""Scene units of scene.json."""
+"""center and scale of scene.json."""
 
 FACTORS = {"nerfds": 1, "hypernerf": 2, "iphone": 2}
 
@@ -21,7 +21,7 @@ def write_json(path: Path, values: object) -> None:
 
 
 def edit_json(path: Path, **changes: object) -> None:
-    """Changes some entries of a JSON object; None takes an entry away."""
+    """Changes some entries of a JSON object; None removes an entry."""
     values = {**json.loads(path.read_text()), **changes}
     write_json(path, {key: value for key, value in values.items() if value is not None})
 
@@ -38,8 +38,8 @@ def write_array(path: Path, values: np.ndarray) -> None:
     np.save(path, values)
 
 
-def camera_facts(k: int, size: tuple[int, int] = SIZE) -> dict[str, object]:
-    """A camera file: turned, off the middle, and not at the centre of the scene."""
+def camera_fields(k: int, size: tuple[int, int] = SIZE) -> dict[str, object]:
+    """A camera file: rotated, with the principal point off the image centre, not at the scene centre."""
     rotation = cv2.Rodrigues(np.array([0.1 * k, 0.3, -0.05 * k]))[0]
     return {
         "orientation": rotation.tolist(),
@@ -54,49 +54,49 @@ def camera_facts(k: int, size: tuple[int, int] = SIZE) -> dict[str, object]:
     }
 
 
-def picture(name: str, size: tuple[int, int] = SIZE) -> np.ndarray:
-    """[H, W, 3] RGB, its own for every name."""
+def image_of(name: str, size: tuple[int, int] = SIZE) -> np.ndarray:
+    """[H, W, 3] RGB noise, different for every name."""
     seed = int.from_bytes(name.encode()[-4:], "big")
     return np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
 
 
-def moving_block(size: tuple[int, int] = SIZE) -> np.ndarray:
-    """[H, W] mask file: 0 in a block that moves, else 255."""
+def dynamic_block(size: tuple[int, int] = SIZE) -> np.ndarray:
+    """[H, W] mask file: 0 in a dynamic block, else 255."""
     mask = np.full((size[1], size[0]), 255, np.uint8)
     mask[4:9, 3:10] = 0
     return mask
 
 
-def ids_of(kind: str) -> tuple[list[str], list[str]]:
-    """train_ids and val_ids; two cameras, four moments."""
-    if kind == "iphone":
+def ids_of(dataset: str) -> tuple[list[str], list[str]]:
+    """train_ids and val_ids; two cameras, four times."""
+    if dataset == "iphone":
         return [f"0_{k:05d}" for k in range(4)], [f"1_{k:05d}" for k in range(0, 4, 2)]
     return [f"left_{k:06d}" for k in range(4)], [f"right_{k:06d}" for k in range(0, 4, 2)]
 
 
-def write_capture(root: Path, kind: str = "nerfds") -> Path:
-    """A capture of four training and two evaluation frames with all that its dataset comes with."""
-    train, val = ids_of(kind)
-    factor = FACTORS[kind]
+def write_capture(root: Path, dataset: str = "nerfds") -> Path:
+    """A capture of four training and two evaluation frames with all files that its dataset has."""
+    train, val = ids_of(dataset)
+    factor = FACTORS[dataset]
     size = (SIZE[0] // factor, SIZE[1] // factor)
     metadata = {}
     for name in [*train, *val]:
         step = int(name.split("_")[1])
         ids = {"warp_id": step, "appearance_id": step, "camera_id": int(name in val)}
-        metadata[name] = ids if kind == "iphone" else {**ids, "time_id": step}
-        write_png(root / f"rgb/{factor}x/{name}.png", picture(name, size))
-        write_json(root / f"camera/{name}.json", camera_facts(step + 10 * (name in val)))
-        if kind == "nerfds":
-            write_png(root / f"resized_mask/1x/{name}.png.png", moving_block())
-    if kind == "iphone":
+        metadata[name] = ids if dataset == "iphone" else {**ids, "time_id": step}
+        write_png(root / f"rgb/{factor}x/{name}.png", image_of(name, size))
+        write_json(root / f"camera/{name}.json", camera_fields(step + 10 * (name in val)))
+        if dataset == "nerfds":
+            write_png(root / f"resized_mask/1x/{name}.png.png", dynamic_block())
+    if dataset == "iphone":
         for name in train:
             write_array(root / f"depth/2x/{name}.npy", np.full((size[1], size[0], 1), 2.0, np.float32))
         for name in val:
-            write_png(root / f"covisible/2x/val/{name}.png", moving_block(size))
+            write_png(root / f"covisible/2x/val/{name}.png", dynamic_block(size))
         for split, ids in (("train", train), ("val", val)):
             write_json(root / f"splits/{split}.json", {"frame_names": ids, "camera_ids": [], "time_ids": []})
-    dataset = {"count": 6, "num_exemplars": 4, "ids": [*train, *val], "train_ids": train, "val_ids": val}
-    write_json(root / "dataset.json", dataset)
+    index = {"count": 6, "num_exemplars": 4, "ids": [*train, *val], "train_ids": train, "val_ids": val}
+    write_json(root / "dataset.json", index)
     write_json(root / "metadata.json", metadata)
     write_json(root / "scene.json", {"center": CENTER, "scale": SCALE, "near": 0.1, "far": 2.0})
     write_array(root / "points.npy", np.arange(30, dtype=np.float64).reshape(10, 3))

@@ -1,4 +1,4 @@
-"""What the check finds in captures that are fit and in captures that are not."""
+"""Findings of the check in captures that are fit to train on and in captures that are not."""
 
 import json
 import shutil
@@ -11,22 +11,22 @@ import pytest
 
 from tests.data import captures
 from tests.data.captures import edit_json, write_array
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
 
 
 @pytest.fixture(scope="module")
-def film(tmp_path_factory):
-    root = filmed.write_capture(tmp_path_factory.mktemp("check") / "film")
+def original(tmp_path_factory):
+    root = boards.write_capture(tmp_path_factory.mktemp("check") / "capture")
     shutil.rmtree(root / "frames")
     return root
 
 
 @pytest.fixture
-def root(film, tmp_path):
-    return shutil.copytree(film, tmp_path / "film")
+def root(original, tmp_path):
+    return shutil.copytree(original, tmp_path / "capture")
 
 
 def texts(report, level):
@@ -42,40 +42,40 @@ def test_a_good_capture_is_fit_without_warnings(root):
 
 
 @pytest.mark.parametrize(
-    ("kind", "files"),
+    ("dataset", "files"),
     [
         ("nerfds", "6 of 6 frames have masks, 0"),
         ("hypernerf", "0 of 6 frames have masks, 0"),
         ("iphone", "0 of 6 frames have masks, 4"),
     ],
 )
-def test_every_layout_is_read_whole(tmp_path, kind, files):
-    report = check_capture(captures.write_capture(tmp_path / "toy", kind))
+def test_every_dataset_is_read_completely(tmp_path, dataset, files):
+    report = check_capture(captures.write_capture(tmp_path / "toy", dataset))
     notes = texts(report, "note")
-    assert f"read as {kind} | 4 frames to train on, 2 to evaluate" in notes
+    assert f"read as {dataset} | 4 frames to train on, 2 to evaluate" in notes
     assert f"{files} have depth" in notes
 
 
-def test_masks_that_are_turned_around_are_an_error(root):
+def test_inverted_masks_are_an_error(root):
     for path in (root / "resized_mask/1x").iterdir():
         cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     report = check_capture(root)
     assert not report.is_fit
-    assert "turned around" in texts(report, "error")
+    assert "inverted" in texts(report, "error")
 
 
-def test_masks_where_everything_moves_are_an_error(root):
+def test_entirely_dynamic_masks_are_an_error(root):
     for path in (root / "resized_mask/1x").iterdir():
         cv2.imwrite(str(path), np.zeros((192, 256), np.uint8))
-    assert "everything moves" in texts(check_capture(root), "error")
+    assert "everything as dynamic" in texts(check_capture(root), "error")
 
 
-def test_a_capture_without_masks_is_warned_of(root):
+def test_missing_masks_are_a_warning(root):
     shutil.rmtree(root / "resized_mask")
     assert "no masks" in texts(check_capture(root, "nerfds"), "warning")
 
 
-def test_every_file_problem_is_named(root):
+def test_every_damaged_file_is_named(root):
     for name in ("shot003", "shot007"):
         path = root / f"rgb/1x/{name}.png"
         path.write_bytes(path.read_bytes()[:900])
@@ -85,19 +85,19 @@ def test_every_file_problem_is_named(root):
     assert "shot007.png" in texts(report, "error")
 
 
-def test_what_is_no_capture_is_not_fit(tmp_path):
+def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):
     report = check_capture(tmp_path)
     assert not report.is_fit
     assert "dataset.json is missing" in texts(report, "error")
 
 
-def test_cameras_of_other_pictures_are_warned_of(root):
+def test_cameras_that_do_not_match_the_images_are_a_warning(root):
     names = sorted(p.name for p in (root / "camera").iterdir())
     shuffled = np.random.default_rng(0).permutation(len(names))
-    facts = [(root / "camera" / name).read_text() for name in names]
+    cameras = [(root / "camera" / name).read_text() for name in names]
     for name, k in zip(names, shuffled, strict=True):
-        (root / "camera" / name).write_text(facts[k])
-    assert "cameras may not belong" in texts(check_capture(root), "warning")
+        (root / "camera" / name).write_text(cameras[k])
+    assert "cameras may not match" in texts(check_capture(root), "warning")
 
 
 def test_cameras_that_look_away_are_an_error(root):
@@ -107,16 +107,16 @@ def test_cameras_that_look_away_are_an_error(root):
     assert "do not see the points" in texts(check_capture(root), "error")
 
 
-def test_points_at_the_cameras_are_warned_of(root):
+def test_points_at_the_cameras_are_a_warning(root):
     centers = [json.loads(p.read_text())["position"] for p in (root / "camera").iterdir()]
     points = np.load(root / "points.npy")
     write_array(root / "points.npy", np.vstack([points, centers, centers]))
-    assert "no surfaces" in texts(check_capture(root), "warning")
+    assert "not on surfaces" in texts(check_capture(root), "warning")
 
 
-def write_depth(root, of_depth):
-    for k, view in enumerate(filmed.poses(16)):
-        write_array(root / f"depth/1x/shot{k:03d}.npy", of_depth(filmed.depth(view)).astype(np.float32))
+def write_depth(root, convert):
+    for k, view in enumerate(boards.poses(16)):
+        write_array(root / f"depth/1x/shot{k:03d}.npy", convert(boards.depth(view)).astype(np.float32))
 
 
 def test_inverse_depth_of_any_scale_is_fit(root):
@@ -126,12 +126,12 @@ def test_inverse_depth_of_any_scale_is_fit(root):
     assert "off at the points" in texts(report, "note")
 
 
-def test_depth_that_grows_with_distance_is_warned_of(root):
+def test_depth_instead_of_inverse_depth_is_a_warning(root):
     write_depth(root, lambda depth: depth)
-    assert "the depth of 12 of 12 frames can't be aligned" in texts(check_capture(root), "warning")
+    assert "the depth of 12 of 12 frames cannot be aligned" in texts(check_capture(root), "warning")
 
 
-def test_depth_is_not_held_against_points_that_are_not_there(root):
+def test_depth_is_not_checked_without_points(root):
     write_depth(root, lambda depth: 1.0 / depth)
     (root / "points.npy").unlink()
     report = check_capture(root)
@@ -146,21 +146,21 @@ def test_one_time_for_all_frames_is_an_error(root):
     assert "one time" in " ".join(f.text for f in quick_findings(load_capture(root)) if f.level == "error")
 
 
-def test_one_time_does_where_all_is_learnt_as_static(root):
+def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_to_be_static(root):
     names = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
-    findings = quick_findings(load_capture(root), all_static=True)
+    findings = quick_findings(load_capture(root).assuming("static"))
     assert ["one time" in f.text for f in findings if f.topic == "time"] == [True]
     assert {f.level for f in findings} == {"warning"}
 
 
-def test_flat_pictures_are_checked_without_optical_flow(film):
-    """It crashes on pictures that are less than 16 pixels high."""
-    capture = load_capture(film)
+def test_images_too_small_for_optical_flow_are_checked_without_it(original):
+    """OpenCV crashes on images that are less than 16 pixels high."""
+    capture = load_capture(original)
     frames = [capture.frame(name) for name in capture.train[:2]]
     assert motion_between(*frames) is not None
-    flat = [replace(f, image=f.image[90:102], static_mask=f.static_mask[90:102]) for f in frames]
-    assert motion_between(*flat) is None
+    small = [replace(f, image=f.image[90:102], static_mask=f.static_mask[90:102]) for f in frames]
+    assert motion_between(*small) is None
 
 
 def test_the_report_is_plain_json(root):
@@ -169,14 +169,14 @@ def test_the_report_is_plain_json(root):
     assert {f["level"] for f in plain["findings"]} == {"note"}
 
 
-def test_the_quick_check_is_quick_and_silent_about_a_good_capture(root):
+def test_the_quick_check_is_fast_and_finds_nothing_in_a_good_capture(root):
     capture = load_capture(root)
     start = time.process_time()
     assert quick_findings(capture) == []
     assert time.process_time() - start < 1.0
 
 
-def test_the_quick_check_leaves_damaged_frames_to_be_told_as_such(root):
+def test_the_quick_check_raises_on_damaged_frames(root):
     path = root / "rgb/1x/shot000.png"
     path.write_bytes(path.read_bytes()[:900])
     with pytest.raises(ValueError, match=r"shot000\.png"):
@@ -188,3 +188,8 @@ def test_the_quick_check_finds_cameras_that_look_away(root):
         rotation = np.array(json.loads(path.read_text())["orientation"])
         edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
     assert [f.level for f in quick_findings(load_capture(root))] == ["error"]
+
+
+def test_the_quick_check_compares_points_with_the_masks_of_the_files(root):
+    capture = load_capture(root)
+    assert quick_findings(capture.assuming("dynamic")) == quick_findings(capture)

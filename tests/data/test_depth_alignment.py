@@ -13,7 +13,7 @@ SCALE, OFFSET = 1.7, 0.2
 ALIGNMENT = torch.tensor([SCALE, OFFSET])
 EVERYWHERE = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
 ENOUGH = 16
-"""Samples with which a frame is aligned."""
+"""Minimum number of samples."""
 
 
 def samples(num=200, noise=0.0):
@@ -22,14 +22,14 @@ def samples(num=200, noise=0.0):
     return values, SCALE * values + OFFSET + noise * torch.randn(num, generator=g)
 
 
-def spoiled(targets, share, by):
+def with_outliers(targets, fraction, by):
     targets = targets.clone()
-    targets[: round(share * len(targets))] += by
+    targets[: round(fraction * len(targets))] += by
     return targets
 
 
 def least_absolute_deviations(values, targets):
-    """(a, b) of least Σ |a · values + b − targets|, by linear programming."""
+    """(a, b) that minimise Σ |a · values + b − targets|, by linear programming."""
     x, y, num = values.double().numpy(), targets.double().numpy(), len(values)
     line = np.stack([x, np.ones(num)], 1)
     bounds = np.block([[line, -np.eye(num)], [-line, -np.eye(num)]])  # ±(a x + b − y) ≤ slack
@@ -50,21 +50,21 @@ def test_exact_samples_give_their_scale_and_offset():
     assert error(fit_scale_offset(*samples()), ALIGNMENT) < 1e-6
 
 
-@pytest.mark.parametrize(("share", "by"), [(0.1, 1000.0), (0.2, 5.0), (0.2, -5.0), (0.3, 1.0), (0.3, -1.0)])
-def test_outliers_do_not_count(share, by):
+@pytest.mark.parametrize(("fraction", "by"), [(0.1, 1000.0), (0.2, 5.0), (0.2, -5.0), (0.3, 1.0), (0.3, -1.0)])
+def test_outliers_do_not_count(fraction, by):
     values, targets = samples()
-    assert error(fit_scale_offset(values, spoiled(targets, share, by)), ALIGNMENT) < 1e-3
+    assert error(fit_scale_offset(values, with_outliers(targets, fraction, by)), ALIGNMENT) < 1e-3
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3])
-def test_noisy_samples_are_fitted_with_the_least_absolute_error(share):
+@pytest.mark.parametrize("fraction", [0.1, 0.3])
+def test_noisy_samples_are_fitted_with_the_minimum_absolute_error(fraction):
     values, targets = samples(noise=0.05)
-    targets = spoiled(targets, share, 3.0)
+    targets = with_outliers(targets, fraction, 3.0)
     best = total_error(least_absolute_deviations(values, targets), values, targets)
     assert total_error(fit_scale_offset(values, targets), values, targets) < 1.001 * best
 
 
-def test_the_fit_follows_the_units_of_both_sides():
+def test_the_fit_scales_with_the_units_of_values_and_targets():
     values, targets = samples(noise=0.05)
     a, b = fit_scale_offset(values, targets)
     scaled = fit_scale_offset(100.0 * values, 0.01 * targets)
@@ -72,36 +72,36 @@ def test_the_fit_follows_the_units_of_both_sides():
 
 
 @pytest.mark.parametrize("far", [1e4, -1e4])
-def test_an_offset_far_from_zero_is_found_all_the_same(far):
+def test_an_offset_far_from_zero_is_found(far):
     values, _ = samples()
     targets = SCALE * values + OFFSET
     found = fit_scale_offset(values.double() + far, targets.double())
     assert relative_error(found, torch.tensor([SCALE, OFFSET - SCALE * far]).double()) < 1e-6
 
 
-def test_few_samples_are_enough_but_fewer_are_not():
+def test_the_minimum_number_of_samples_is_enough_and_fewer_are_not():
     values, targets = samples(ENOUGH)
     assert error(fit_scale_offset(values, targets), ALIGNMENT) < 1e-6
     assert fit_scale_offset(values[1:], targets[1:]).isnan().all()
 
 
-def test_no_samples_align_nothing():
+def test_no_samples_give_no_alignment():
     assert fit_scale_offset(torch.zeros(0), torch.zeros(0)).isnan().all()
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_samples_of_one_value_align_nothing(value):
+def test_samples_of_one_value_give_no_alignment(value):
     _, targets = samples()
     assert fit_scale_offset(torch.full_like(targets, value), targets).isnan().all()
 
 
-def test_samples_that_turn_depth_around_align_nothing():
+def test_a_negative_scale_gives_no_alignment():
     values, targets = samples()
     assert fit_scale_offset(values, -targets).isnan().all()
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
-def test_a_sample_that_is_not_finite_gives_no_wrong_alignment(unknown):
+def test_a_sample_that_is_not_finite_gives_no_alignment(unknown):
     values, targets = samples()
     targets[3] = unknown
     assert fit_scale_offset(values, targets).isnan().all()
@@ -115,18 +115,18 @@ def random_inverse_depth():
 
 
 def points_behind(inverse_depth, rows, columns):
-    """Points at the depths that ``ALIGNMENT`` gives to some pixels."""
+    """Points at the aligned depth of some pixels."""
     row, column = torch.cartesian_prod(torch.tensor(rows), torch.tensor(columns)).T
     return CAMERA.unproject(row, column, 1.0 / (SCALE * inverse_depth[row, column] + OFFSET))
 
 
-def test_points_align_the_inverse_depth_of_the_pixels_they_fall_on():
+def test_points_align_the_inverse_depth_of_their_pixels():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
-def test_points_seen_through_other_surfaces_do_not_count():
+def test_points_hidden_behind_other_surfaces_do_not_count():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     hidden = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 45, 5))
@@ -134,7 +134,7 @@ def test_points_seen_through_other_surfaces_do_not_count():
     assert error(found, ALIGNMENT) < 1e-3
 
 
-def test_points_do_not_count_where_something_moves():
+def test_points_in_dynamic_regions_do_not_count():
     inverse_depth = random_inverse_depth()
     static = EVERYWHERE.clone()
     static[:, :25] = False
@@ -143,12 +143,12 @@ def test_points_do_not_count_where_something_moves():
     assert error(align_to_points(inverse_depth, static, CAMERA, torch.cat([true, wrong])), ALIGNMENT) < 1e-4
 
 
-def test_points_behind_the_camera_or_beside_the_image_do_not_count():
+def test_points_behind_the_camera_or_outside_the_image_do_not_count():
     inverse_depth = random_inverse_depth()
     true = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     behind = points_behind(-inverse_depth, range(20), range(20))
-    beside = CAMERA.unproject(torch.arange(100), torch.full((100,), WIDTH + 3), torch.ones(100))
-    points = torch.cat([behind, true, beside])
+    outside = CAMERA.unproject(torch.arange(100), torch.full((100,), WIDTH + 3), torch.ones(100))
+    points = torch.cat([behind, true, outside])
     assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
@@ -181,30 +181,30 @@ def rendered_depth(inverse_depth):
     return 1.0 / (SCALE * inverse_depth + OFFSET)
 
 
-def test_a_rendering_aligns_the_inverse_depth_it_shows():
+def test_a_rendering_aligns_inverse_depth():
     inverse_depth = random_inverse_depth()
     depth = rendered_depth(inverse_depth)
     assert error(align_to_rendering(inverse_depth, EVERYWHERE, depth, OPAQUE), ALIGNMENT) < 1e-5
 
 
-@pytest.mark.parametrize("left_out", ["moving", "transparent", "unknown", "empty"])
-def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(left_out):
+@pytest.mark.parametrize("excluded", ["dynamic", "transparent", "unknown", "empty"])
+def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(excluded):
     inverse_depth, static, alpha = random_inverse_depth(), EVERYWHERE.clone(), OPAQUE.clone()
     depth = rendered_depth(inverse_depth)
-    spoiled_rows = slice(0, 22)  # most of the picture: more than a robust fit bears
-    depth[spoiled_rows] = 1.0 / (9.0 * inverse_depth[spoiled_rows] + 4.0)
-    if left_out == "moving":
-        static[spoiled_rows] = False
-    elif left_out == "transparent":
-        alpha[spoiled_rows] = 0.5
-    elif left_out == "unknown":
-        inverse_depth[spoiled_rows] = torch.nan
+    wrong_rows = slice(0, 22)  # most of the image: more outliers than a robust fit tolerates
+    depth[wrong_rows] = 1.0 / (9.0 * inverse_depth[wrong_rows] + 4.0)
+    if excluded == "dynamic":
+        static[wrong_rows] = False
+    elif excluded == "transparent":
+        alpha[wrong_rows] = 0.5
+    elif excluded == "unknown":
+        inverse_depth[wrong_rows] = torch.nan
     else:
-        depth[spoiled_rows] = 0.0
+        depth[wrong_rows] = 0.0
     assert error(align_to_rendering(inverse_depth, static, depth, alpha), ALIGNMENT) < 1e-5
 
 
-def test_an_empty_rendering_aligns_nothing():
+def test_an_empty_rendering_gives_no_alignment():
     nothing = torch.zeros(HEIGHT, WIDTH)
     assert align_to_rendering(random_inverse_depth(), EVERYWHERE, nothing, nothing).isnan().all()
 

@@ -1,9 +1,9 @@
-"""Damage to training masks."""
+"""Perturbation of training masks."""
 
 import numpy as np
 import pytest
 
-from tests.data.captures import moving_block
+from tests.data.captures import dynamic_block
 from warpgs.config import MaskPerturbation
 from warpgs.data.masks import perturb
 
@@ -11,7 +11,7 @@ STATIC = np.ones((120, 160), dtype=bool)
 STATIC[30:90, 40:110] = False
 
 
-def moving(static):
+def num_dynamic(static):
     return int((~static).sum())
 
 
@@ -19,55 +19,55 @@ def test_no_perturbation_changes_nothing():
     assert np.array_equal(perturb(STATIC, MaskPerturbation(), "a"), STATIC)
 
 
-def test_erosion_takes_its_pixels_off_every_side():
+def test_erosion_removes_its_radius_on_every_side():
     eroded = perturb(STATIC, MaskPerturbation(erode=3), "a")
-    assert moving(eroded) == (60 - 6) * (70 - 6)
+    assert num_dynamic(eroded) == (60 - 6) * (70 - 6)
     assert not (~eroded & STATIC).any()
 
 
-def test_dilation_reaches_exactly_its_pixels():
+def test_dilation_adds_exactly_its_radius():
     grown = perturb(STATIC, MaskPerturbation(dilate=3), "a")
     assert grown[60, 34:40].tolist() == [True, True, True, False, False, False]
     assert not (grown & ~STATIC).any()
 
 
-def test_an_object_cut_by_the_picture_is_not_eroded_along_the_cut():
+def test_objects_are_not_eroded_along_the_border_of_the_image():
     cut = np.ones((20, 20), dtype=bool)
     cut[:, :10] = False
     assert np.array_equal(perturb(cut, MaskPerturbation(erode=2), "a")[0], np.arange(20) >= 8)
 
 
-def test_holes_take_about_their_share_and_only_from_the_moving_region():
+def test_holes_cover_about_their_fraction_of_the_dynamic_region_only():
     holed = perturb(STATIC, MaskPerturbation(holes=0.3), "a")
-    assert 0.3 <= 1 - moving(holed) / moving(STATIC) < 0.4
+    assert 0.3 <= 1 - num_dynamic(holed) / num_dynamic(STATIC) < 0.4
     assert not (~holed & STATIC).any()
 
 
-def test_holes_depend_on_the_name_alone():
+def test_holes_depend_on_the_name():
     first, again, other = (perturb(STATIC, MaskPerturbation(holes=0.3), name) for name in ("a", "a", "b"))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
-def test_the_mask_given_is_left_as_it_was():
+def test_the_given_mask_is_unchanged():
     given = STATIC.copy()
     perturb(given, MaskPerturbation(erode=1, dilate=2, holes=0.5), "a")
     assert np.array_equal(given, STATIC)
 
 
 @pytest.mark.parametrize("perturbation", [MaskPerturbation(erode=3, dilate=3, holes=0.5)])
-def test_a_mask_with_nothing_moving_stays_so(perturbation):
+def test_a_static_mask_stays_static(perturbation):
     assert perturb(np.ones((9, 9), dtype=bool), perturbation, "a").all()
 
 
-def test_everything_moving_can_be_perturbed():
-    assert perturb(moving_block() > 300, MaskPerturbation(erode=2, dilate=2), "a").sum() == 0
+def test_an_entirely_dynamic_mask_can_be_perturbed():
+    assert perturb(dynamic_block() > 300, MaskPerturbation(erode=2, dilate=2), "a").sum() == 0
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "field"),
     [({"erode": -1}, "erode"), ({"dilate": 10**6}, "dilate"), ({"holes": 1.0}, "holes"), ({"holes": np.nan}, "holes")],
 )
-def test_a_perturbation_out_of_range_is_refused_by_name(changes, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_perturbation_out_of_range_is_refused_by_name(changes, field):
+    with pytest.raises(ValueError, match=field):
         perturb(STATIC, MaskPerturbation(**changes), "a")

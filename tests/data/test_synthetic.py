@@ -1,3 +1,5 @@
+"""The built-in capture."""
+
 import errno
 import json
 import os
@@ -10,7 +12,7 @@ import torch
 
 from warpgs.data import synthetic
 from warpgs.data.loaders import load_capture
-from warpgs.data.synthetic import BuiltinScene, builtin_capture, picture
+from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 
 SMALL = BuiltinScene(width=48, height=28, num_frames=4, num_samples=2, num_points=200)
 CPU = torch.device("cpu")
@@ -42,14 +44,14 @@ def test_every_frame_has_all_its_files(folder):
     assert set(dataset["ids"]) == set(json.loads((folder / "metadata.json").read_text())) == set(frames)
 
 
-def test_masks_are_0_exactly_where_a_moving_body_is_at_the_centre_of_a_pixel(folder):
-    shot, _ = picture(1 / 3, 0.0, SMALL, CPU)
+def test_masks_are_0_exactly_where_a_moving_body_covers_the_centre_of_a_pixel(folder):
+    *_, bodies = trace(1 / 3, 0.0, SMALL, CPU)
     mask = cv2.imread(str(folder / "resized_mask/1x/left_000001.png.png"), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(mask, np.where(shot.bodies.numpy() >= NUM_STATIC, 0, 255))
+    assert np.array_equal(mask, np.where(bodies.numpy() >= NUM_STATIC, 0, 255))
 
 
 @pytest.mark.parametrize("name", ["left_000000", "left_000001", "left_000003", "right_000002"])
-def test_the_centre_of_the_ball_is_seen_within_the_mask(capture, name):
+def test_the_mask_contains_the_centre_of_the_ball(capture, name):
     time = int(name[-1]) / 3
     ball = synthetic._moving_bodies(time)[1]
     center = (torch.tensor([ball.center]) - torch.tensor(synthetic.CENTER)) * synthetic.SCALE
@@ -67,7 +69,7 @@ def test_it_loads_as_a_nerfds_capture(capture):
     assert 0.02 < (~frame.static_mask).float().mean() < 0.3
 
 
-def test_the_evaluation_camera_is_beside_the_training_camera(capture):
+def test_the_evaluation_camera_is_next_to_the_training_camera(capture):
     left, right = capture.cameras["left_000002"], capture.cameras["right_000002"]
     assert torch.equal(left.viewmat[:3, :3], right.viewmat[:3, :3])
     distance = (left.position - right.position).norm()
@@ -75,10 +77,10 @@ def test_the_evaluation_camera_is_beside_the_training_camera(capture):
 
 
 def distances(points, body):
-    """Distance of points from a static body's surface; from that of an ellipsoid only if it is a ball."""
-    local = ((points - torch.tensor(body.center)) @ body.turn).abs()
+    """Distance of points from the surface of a static body; ellipsoids must be spheres."""
+    local = ((points - torch.tensor(body.center)) @ body.rotation).abs()
     half = torch.tensor(body.half_sizes)
-    if body.kind == synthetic.SPHERE:
+    if body.shape == synthetic.SPHERE:
         return (local.norm(dim=1) - half[0]).abs()
     beyond = local - half
     return (beyond.clamp_min(0).norm(dim=1) + beyond.amax(1).clamp_max(0)).abs()
@@ -91,17 +93,17 @@ def test_points_lie_on_static_surfaces_up_to_their_noise(folder):
     assert float(distance.max()) < 5 * synthetic.POINT_NOISE
 
 
-def test_points_are_seen_from_the_training_cameras(capture):
+def test_training_cameras_see_the_points(capture):
     seen = [capture.cameras[name].project(capture.points) for name in capture.train]
     assert all(bool((depth > 0).all()) for _, _, depth, _ in seen)
-    # Noise may push a point from the outermost pixels out of the picture.
+    # Noise may move a point of the outermost pixels out of the image.
     assert torch.stack([inside for *_, inside in seen]).any(0).float().mean() > 0.97
 
 
 def test_monocular_depth_is_inverse_depth_up_to_scale_and_offset(capture):
-    shot, _ = picture(1 / 3, 0.0, SMALL, CPU)
+    _, _, depth, _ = trace(1 / 3, 0.0, SMALL, CPU)
     inverse = capture.frame("left_000001").inverse_depth.flatten()
-    truth = 1.0 / shot.depth.flatten()
+    truth = 1.0 / depth.flatten()
     together = torch.stack([inverse, truth])
     assert torch.corrcoef(together)[0, 1] > 0.9999
 
@@ -109,7 +111,7 @@ def test_monocular_depth_is_inverse_depth_up_to_scale_and_offset(capture):
 def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
     fits = []
     for k, name in enumerate(capture.train):
-        truth = 1.0 / picture(k / 3, 0.0, SMALL, CPU)[0].depth.flatten()
+        truth = 1.0 / trace(k / 3, 0.0, SMALL, CPU)[2].flatten()
         inverse = capture.frame(name).inverse_depth.flatten()
         fits.append(torch.linalg.lstsq(torch.stack([truth, torch.ones_like(truth)], 1), inverse[:, None]).solution)
     assert bool((torch.cat(fits, 1).amax(1) - torch.cat(fits, 1).amin(1) > 0.02).all())
@@ -133,16 +135,16 @@ def test_shadows_move_over_static_pixels():
     assert (change[static] > 0.1).sum() > 10
 
 
-def test_the_same_bytes_are_written_twice(tmp_path):
+def test_the_capture_is_deterministic(tmp_path):
     folders = [builtin_capture(tmp_path / name, SMALL, quiet=True) for name in ("a", "b")]
     files = [sorted(p.relative_to(f) for p in f.rglob("*") if p.is_file()) for f in folders]
     assert files[0] == files[1]
     assert all((folders[0] / p).read_bytes() == (folders[1] / p).read_bytes() for p in files[0])
 
 
-def test_a_finished_capture_is_not_made_again(tmp_path, monkeypatch):
+def test_a_cached_capture_is_not_written_again(tmp_path, monkeypatch):
     folder = builtin_capture(tmp_path, SMALL, quiet=True)
-    monkeypatch.setattr(synthetic, "write_builtin_capture", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(synthetic, "write_builtin_capture", lambda *_: pytest.fail("written again"))
     assert builtin_capture(tmp_path, SMALL, quiet=True) == folder
 
 
@@ -164,9 +166,9 @@ def test_another_size_is_another_capture(tmp_path):
     assert builtin_capture(tmp_path, SMALL, quiet=True) != builtin_capture(tmp_path, other, quiet=True)
 
 
-def test_a_cache_that_can_not_be_made_is_told_in_words(tmp_path):
+def test_the_error_names_a_cache_that_cannot_be_created(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match=f"can't be kept in {re.escape(str(tmp_path / 'file'))}"):
+    with pytest.raises(OSError, match=f"cannot be kept in {re.escape(str(tmp_path / 'file'))}"):
         builtin_capture(tmp_path / "file", SMALL, quiet=True)
 
 
@@ -180,6 +182,6 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, monkeypatch):
     assert [p for p in tmp_path.rglob("*") if p.is_file() or p.name.startswith("partial")] == []
 
 
-def test_one_frame_is_refused_in_words(tmp_path):
+def test_a_single_frame_is_refused(tmp_path):
     with pytest.raises(ValueError, match="at least 2 frames, got 1"):
         builtin_capture(tmp_path, BuiltinScene(num_frames=1), quiet=True)

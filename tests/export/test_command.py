@@ -211,7 +211,7 @@ def test_a_page_without_a_capture_starts_at_a_default_camera_that_sees_the_scene
     summary = export(stranded, tmp_path, format="html")
     assert "default cameras, because the capture cannot be opened" in summary
     means = clouds_of(stranded).scene.scene.static.means
-    camera = camera_paths.default_camera(camera_paths.Ball.around(means))
+    camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(means))
     assert camera.project(means)[3].float().mean() > 0.7
 
 

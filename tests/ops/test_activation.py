@@ -1,4 +1,4 @@
-"""From raw Gaussians and what the networks say to splats (paper Eq. 5, 8 and 11)."""
+"""Activation of raw Gaussians with the outputs of the networks (paper Eq. 5, 8 and 11)."""
 
 from itertools import chain
 
@@ -35,12 +35,12 @@ def doubles(tensors):
 
 
 def assert_same(ours, expected, inputs, twins):
-    """Compares values, and gradients of whatever has any."""
+    """Compares values, and the gradients of all inputs that have any."""
     for value, wanted in zip(ours, expected, strict=True):
         assert torch.allclose(value.double(), wanted, rtol=2e-6, atol=2e-6)
-    cotangents = random_like(ours)
-    torch.autograd.backward(ours, cotangents)
-    torch.autograd.backward(expected, [c.double() for c in cotangents])
+    v_outputs = random_like(ours)
+    torch.autograd.backward(ours, v_outputs)
+    torch.autograd.backward(expected, [c.double() for c in v_outputs])
     for tensor, wanted in zip(inputs, twins, strict=True):
         if tensor is not None and wanted.grad is not None:
             assert torch.allclose(tensor.grad.double(), wanted.grad, rtol=2e-6, atol=5e-6)
@@ -48,11 +48,11 @@ def assert_same(ours, expected, inputs, twins):
 
 @pytest.mark.parametrize(("num_static", "num_dynamic"), SIZES)
 @pytest.mark.parametrize("changed", [(False, False), (True, False), (False, True), (True, True)])
-def test_geometry_and_its_gradients_are_those_of_the_reference(num_static, num_dynamic, changed):
+def test_geometry_and_its_gradients_equal_the_reference(num_static, num_dynamic, changed):
     static, dynamic = random_raw(num_static), random_raw(num_dynamic, seed=1)
-    relit = random_changes(num_static) if changed[0] else NO_CHANGES
-    moved = random_changes(num_dynamic, seed=7) if changed[1] else NO_CHANGES
-    parts = [static, dynamic, relit, moved]
+    static_changes = random_changes(num_static) if changed[0] else NO_CHANGES
+    dynamic_changes = random_changes(num_dynamic, seed=7) if changed[1] else NO_CHANGES
+    parts = [static, dynamic, static_changes, dynamic_changes]
     twins = [doubles(part) for part in parts]
     inputs = [leaves(part) for part in parts]
     assert_same(activate(*parts), reference.activate(*twins), [*chain(*inputs)], [*chain(*twins)])
@@ -62,7 +62,7 @@ def test_geometry_and_its_gradients_are_those_of_the_reference(num_static, num_d
 @pytest.mark.parametrize(("num_static", "num_dynamic"), SIZES)
 @pytest.mark.parametrize("rest", [0, 3])
 @pytest.mark.parametrize("changed", [0, 1])
-def test_colours_and_their_gradients_are_those_of_the_reference(num_static, num_dynamic, rest, changed):
+def test_colours_and_their_gradients_equal_the_reference(num_static, num_dynamic, rest, changed):
     static, dynamic = random_raw(num_static, rest), random_raw(num_dynamic, rest, seed=1)
     residuals = random_residuals(num_static, 1 + rest // 3) if changed else None
     inputs = leaves([*static, *dynamic, residuals])
@@ -73,7 +73,7 @@ def test_colours_and_their_gradients_are_those_of_the_reference(num_static, num_
     assert dynamic.sh_rest.grad is not None
 
 
-def test_what_gets_no_gradient_hands_none_back():
+def test_outputs_without_a_gradient_contribute_zero():
     static = random_raw(4)
     static.means.requires_grad_()
     static.log_scales.requires_grad_()
@@ -82,12 +82,12 @@ def test_what_gets_no_gradient_hands_none_back():
     assert not static.log_scales.grad.any()
 
 
-def test_products_of_quaternions_turn_first_by_the_right_one():
+def test_a_product_of_quaternions_rotates_by_the_right_factor_first():
     a, b = (torch.randn(6, 4, generator=generator(seed)).double() for seed in (0, 1))
     assert error(rotation(reference.multiply(a, b)), rotation(a) @ rotation(b)) < 1e-12
 
 
-def test_opacities_stay_within_zero_and_one():
+def test_opacities_stay_between_zero_and_one():
     static = random_raw(2)._replace(logit_opacities=torch.tensor([-1000.0, 1000.0]).requires_grad_())
     opacities = activate(static, random_raw(0)).opacities
     opacities.sum().backward()
@@ -107,4 +107,4 @@ def test_branches_of_different_degrees_are_refused():
 
 def test_offsets_of_another_number_of_gaussians_are_refused():
     with pytest.raises(ValueError, match=r"dynamic: offsets must have shape \[N, 10\] with N = 2"):
-        activate(random_raw(2), random_raw(2), moved=random_changes(3))
+        activate(random_raw(2), random_raw(2), dynamic_changes=random_changes(3))

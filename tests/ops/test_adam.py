@@ -1,9 +1,10 @@
-"""Adam (Kingma and Ba 2015) against torch's own."""
+"""Adam (Kingma and Ba 2015) against the reference and torch."""
 
 import pytest
 import torch
 
-from tests.scenes import generator
+from tests.reference.adam import adam as reference
+from tests.scenes import generator, relative_error
 from warpgs.ops.adam import Adam
 
 BETAS, EPSILON = (0.9, 0.999), 1e-15
@@ -19,7 +20,23 @@ def make(params):
     return Adam([{"params": [p], "lr": r} for p, r in zip(params, rates.unbind(), strict=True)], BETAS, EPSILON), rates
 
 
-def test_steps_are_those_of_torch():
+def test_steps_equal_the_reference():
+    params = parameters()
+    optimizer, _ = make(params)
+    gradients = [[torch.randn(p.shape, generator=generator(10 * k)) for k in range(1, 21)] for p in params]
+    doubles = [p.detach().double() for p in params]
+    for step in zip(*gradients, strict=True):
+        for parameter, gradient in zip(params, step, strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+    for parameter, start, steps, rate in zip(params, doubles, gradients, RATES, strict=True):
+        expected, mean, square = reference(start, [g.double() for g in steps], rate, BETAS, EPSILON)
+        assert relative_error(parameter.detach(), expected) < 1e-6
+        assert relative_error(optimizer.state[parameter]["exp_avg"], mean) < 1e-6
+        assert relative_error(optimizer.state[parameter]["exp_avg_sq"], square) < 1e-6
+
+
+def test_steps_equal_those_of_torch():
     ours, theirs = parameters(), parameters()
     optimizer, _ = make(ours)
     groups = [{"params": [p], "lr": r} for p, r in zip(theirs, RATES, strict=True)]
@@ -36,7 +53,7 @@ def test_steps_are_those_of_torch():
             assert torch.allclose(optimizer.state[a][name], expected.state[b][name], rtol=1e-6, atol=1e-7)
 
 
-def test_the_first_step_has_the_length_of_the_rate():
+def test_the_length_of_the_first_step_is_the_learning_rate():
     (parameter, _) = params = parameters()
     optimizer, _ = make(params)
     before = parameter.detach().clone()
@@ -45,7 +62,7 @@ def test_the_first_step_has_the_length_of_the_rate():
     assert torch.allclose((parameter - before).abs(), torch.full_like(before, RATES[0]), rtol=1e-4)
 
 
-def test_rates_are_read_anew_in_every_step():
+def test_rates_are_read_in_every_step():
     (parameter, _) = params = parameters()
     optimizer, rates = make(params)
     rates.zero_()
@@ -55,7 +72,7 @@ def test_rates_are_read_anew_in_every_step():
     assert torch.equal(parameter, before)
 
 
-def test_a_parameter_without_a_gradient_stays_and_its_steps_are_not_counted():
+def test_a_parameter_without_a_gradient_is_skipped():
     params = parameters()
     optimizer, _ = make(params)
     before = params[1].detach().clone()
@@ -67,7 +84,7 @@ def test_a_parameter_without_a_gradient_stays_and_its_steps_are_not_counted():
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (1,), ()])
-def test_parameters_of_any_shape_are_taken(shape):
+def test_parameters_may_have_any_shape(shape):
     parameter = torch.zeros(shape, requires_grad=True)
     optimizer = Adam([{"params": [parameter], "lr": torch.tensor(0.5)}], BETAS, EPSILON)
     parameter.grad = torch.ones(shape)

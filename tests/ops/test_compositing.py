@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from tests.reference.compositing import composite as reference
-from tests.scenes import error, generator, pulled, random_like, relative_error
+from tests.scenes import error, generator, random_like, relative_error, weighted_sum
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Projection
 from warpgs.runtime.launch import command_for
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 SIZE = (50, 37)
 INPUTS = ("means2d", "conics", "opacities", "features", "background")
@@ -42,10 +42,10 @@ def make_walled_inputs(num=40, size=SIZE):
     return inputs
 
 
-def theirs(inputs, size=SIZE, drawn=None):
+def theirs(inputs, size=SIZE, selected=None):
     means2d, conics, opacities, features, background, depths = inputs
-    drawn = torch.ones(means2d.shape[0], dtype=torch.bool) if drawn is None else drawn
-    return reference(means2d, conics, opacities, features, depths, drawn, size, background)
+    selected = torch.ones(means2d.shape[0], dtype=torch.bool) if selected is None else selected
+    return reference((means2d, conics, depths, opacities), features, selected, size, background)
 
 
 def leaves(inputs, dtype=torch.float32):
@@ -53,7 +53,7 @@ def leaves(inputs, dtype=torch.float32):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 33), SIZE])
-def test_image_and_alpha_are_those_of_the_reference(size):
+def test_image_and_alpha_equal_the_reference(size):
     inputs = make_inputs(size=size)
     image, alpha, _ = theirs([t.double() for t in inputs], size)
     result = ours(inputs, size)
@@ -62,44 +62,44 @@ def test_image_and_alpha_are_those_of_the_reference(size):
 
 
 @pytest.mark.parametrize("num", [0, 1, 40])
-def test_gradients_are_those_of_the_reference(num):
+def test_gradients_equal_the_reference(num):
     inputs = make_inputs(num)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result = ours(single)
     outputs = [result.images[0], result.alphas[0]]
-    cotangents = random_like(outputs)
-    pulled(outputs, cotangents).backward()
-    pulled(theirs(double)[:2], cotangents).backward()
+    v_outputs = random_like(outputs)
+    weighted_sum(outputs, v_outputs).backward()
+    weighted_sum(theirs(double)[:2], v_outputs).backward()
     for name, actual, expected in zip(INPUTS, single, double, strict=False):
         wanted = torch.zeros_like(expected) if expected.grad is None else expected.grad
         assert (actual.grad - wanted).norm() <= 1e-5 * wanted.norm(), name
 
 
-def test_gradients_of_three_images_are_those_of_the_reference():
+def test_gradients_of_three_images_equal_the_reference():
     inputs = make_inputs()
     branch = torch.rand(40) > 0.5
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result = ours(single, is_dynamic=branch, statistics=True)
     outputs = [*result.images, *result.alphas]
-    cotangents = random_like(outputs)
-    expected = [theirs(double, drawn=drawn) for drawn in (None, ~branch, branch)]
-    pulled(outputs, cotangents).backward()
-    pulled([e[k] for k in (0, 1) for e in expected], cotangents).backward()
+    v_outputs = random_like(outputs)
+    expected = [theirs(double, selected=selected) for selected in (None, ~branch, branch)]
+    weighted_sum(outputs, v_outputs).backward()
+    weighted_sum([e[k] for k in (0, 1) for e in expected], v_outputs).backward()
     for name, actual, wanted in zip(INPUTS, single, double, strict=False):
         assert relative_error(actual.grad, wanted.grad) < 1e-5, name
 
 
 @pytest.mark.parametrize("chosen", ["image", "alpha"])
-def test_a_cotangent_of_one_output_alone_is_enough(chosen):
+def test_a_gradient_of_a_single_output_is_propagated(chosen):
     inputs = make_inputs()
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result = ours(single)
     actual, expected = (
         (result.images[0], theirs(double)[0]) if chosen == "image" else (result.alphas[0], theirs(double)[1])
     )
-    cotangents = random_like([actual])
-    pulled([actual], cotangents).backward()
-    pulled([expected], cotangents).backward()
+    v_outputs = random_like([actual])
+    weighted_sum([actual], v_outputs).backward()
+    weighted_sum([expected], v_outputs).backward()
     assert relative_error(single[0].grad, double[0].grad) < 1e-5
     assert relative_error(single[2].grad, double[2].grad) < 1e-5
 
@@ -114,23 +114,23 @@ def test_a_stack_of_opaque_splats_stops_where_the_reference_stops():
     assert hidden.any()
     assert torch.equal(result.contributed, ~hidden)
     assert error(result.images[0], image) < 2e-6
-    cotangents = random_like([result.images[0]])
-    pulled(result.images, cotangents).backward()
-    pulled([image], cotangents).backward()
+    v_outputs = random_like([result.images[0]])
+    weighted_sum(result.images, v_outputs).backward()
+    weighted_sum([image], v_outputs).backward()
     assert relative_error(single[2].grad, double[2].grad) < 1e-5
     assert not single[2].grad[hidden].any()
 
 
-def test_a_fully_opaque_splat_is_clamped_and_gets_no_gradient_where_it_is():
+def test_a_fully_opaque_splat_gets_no_gradient_where_it_is_clamped():
     inputs = make_inputs(1)
     inputs[0] = torch.tensor([[25.5, 18.5]])
     inputs[2] = torch.ones(1)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result, alpha = ours(single), theirs(double)[1]
     assert result.alphas[0].max().item() == pytest.approx(0.999, abs=1e-6)
-    cotangents = random_like([alpha])
-    pulled(result.alphas, cotangents).backward()
-    pulled([alpha], cotangents).backward()
+    v_outputs = random_like([alpha])
+    weighted_sum(result.alphas, v_outputs).backward()
+    weighted_sum([alpha], v_outputs).backward()
     assert relative_error(single[2].grad, double[2].grad) < 1e-5
 
 
@@ -142,25 +142,25 @@ def test_statistics_are_the_sums_of_the_blend_weights():
     assert torch.equal(result.contributed, weights > 0)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("fraction", [0.0, 0.5, 0.9, 1.0])
 @pytest.mark.parametrize("k", [0, 1, 2])
-def test_each_image_alone_can_be_gone_back_from(share, k):
+def test_each_image_alone_propagates_its_gradient(fraction, k):
     inputs = make_inputs()
-    dynamic = inputs[0][:, 0] < share * SIZE[0]  # so that there are tiles of one branch, too
+    dynamic = inputs[0][:, 0] < fraction * SIZE[0]  # so that there are tiles of one branch, too
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     image = ours(single, is_dynamic=dynamic).images[k]
-    expected = theirs(double, drawn=(torch.ones(40, dtype=torch.bool), ~dynamic, dynamic)[k])[0]
+    expected = theirs(double, selected=(torch.ones(40, dtype=torch.bool), ~dynamic, dynamic)[k])[0]
     assert error(image, expected) < 2e-6
-    (cotangent,) = random_like([image])
-    pulled([image], [cotangent]).backward()
-    pulled([expected], [cotangent]).backward()
+    (v_output,) = random_like([image])
+    weighted_sum([image], [v_output]).backward()
+    weighted_sum([expected], [v_output]).backward()
     for name, a, e in zip(INPUTS, single, double, strict=False):
         wanted = torch.zeros_like(e) if e.grad is None else e.grad
         assert error(a.grad, wanted) < 1e-5 * (1 + wanted.abs().max()), name
 
 
 @pytest.mark.parametrize("wall_is_dynamic", [False, True])
-def test_behind_a_wall_of_one_branch_the_other_has_an_image_of_its_own(wall_is_dynamic):
+def test_behind_a_wall_of_one_branch_the_other_has_its_own_image(wall_is_dynamic):
     inputs = make_walled_inputs()
     dynamic = (torch.arange(40) < 12) == wall_is_dynamic
     dynamic[20:25] = wall_is_dynamic
@@ -169,27 +169,27 @@ def test_behind_a_wall_of_one_branch_the_other_has_an_image_of_its_own(wall_is_d
     outputs = [*result.images, *result.alphas]
     for k in (0, 3):
         assert torch.equal(outputs[k], outputs[k + 1 + wall_is_dynamic])
-    expected = [theirs(double, drawn=drawn) for drawn in (None, ~dynamic, dynamic)]
+    expected = [theirs(double, selected=selected) for selected in (None, ~dynamic, dynamic)]
     expected = [e[k] for k in (0, 1) for e in expected]
     for actual, wanted in zip(outputs, expected, strict=True):
         assert error(actual, wanted) < 2e-6
-    cotangents = random_like(outputs)
-    pulled(outputs, cotangents).backward()
-    pulled(expected, cotangents).backward()
+    v_outputs = random_like(outputs)
+    weighted_sum(outputs, v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
     for name, actual, wanted in zip(INPUTS, single, double, strict=False):
         assert relative_error(actual.grad, wanted.grad) < 1e-5, name
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("make", [make_inputs, make_walled_inputs])
-def test_every_image_is_that_of_its_splats_drawn_alone(make, seed, monkeypatch):
+def test_every_image_equals_that_of_its_splats_rendered_alone(make, seed, monkeypatch):
     size = (112, 80)  # with splats that reach into more tiles than one thread writes
     inputs = make(60, size)
     inputs[1][::4] = torch.tensor([1e-4, 0.0, 1e-4])
     inputs[2] *= torch.rand(60, generator=generator(seed))
     dynamic = torch.rand(60, generator=generator(seed)) < (0.1, 0.5, 0.9, 0.5)[seed]
-    alone = [ours([t if t.shape[0] != 60 else t[drawn] for t in inputs], size) for drawn in (~dynamic, dynamic)]
-    launch = Run._launch
+    alone = [ours([t if t.shape[0] != 60 else t[selected] for t in inputs], size) for selected in (~dynamic, dynamic)]
+    launch = OpContext._launch
     for backwards in (False, True):  # as on a GPU, where a branch's image may begin before the joint one ends
 
         def run_kernel(run, kernel, dim, arguments, block_dim, work, backwards=backwards):
@@ -198,14 +198,14 @@ def test_every_image_is_that_of_its_splats_drawn_alone(make, seed, monkeypatch):
             for thread in reversed(range(dim)):
                 command_for(kernel, run.device, 1)(1, thread, arguments, None, 0)
 
-        monkeypatch.setattr(Run, "_launch", run_kernel)
+        monkeypatch.setattr(OpContext, "_launch", run_kernel)
         result = ours(inputs, size, is_dynamic=dynamic)
         for k, expected in enumerate([ours(inputs, size), *alone]):
             assert torch.equal(result.images[k], expected.images[0])
             assert torch.equal(result.alphas[k], expected.alphas[0])
 
 
-def test_a_splat_that_closes_a_pixel_of_the_joint_image_alone_makes_it_differ():
+def test_a_splat_that_completes_a_pixel_of_the_joint_image_only_makes_it_differ():
     conics, means2d = torch.tensor([[0.01, 0.0, 0.01]]).repeat(4, 1), torch.full((4, 2), 0.5)
     opacities, depths = torch.tensor([0.99, 0.98, 0.9, 0.4]), torch.arange(1.0, 5.0)
     inputs = [means2d, conics, opacities, torch.eye(4), torch.zeros(4), depths]
@@ -230,36 +230,38 @@ FEW = make_inputs(8, size=(20, 17))
         (make_walled_inputs(16, (20, 17)), torch.arange(16) >= 12),
     ],
 )
-def test_absolute_norms_sum_the_lengths_pixel_by_pixel(inputs, dynamic):
+def test_absolute_gradient_norms_sum_absolute_values_over_pixels(inputs, dynamic):
     size = (20, 17)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
     result = ours(single, size, absgrad=True, is_dynamic=dynamic)
-    images = [theirs(double, size, drawn)[0] for drawn in ([None] if dynamic is None else [None, ~dynamic, dynamic])]
-    cotangents = random_like(images)
-    pulled(result.images, cotangents).backward()
-    per_pixel = torch.cat([(i * c).sum(-1).flatten() for i, c in zip(images, cotangents, strict=True)])
+    images = [
+        theirs(double, size, selected)[0] for selected in ([None] if dynamic is None else [None, ~dynamic, dynamic])
+    ]
+    v_outputs = random_like(images)
+    weighted_sum(result.images, v_outputs).backward()
+    per_pixel = torch.cat([(i * c).sum(-1).flatten() for i, c in zip(images, v_outputs, strict=True)])
     gradients = torch.stack([torch.autograd.grad(p, double[0], retain_graph=True)[0] for p in per_pixel])
     half_size = torch.tensor([size[0] / 2, size[1] / 2])
-    assert relative_error(result.norms[:, 0], (gradients.sum(0) * half_size).norm(dim=-1)) < 1e-5
-    assert relative_error(result.norms[:, 1], (gradients.abs().sum(0) * half_size).norm(dim=-1)) < 1e-5
+    assert relative_error(result.gradient_norms[:, 0], (gradients.sum(0) * half_size).norm(dim=-1)) < 1e-5
+    assert relative_error(result.gradient_norms[:, 1], (gradients.abs().sum(0) * half_size).norm(dim=-1)) < 1e-5
 
 
 @pytest.mark.parametrize(
-    "spoilt",
+    "invalid",
     [{"opacities": 1.5}, {"opacities": 0.9 / 255}, {"conics": -1.0}, {"means2d": float("nan")}, {"depths": 0.0}],
 )
-def test_splats_that_make_no_sense_are_not_drawn(spoilt):
+def test_invalid_splats_are_skipped(invalid):
     inputs = make_inputs()
-    ((name, value),) = spoilt.items()
+    ((name, value),) = invalid.items()
     names = (*INPUTS, "depths")
     bad = [t.clone() for t in inputs]
     bad[names.index(name)][::4] = value
-    kept = torch.arange(40) % 4 != 0
-    without = [t if n == "background" else t[kept].contiguous() for n, t in zip(names, inputs, strict=True)]
+    valid = torch.arange(40) % 4 != 0
+    without = [t if n == "background" else t[valid].contiguous() for n, t in zip(names, inputs, strict=True)]
     assert torch.equal(ours(bad).images[0], ours(without).images[0])
 
 
-def test_without_a_background_black_is_behind():
+def test_the_default_background_is_black():
     inputs = make_inputs()
     plain = [*inputs[:4], None, inputs[5]]
     black = [*inputs[:4], torch.zeros(3), inputs[5]]

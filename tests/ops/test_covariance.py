@@ -1,4 +1,4 @@
-"""Covariances from quaternions and scales, and Warp's own adjoint of them."""
+"""Covariances from quaternions and scales, and Warp's generated adjoint."""
 
 import pytest
 import torch
@@ -8,25 +8,25 @@ from tests.scenes import error, make_splats, random_like, relative_error
 from warpgs.ops.covariance import covariance
 
 
-def test_covariance_is_that_of_the_reference():
+def test_covariance_equals_the_reference():
     splats = make_splats()
     expected = reference(splats.quats.double(), splats.scales.double())
     assert error(covariance(splats.quats, splats.scales), expected) < 2e-6
 
 
-def test_gradients_are_those_of_the_reference():
+def test_gradients_equal_the_reference():
     splats = make_splats()
     inputs = [t.clone().requires_grad_() for t in (splats.quats, splats.scales)]
     doubles = [t.double().requires_grad_() for t in (splats.quats, splats.scales)]
     value = covariance(*inputs)
-    (cotangent,) = random_like([value])
-    value.backward(cotangent)
-    reference(*doubles).backward(cotangent.double())
+    (v_output,) = random_like([value])
+    value.backward(v_output)
+    reference(*doubles).backward(v_output.double())
     for actual, expected in zip(inputs, doubles, strict=True):
         assert relative_error(actual.grad, expected.grad) < 2e-6
 
 
-def test_length_of_a_quaternion_does_not_matter():
+def test_the_length_of_a_quaternion_does_not_matter():
     splats = make_splats()
     plain = covariance(splats.quats, splats.scales)
     assert error(covariance(splats.quats * 7.0, splats.scales), plain) < 2e-6

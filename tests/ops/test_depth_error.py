@@ -16,7 +16,7 @@ def doubles(inputs):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_error_is_that_of_the_reference(size):
+def test_error_equals_the_reference(size):
     inputs = random_inputs(*size, generator())
     expected = reference(*doubles(inputs))
     assert expected > 0
@@ -24,7 +24,7 @@ def test_error_is_that_of_the_reference(size):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_gradient_is_that_of_the_reference(size):
+def test_gradient_equals_the_reference(size):
     inputs = random_inputs(*size, generator())
     double = doubles(inputs)
     inputs[0].requires_grad_()
@@ -34,7 +34,7 @@ def test_gradient_is_that_of_the_reference(size):
     assert relative_error(inputs[0].grad, double[0].grad) < 1e-6
 
 
-def test_a_depth_that_is_right_is_not_pulled():
+def test_exact_depth_has_no_error_and_no_gradient():
     depth, opaque, everywhere = torch.full((3, 4), 4.0), torch.ones(3, 4), torch.ones(3, 4, dtype=torch.bool)
     depth.requires_grad_()
     value = depth_error(depth, opaque, torch.full((3, 4), 0.25), torch.tensor([1.0, 0.0]), everywhere)
@@ -44,7 +44,7 @@ def test_a_depth_that_is_right_is_not_pulled():
 
 
 @pytest.mark.parametrize("alignment", [[torch.nan, torch.nan], [-1.0, 0.0], [0.0, 1e-3]])
-def test_without_an_alignment_that_leaves_targets_there_is_no_error(alignment):
+def test_an_alignment_without_valid_targets_has_no_error(alignment):
     depth, alpha, inverse_depth, _, region = random_inputs(5, 6, generator())
     depth.requires_grad_()
     value = depth_error(depth, alpha, inverse_depth, torch.tensor(alignment), region)
@@ -53,7 +53,7 @@ def test_without_an_alignment_that_leaves_targets_there_is_no_error(alignment):
     assert not depth.grad.any()
 
 
-def test_depth_alone_gets_a_gradient():
+def test_only_depth_gets_a_gradient():
     inputs = [t.requires_grad_() if t.is_floating_point() else t for t in random_inputs(5, 6, generator())]
     depth_error(*inputs).backward()
     assert [t.grad is None for t in inputs] == [False, True, True, True, True]
@@ -62,7 +62,7 @@ def test_depth_alone_gets_a_gradient():
 @pytest.mark.parametrize("name", ["depth", "alpha", "inverse_depth", "alignment", "region"])
 @pytest.mark.parametrize("spoil", [lambda t: t[:1], lambda t: t.double(), lambda t: t[..., None]])
 @pytest.mark.usefixtures("contracts_off")
-def test_what_does_not_fit_is_refused(name, spoil):
+def test_inputs_that_do_not_fit_are_refused(name, spoil):
     names = ["depth", "alpha", "inverse_depth", "alignment", "region"]
     inputs = dict(zip(names, random_inputs(5, 6, generator()), strict=True))
     with pytest.raises(ValueError, match=" must "):

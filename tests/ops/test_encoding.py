@@ -9,7 +9,7 @@ from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
 from warpgs.kernels.encoding import CUDA_LANES_LOG2, make_encode
 from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 TIME = torch.tensor([0.3])
 BOX = (torch.zeros(3), torch.ones(3))
@@ -19,42 +19,42 @@ def random_means(num):
     return 2.0 * torch.rand(num, 3, generator=generator()) - 1.0
 
 
-def encode_plainly(means, *bands, time=TIME, **options):
+def encode_unit_box(means, *bands, time=TIME, **options):
     return encode(means, time, bands, *BOX, **options)
 
 
 def waves(values, bands):
-    """Equation 6 in Python's own floats, each value's frequencies together."""
+    """Equation 6 in Python floats, with the frequencies of a value side by side."""
     angles = [2**k * math.pi * x for x in values for k in range(bands)]
     return [*values, *map(math.sin, angles), *map(math.cos, angles)]
 
 
-def test_the_encoding_is_that_of_the_reference():
+def test_the_encoding_equals_the_reference():
     means, center, half_size = random_means(50), torch.tensor([0.1, 2.0, -1.0]), torch.tensor([1.0, 3.0, 0.5])
     positions = reference((means.double() - center) / half_size, 6)
-    moments = reference(TIME.double()[:, None], 4).expand(50, -1)
+    times = reference(TIME.double()[:, None], 4).expand(50, -1)
     encoded = encode(means, TIME, (6, 4), center, half_size)[:, : encoded_size(6, 4)]
     # p is rounded before the highest frequency multiplies its error by 32 π.
-    assert error(encoded, torch.cat([positions, moments], 1)) < 2e-5
+    assert error(encoded, torch.cat([positions, times], 1)) < 2e-5
 
 
 @pytest.mark.parametrize("bands", [(1, 2), (4, 1), (10, 10)])
-def test_the_encoding_holds_equation_6_of_position_and_of_time(bands):
+def test_the_encoding_is_equation_6_for_position_and_time(bands):
     means = random_means(6)
-    encoded = encode_plainly(means, *bands)
+    encoded = encode_unit_box(means, *bands)
     for row in range(6):
         expected = waves(means[row].tolist(), bands[0]) + waves(TIME.tolist(), bands[1])
         assert error(encoded[row, : len(expected)], torch.tensor(expected, dtype=torch.float64)) < 1e-6
 
 
-def test_half_precision_is_single_precision_rounded():
+def test_half_precision_is_rounded_single_precision():
     means = random_means(20)
-    assert torch.equal(encode_plainly(means, 4, 3, half=True), encode_plainly(means, 4, 3).half())
+    assert torch.equal(encode_unit_box(means, 4, 3, half=True), encode_unit_box(means, 4, 3).half())
 
 
 @pytest.mark.parametrize("bands", [(10, 10), (3, 2), (0, 0), (1, 3)])
-def test_rows_are_padded_with_zeros_to_whole_pieces_of_memory(bands):
-    encoded = encode_plainly(random_means(2), *bands)
+def test_rows_are_padded_with_zeros_to_a_multiple_of_the_alignment(bands):
+    encoded = encode_unit_box(random_means(2), *bands)
     size = encoded_size(*bands)
     assert encoded.shape == (2, math.ceil(size / ALIGNMENT) * ALIGNMENT)
     assert not encoded[:, size:].any()
@@ -62,51 +62,51 @@ def test_rows_are_padded_with_zeros_to_whole_pieces_of_memory(bands):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_room_is_left_before_the_encoding(half):
+def test_the_encoding_starts_at_the_offset(half):
     means = random_means(5)
-    with_room = encode_plainly(means, 4, 2, room=16, half=half)
-    assert torch.equal(with_room[:, 16:], encode_plainly(means, 4, 2, half=half))
+    with_offset = encode_unit_box(means, 4, 2, offset=16, half=half)
+    assert torch.equal(with_offset[:, 16:], encode_unit_box(means, 4, 2, half=half))
 
 
-def test_threads_that_share_a_row_write_what_one_thread_writes():
+def test_several_threads_per_row_write_the_same_as_one():
     means = random_means(5)
-    expected = encode_plainly(means, 10, 3, room=8)
+    expected = encode_unit_box(means, 10, 3, offset=8)
     encoding = torch.empty_like(expected)
-    run = Run(means.device, [])
+    ctx = OpContext(means.device, [])
     threads = 5 * 4 << CUDA_LANES_LOG2
-    run.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, CUDA_LANES_LOG2, encoding)
+    ctx.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, CUDA_LANES_LOG2, encoding)
     assert torch.equal(encoding[:, 8:], expected[:, 8:])
 
 
-def test_without_bands_the_values_are_the_encoding():
+def test_without_bands_the_encoding_is_the_values():
     means = random_means(5)
-    assert torch.equal(encode_plainly(means, 0, 0)[:, :4], torch.cat([means, TIME.expand(5, 1)], 1))
+    assert torch.equal(encode_unit_box(means, 0, 0)[:, :4], torch.cat([means, TIME.expand(5, 1)], 1))
 
 
-def test_no_values_have_an_empty_encoding():
-    assert encode_plainly(torch.zeros(0, 3), 4, 2).shape == (0, 32)
+def test_the_encoding_of_no_values_is_empty():
+    assert encode_unit_box(torch.zeros(0, 3), 4, 2).shape == (0, 32)
 
 
-def test_each_value_is_encoded_apart_from_the_others():
+def test_each_value_is_encoded_independently():
     means = random_means(1)
     moved = means.clone()
     moved[0, 1] += 0.1
-    changed = (encode_plainly(means, 4, 2) != encode_plainly(moved, 4, 2))[0]
+    changed = (encode_unit_box(means, 4, 2) != encode_unit_box(moved, 4, 2))[0]
     assert changed.nonzero()[:, 0].tolist() == [1, *range(7, 11), *range(19, 23)]
-    changed = (encode_plainly(means, 4, 2) != encode_plainly(means, 4, 2, time=TIME + 0.1))[0]
+    changed = (encode_unit_box(means, 4, 2) != encode_unit_box(means, 4, 2, time=TIME + 0.1))[0]
     assert changed.nonzero()[:, 0].tolist() == [*range(27, 32)]
 
 
-def test_no_gradient_flows_back():
-    assert not encode_plainly(random_means(3).requires_grad_(), 2, 2).requires_grad
+def test_the_encoding_has_no_gradient():
+    assert not encode_unit_box(random_means(3).requires_grad_(), 2, 2).requires_grad
 
 
 @pytest.mark.parametrize("means", [torch.zeros(4, 3, dtype=torch.float64), torch.zeros(3, 4).T])
-def test_positions_that_the_kernel_cannot_read_are_refused(means):
+def test_positions_of_a_wrong_type_or_layout_are_refused(means):
     with pytest.raises(ValueError, match="means must"):
-        encode_plainly(means, 2, 2)
+        encode_unit_box(means, 2, 2)
 
 
-def test_a_time_that_the_kernel_cannot_read_is_refused():
+def test_a_time_of_a_wrong_type_is_refused():
     with pytest.raises(ValueError, match="time must"):
-        encode_plainly(random_means(4), 2, 2, time=TIME.double())
+        encode_unit_box(random_means(4), 2, 2, time=TIME.double())

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from tests.reference.projection import project as reference
-from tests.scenes import GEOMETRY, make_camera, make_splats, pulled, random_like, relative_error
-from warpgs.ops.projection import project
+from tests.scenes import GEOMETRY, make_camera, make_splats, random_like, relative_error, weighted_sum
+from warpgs.ops.projection import Geometry, View, project
 
 CAMERA = make_camera()
 NUM = 150
@@ -17,17 +17,18 @@ def inputs(requires_grad: bool = False):
 
 
 def project_here(*tensors, near=0.01, antialias=False):
-    return project(*tensors, CAMERA.viewmat, CAMERA.K, CAMERA.size, near=near, antialias=antialias)
+    view = View(CAMERA.viewmat, CAMERA.K, *CAMERA.size)
+    return project(Geometry(*tensors), view, near=near, antialias=antialias)
 
 
 def reference_here(*tensors, near=0.01, antialias=False):
-    camera = CAMERA.viewmat.double(), CAMERA.K.double()
-    return reference(*tensors, *camera, CAMERA.size, near=near, antialias=antialias)
+    view = View(CAMERA.viewmat.double(), CAMERA.K.double(), *CAMERA.size)
+    return reference(Geometry(*tensors), view, near=near, antialias=antialias)
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("near", [0.01, 3.5])
-def test_values_are_those_of_the_reference(antialias, near):
+def test_values_equal_the_reference(antialias, near):
     splats = project_here(*inputs(), near=near, antialias=antialias)
     *values, visible = reference_here(*(t.double() for t in inputs()), near=near, antialias=antialias)
     assert 10 < visible.sum() < NUM
@@ -37,31 +38,31 @@ def test_values_are_those_of_the_reference(antialias, near):
 
 
 @pytest.mark.parametrize("antialias", [False, True])
-def test_gradients_are_those_of_the_reference(antialias):
+def test_gradients_equal_the_reference(antialias):
     ours, theirs = inputs(True), [t.double().requires_grad_() for t in inputs()]
     splats = project_here(*ours, antialias=antialias)[:4]
     *values, visible = reference_here(*theirs, antialias=antialias)
-    cotangents = random_like(splats)
-    pulled(splats, cotangents).backward()
-    pulled((v[visible] for v in values), (c[visible] for c in cotangents)).backward()
+    v_outputs = random_like(splats)
+    weighted_sum(splats, v_outputs).backward()
+    weighted_sum((v[visible] for v in values), (c[visible] for c in v_outputs)).backward()
     for name, actual, expected in zip(GEOMETRY, ours, theirs, strict=True):
         assert relative_error(actual.grad, expected.grad) < 1e-5, name
 
 
 @pytest.mark.parametrize("output", range(4))
-def test_each_output_sends_its_own_gradient_back(output):
+def test_the_gradient_of_each_output_equals_the_reference(output):
     ours, theirs = inputs(True), [t.double().requires_grad_() for t in inputs()]
     splats = project_here(*ours)
     *values, visible = reference_here(*theirs)
-    (cotangent,) = random_like([splats[output]])
-    pulled([splats[output]], [cotangent]).backward()
-    pulled([values[output][visible]], [cotangent[visible]]).backward()
+    (v_output,) = random_like([splats[output]])
+    weighted_sum([splats[output]], [v_output]).backward()
+    weighted_sum([values[output][visible]], [v_output[visible]]).backward()
     for actual, expected in zip(ours, theirs, strict=True):
         wanted = torch.zeros_like(expected) if expected.grad is None else expected.grad
         assert (actual.grad - wanted).norm() <= 1e-5 * wanted.norm()
 
 
-def test_slopes_beyond_the_margin_of_the_image_get_the_clamped_jacobian():
+def test_slopes_outside_the_margin_use_the_clamped_jacobian():
     means = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])
     rest = torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
     ours = [t.clone().requires_grad_() for t in (means, *rest)]
@@ -69,19 +70,20 @@ def test_slopes_beyond_the_margin_of_the_image_get_the_clamped_jacobian():
     splats = project_here(*ours)
     *values, visible = reference_here(*theirs)
     assert visible.all()
-    cotangents = random_like(splats[:4])
-    pulled(splats[:4], cotangents).backward()
-    pulled(values, cotangents).backward()
+    v_outputs = random_like(splats[:4])
+    weighted_sum(splats[:4], v_outputs).backward()
+    weighted_sum(values, v_outputs).backward()
     assert relative_error(splats.conics, values[1]) < 2e-6
     for actual, expected in zip(ours, theirs, strict=True):
         assert relative_error(actual.grad, expected.grad) < 1e-5
 
 
 def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
-    """A round Gaussian seen by a camera that stands at the origin of a 64 × 64 image."""
+    """The projection of a round Gaussian to a 64 × 64 image of a camera at the origin."""
     K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]])
     means, quats = torch.tensor([[x, 0.0, depth]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
-    return project(means, quats, torch.full((1, 3), scale), torch.tensor([opacity]), torch.eye(4), K, (64, 64))
+    geometry = Geometry(means, quats, torch.full((1, 3), scale), torch.tensor([opacity]))
+    return project(geometry, View(torch.eye(4), K, 64, 64))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
         {"scale": float("nan")},
     ],
 )
-def test_what_cannot_be_seen_has_radius_zero_and_zero_values(culled):
+def test_culled_gaussians_have_radius_zero_and_zero_values(culled):
     assert one().radii.min() > 0
     for value in one(**culled):
         assert not value.any()

@@ -18,11 +18,11 @@ def inputs(time=0.3):
 @pytest.fixture(scope="module")
 def pair():
     bodies, *rest, size = inputs()
-    wide = [t.double() if t.is_floating_point() else t for t in (*bodies, *rest)]
-    return raytrace(bodies, *rest, size), reference(*wide, size)
+    scene = [t.double() if t.is_floating_point() else t for t in bodies]
+    return raytrace(bodies, *rest, size), reference(scene, *(t.double() for t in rest), size)
 
 
-def test_depth_is_that_of_the_reference(pair):
+def test_depth_equals_the_reference(pair):
     ours, (_, depth, body) = pair
     same = ours.bodies == body
     assert same.float().mean() > 0.99  # rays that graze an edge may fall on either side
@@ -30,18 +30,18 @@ def test_depth_is_that_of_the_reference(pair):
     assert (ours.depth[same].double() / depth[same] - 1).abs().median() < 1e-6
 
 
-def test_colours_are_those_of_the_reference(pair):
+def test_colours_equal_the_reference(pair):
     ours, (image, _, _) = pair
     error = (ours.image.double() - image).abs().amax(-1)
     assert error.median() < 1e-5
     assert (error > 1e-2).float().mean() < 0.02  # samples that graze an edge or a shadow's border
 
 
-def test_every_pixel_of_a_closed_room_hits_something(pair):
+def test_every_pixel_inside_a_closed_cube_hits_a_body(pair):
     assert bool((pair[0].bodies >= 0).all())
 
 
-def test_a_lamp_behind_the_walls_leaves_ambient_light_only():
+def test_a_lamp_behind_the_walls_leaves_only_ambient_light():
     bodies, lamp, *rest = inputs()
     lit, dark = (
         raytrace(bodies, lamp, *rest),
@@ -51,7 +51,7 @@ def test_a_lamp_behind_the_walls_leaves_ambient_light_only():
     assert float(lit.image.mean()) > 1.3 * float(dark.image.mean())
 
 
-def test_wrong_shapes_are_refused_in_words(contracts_off):
+def test_wrong_shapes_are_refused_by_name(contracts_off):
     bodies, lamp, *rest = inputs()
     with pytest.raises(ValueError, match="lamp"):
         raytrace(bodies, lamp[:2], *rest)

@@ -16,22 +16,22 @@ def inputs(held=3, num=60):
 
 
 @pytest.mark.parametrize("held", range(4))
-def test_colours_are_those_of_the_reference(held):
+def test_colours_equal_the_reference(held):
     means, sh = inputs(held)
     expected = reference(means.double(), sh.double(), VIEW.double(), held)
     assert error(spherical_harmonics(means, sh, VIEW), expected) < 2e-6
 
 
 @pytest.mark.parametrize("held", range(4))
-def test_gradients_are_those_of_the_reference(held):
+def test_gradients_equal_the_reference(held):
     ours = [t.clone().requires_grad_() for t in inputs(held)]
     theirs = [t.double().requires_grad_() for t in inputs(held)]
     colors = spherical_harmonics(*ours, VIEW)
     expected = reference(*theirs, VIEW.double(), held)
     assert (expected == 0).any()
-    (cotangent,) = random_like([colors])
-    colors.backward(cotangent)
-    expected.backward(cotangent.double())
+    (v_output,) = random_like([colors])
+    colors.backward(v_output)
+    expected.backward(v_output.double())
     if held == 0:
         assert not ours[0].grad.any()
     else:

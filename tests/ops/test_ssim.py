@@ -22,7 +22,7 @@ def images(size=(37, 50, 3)):
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-def test_map_is_that_of_the_reference(size, masked):
+def test_map_equals_the_reference(size, masked):
     image, target, mask = images(size)
     mask = mask if masked else None
     assert error(ssim_map(image, target, mask), reference(image.double(), target.double(), mask)) < 4e-6
@@ -30,21 +30,21 @@ def test_map_is_that_of_the_reference(size, masked):
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", SIZES)
-def test_gradient_is_that_of_the_reference(size, masked):
+def test_gradient_equals_the_reference(size, masked):
     image, target, mask = images(size)
     mask = mask if masked else None
     double = image.double().requires_grad_()
     image.requires_grad_()
     value = ssim_map(image, target, mask)
-    (cotangent,) = random_like([value])
-    value.backward(cotangent)
-    reference(double, target.double(), mask).backward(cotangent.double())
+    (v_output,) = random_like([value])
+    value.backward(v_output)
+    reference(double, target.double(), mask).backward(v_output.double())
     assert relative_error(image.grad, double.grad) < 1e-5
 
 
-def test_strips_of_small_images_make_no_difference(monkeypatch):
+def test_the_strip_size_makes_no_difference(monkeypatch):
     values = []
-    for strip in (kernels.STRIP, kernels.STRIP_OF_SMALL):
+    for strip in (kernels.STRIP, kernels.SMALL_IMAGE_STRIP):
         monkeypatch.setattr(kernels, "STRIP", strip)
         image, target, mask = images((37, 21, 3))
         value = ssim_map(image.requires_grad_(), target, mask)
@@ -53,7 +53,7 @@ def test_strips_of_small_images_make_no_difference(monkeypatch):
     assert all(torch.equal(*pair) for pair in zip(*values, strict=True))
 
 
-def test_interior_is_that_of_scikit_image():
+def test_interior_equals_scikit_image():
     image, target, _ = images()
     expected = structural_similarity(
         image.double().numpy(),
@@ -75,7 +75,7 @@ def test_equal_images_have_similarity_one():
     assert ssim(image, image, mask).item() == pytest.approx(1, abs=1e-6)
 
 
-def test_pixels_outside_the_mask_do_not_matter_and_get_no_gradient():
+def test_pixels_outside_the_mask_have_no_effect_and_get_no_gradient():
     image, target, mask = images()
     changed = torch.where(mask[..., None], image, 0.123).requires_grad_()
     value = ssim(changed, target, mask)
@@ -85,7 +85,7 @@ def test_pixels_outside_the_mask_do_not_matter_and_get_no_gradient():
     assert changed.grad[mask].any()
 
 
-def test_an_empty_mask_makes_everything_alike():
+def test_an_empty_mask_gives_similarity_one():
     image, target, mask = images()
     assert ssim(image, target, torch.zeros_like(mask)).item() == pytest.approx(1, abs=1e-6)
 
@@ -111,7 +111,7 @@ def l1_and_ssim_reference(image, target, weight, mask):
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 0.2, 3.0])
 @pytest.mark.parametrize("size", SIZES)
-def test_l1_and_similarity_in_one_pass_are_those_of_the_reference(size, weight, masked):
+def test_l1_and_similarity_in_one_pass_equal_the_reference(size, weight, masked):
     image, target, mask = images(size)
     mask = mask if masked else None
     double = image.double().requires_grad_()
@@ -124,7 +124,7 @@ def test_l1_and_similarity_in_one_pass_are_those_of_the_reference(size, weight, 
     assert relative_error(image.grad, double.grad) < 1e-5
 
 
-def test_equal_images_are_not_pulled_by_l1_and_similarity():
+def test_equal_images_have_no_loss_and_no_gradient():
     image, _, mask = images()
     leaf = image.clone().requires_grad_()
     value = l1_and_ssim(leaf, image, 0.2, mask)

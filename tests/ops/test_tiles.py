@@ -1,77 +1,61 @@
-"""Tile binning: every tile's list holds the Gaussians that reach into it, front to back."""
+"""Tile binning: the list of every tile has the Gaussians that reach into it, front to back."""
 
 import pytest
 import torch
 
+from tests.reference.tiles import ALPHA_MIN, max_alphas
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
 from warpgs.kernels import tiles as kernels
 from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
-from warpgs.ops.projection import Projection, project
+from warpgs.ops.projection import Geometry, Projection, View, project
 from warpgs.ops.rows import Rows
 from warpgs.rendering import render
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 NUM = 120
-ALPHA_MIN = 1 / 255
 
 
 def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
     camera, splats = make_camera(width, height), make_splats(num)
-    geometry = splats.means, splats.quats, splats.scales, splats.opacities
-    return project(*geometry, camera.viewmat, camera.K, camera.size)
+    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
+    return project(geometry, View(camera.viewmat, camera.K, *camera.size))
 
 
 def binned(splats: Projection, width=WIDTH, height=HEIGHT) -> tuple[list[list[int]], int]:
-    """Each tile's list, and how many intersections were counted."""
-    run = Run(torch.device("cpu"), [])
-    rows = Rows(run, splats, 3, False, (width, height))
-    result = tiles.record_tiles(run, rows, (width, height))
+    """The list of each tile, and the number of intersections."""
+    ctx = OpContext(torch.device("cpu"), [])
+    rows = Rows(ctx, splats, 3, False, (width, height))
+    result = tiles.record_tiles(ctx, rows, (width, height))
     isects = result.gaussian_from_isect.tolist()
     return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.demand.item())
 
 
-def greatest_alphas(splats: Projection, width: int, height: int, step: float) -> torch.Tensor:
-    """[N, tiles] greatest alpha over points ``step`` apart in the box of each tile's pixel centres in the image."""
-    mean, opacity = splats.means2d.double(), splats.opacities.double()[:, None, None]
-    a, b, c = (entry[:, None, None] for entry in splats.conics.double().unbind(-1))
-    columns, rows = tiles.num_tiles(width, height)
-    greatest = []
-    for tile in range(columns * rows):
-        left, top = tile % columns * 16, tile // columns * 16
-        x = torch.arange(left + 0.5, min(left + 16, width), step, dtype=torch.float64)
-        y = torch.arange(top + 0.5, min(top + 16, height), step, dtype=torch.float64)
-        dx, dy = mean[:, 0, None, None] - x, mean[:, 1, None, None] - y[:, None]
-        alphas = opacity * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-        greatest.append(alphas.flatten(1).max(1).values)
-    return torch.stack(greatest, 1) * (splats.radii[:, :1] > 0)
-
-
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (16, 16), (1, 1), (130, 7)])
-def test_every_gaussian_drawn_in_a_tile_is_in_its_list(size):
+def test_every_gaussian_visible_in_a_tile_is_in_its_list(size):
     splats = projected()
     splats = splats._replace(means2d=splats.means2d * torch.tensor(size) / torch.tensor([WIDTH, HEIGHT]))
     lists, _ = binned(splats, *size)
-    drawn = greatest_alphas(splats, *size, step=1.0) >= ALPHA_MIN
-    assert drawn.any()
+    visible = max_alphas(splats, size, step=1.0) >= ALPHA_MIN
+    assert visible.any()
     for tile, listed in enumerate(lists):
-        assert set(drawn[:, tile].nonzero()[:, 0].tolist()) <= set(listed)
+        assert set(visible[:, tile].nonzero()[:, 0].tolist()) <= set(listed)
 
 
 def test_a_listed_gaussian_reaches_into_its_tile():
     splats = projected(64, 48)
     lists, _ = binned(splats, 64, 48)
-    alphas = greatest_alphas(splats, 64, 48, step=0.125)
+    alphas = max_alphas(splats, (64, 48), step=0.125)
     for tile, listed in enumerate(lists):
         assert (alphas[listed, tile] >= 0.8 * ALPHA_MIN).all()
 
 
-def test_hardly_a_gaussian_is_listed_in_vain():
+def test_few_listed_gaussians_are_invisible():
     splats = projected()
     lists, _ = binned(splats)
-    drawn = (greatest_alphas(splats, WIDTH, HEIGHT, step=1.0) >= ALPHA_MIN).sum().item()
+    visible = (max_alphas(splats, (WIDTH, HEIGHT), step=1.0) >= ALPHA_MIN).sum().item()
     listed = sum(map(len, lists))
-    assert drawn <= listed <= 1.05 * drawn
+    assert visible <= listed <= 1.05 * visible
 
 
 def test_lists_are_in_order_of_depth_and_without_repeats():
@@ -101,8 +85,8 @@ def test_culled_gaussians_are_in_no_list():
     gone = torch.arange(NUM) % 3 == 0
     lists, _ = binned(splats._replace(radii=torch.where(gone[:, None], 0, splats.radii)))
     assert not any(gone[listed].any() for listed in lists)
-    kept = [[g for g in listed if not gone[g]] for listed in binned(splats)[0]]
-    assert lists == kept
+    remaining = [[g for g in listed if not gone[g]] for listed in binned(splats)[0]]
+    assert lists == remaining
 
 
 def test_a_gaussian_in_a_corner_leaves_the_other_tiles_empty():
@@ -131,8 +115,8 @@ def test_all_gaussians_culled_make_empty_lists():
     assert demand == 0
 
 
-class _Unlearned(torch.Tensor):
-    """A counter that cannot be told how much will be needed."""
+class _IgnoresDemand(torch.Tensor):
+    """A counter that ignores the demand."""
 
     def copy_(self, *_):
         return self
@@ -140,17 +124,17 @@ class _Unlearned(torch.Tensor):
 
 @pytest.fixture
 def too_small(monkeypatch):
-    """Buffers hold no more than one intersection for each Gaussian."""
+    """Buffers hold only one intersection for each Gaussian."""
 
     def budget(device, _width, _height):
         result = tiles._Budget(device)
-        result.demand = result.demand.as_subclass(_Unlearned)
+        result.demand = result.demand.as_subclass(_IgnoresDemand)
         return result
 
     monkeypatch.setattr(tiles, "_budget", budget)
 
 
-def drawn_with_gradients(is_dynamic):
+def images_and_gradients(is_dynamic):
     splats = projected()
     leaves = [t.clone().requires_grad_() for t in splats[:4]]
     colors = torch.rand(NUM, 3, generator=torch.Generator().manual_seed(5)).requires_grad_()
@@ -160,17 +144,17 @@ def drawn_with_gradients(is_dynamic):
 
 
 @pytest.mark.parametrize("is_dynamic", [None, torch.arange(NUM) % 3 == 0])
-def test_the_slow_way_of_full_buffers_draws_the_same(is_dynamic, request):
+def test_buffer_overflow_renders_the_same_image(is_dynamic, request):
     _, demand = binned(projected())
     assert demand > NUM
-    expected = drawn_with_gradients(is_dynamic)
+    expected = images_and_gradients(is_dynamic)
     request.getfixturevalue("too_small")
-    actual = drawn_with_gradients(is_dynamic)
+    actual = images_and_gradients(is_dynamic)
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)
 
 
-def test_full_buffers_make_every_tile_look_at_all_gaussians_in_depth_order(too_small):
+def test_with_buffer_overflow_every_tile_lists_all_gaussians_in_depth_order(too_small):
     splats = projected()
     lists, demand = binned(splats)
     assert demand > NUM
@@ -178,7 +162,7 @@ def test_full_buffers_make_every_tile_look_at_all_gaussians_in_depth_order(too_s
     assert lists == [keys.argsort(stable=True).tolist()] * 12
 
 
-def test_the_next_budget_covers_what_was_needed_and_little_more():
+def test_the_next_budget_covers_the_demand_and_little_more():
     budget = tiles._Budget(torch.device("cpu"))
     for demand in (0, 5_000, 123_457, 40):
         budget.demand.fill_(demand)
@@ -188,11 +172,11 @@ def test_the_next_budget_covers_what_was_needed_and_little_more():
         assert demand == 40 or capacity <= 1.13 * wanted
 
 
-def test_a_budget_knows_whether_buffers_fit():
+def test_a_budget_reports_whether_buffers_fit():
     budget = tiles._Budget(torch.device("cpu"))
-    assert budget.most is None
+    assert budget.recent_max is None
     assert budget.capacity(3_000) < 4_000
-    assert budget.most == 0.0  # nothing was in sight, but a frame has been
+    assert budget.recent_max == 0.0  # a frame without visible Gaussians
     budget.demand.fill_(100_000)
     capacity = budget.capacity(3_000)
     assert budget.fits(capacity, 3_000)
@@ -201,15 +185,15 @@ def test_a_budget_knows_whether_buffers_fit():
     assert not budget.fits(3 * capacity, 3_000)
 
 
-def test_what_is_learned_in_inference_mode_serves_outside_of_it():
-    tiles.forget_budgets()
+def test_a_budget_learned_in_inference_mode_works_outside_of_it():
+    tiles.reset_budgets()
     splats = make_splats()
     with torch.inference_mode():
         inside = render(splats, make_camera()).joint.image
     assert torch.equal(render(splats, make_camera()).joint.image, inside)
 
 
-def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
+def test_removing_gaussians_only_removes_them_from_the_lists():
     splats = projected()
     few = torch.arange(NUM) % 10 == 0
     names = few.nonzero()[:, 0].tolist()
@@ -219,21 +203,21 @@ def test_a_tenth_of_the_gaussians_makes_the_same_lists_without_the_others():
     ]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_the_lists_of_tiles_are_split_by_branch_in_order(share):
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 0.5, 1.0])
+def test_the_lists_of_tiles_are_split_by_branch_in_order(fraction):
     splats = projected()
-    is_dynamic = torch.rand(NUM, generator=generator()) < share
-    run = Run(torch.device("cpu"), [])
-    rows = Rows(run, splats, 3, False, (WIDTH, HEIGHT))
-    result = tiles.record_tiles(run, rows, (WIDTH, HEIGHT), is_dynamic.view(torch.uint8))
+    is_dynamic = torch.rand(NUM, generator=generator()) < fraction
+    ctx = OpContext(torch.device("cpu"), [])
+    rows = Rows(ctx, splats, 3, False, (WIDTH, HEIGHT))
+    result = tiles.record_tiles(ctx, rows, (WIDTH, HEIGHT), is_dynamic.view(torch.uint8))
     joint, _ = binned(splats)
     assert len(joint) == len(result.ranges)
     for listed, (begin, end), (num_static, num_dynamic) in zip(
         joint, result.ranges.tolist(), result.branch_lengths.tolist(), strict=True
     ):
         listed = torch.tensor(listed, dtype=torch.int32)
-        moves = is_dynamic[listed.long()]
-        assert torch.equal(result.gaussian_from_isect[begin:end], listed + moves * kernels.DYNAMIC)
-        room = result.gaussian_from_isect[result.half + begin : result.half + end]
-        assert torch.equal(room[:num_static], listed[~moves])
-        assert torch.equal(room.flip(0)[:num_dynamic], listed[moves])
+        dynamic = is_dynamic[listed.long()]
+        assert torch.equal(result.gaussian_from_isect[begin:end], listed + dynamic * kernels.DYNAMIC)
+        both = result.gaussian_from_isect[result.half + begin : result.half + end]
+        assert torch.equal(both[:num_static], listed[~dynamic])
+        assert torch.equal(both.flip(0)[:num_dynamic], listed[dynamic])

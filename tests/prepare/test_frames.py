@@ -1,4 +1,4 @@
-"""Which frames are taken, and what is refused."""
+"""Which frames are taken, and which sources are refused."""
 
 import struct
 
@@ -6,44 +6,46 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.prepare.filmed import film, write_folder, write_video
+from tests.prepare.boards import record, write_folder, write_video
 from warpgs.data.images import decode
-from warpgs.prepare.frames import Selection, list_frames, sharpness, take_frames
+from warpgs.prepare.frames import Frames, check_selection, take_frames
+from warpgs.prepare.images import sharpness
+from warpgs.prepare.options import Selection
 
 
 @pytest.fixture(scope="module")
 def images():
-    return film(20)[0]
+    return record(20)[0]
 
 
-def test_a_blurred_picture_is_less_sharp(images):
+def test_a_blurred_image_is_less_sharp(images):
     assert sharpness(cv2.GaussianBlur(images[0], (0, 0), 2.0)) < 0.5 * sharpness(images[0])
 
 
 def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, images):
     blurred = [image if k % 4 == 2 else cv2.GaussianBlur(image, (0, 0), 2.5) for k, image in enumerate(images)]
     video = write_video(tmp_path / "video.mp4", blurred)
-    taken = take_frames(video, tmp_path / "frames", Selection(count=5))
-    assert [frame.step for frame in taken] == [2, 6, 10, 14, 18]
+    frames = take_frames(video, tmp_path / "frames", Selection(count=5))
+    assert [frame.step for frame in frames.taken] == [2, 6, 10, 14, 18]
 
 
-def test_a_folder_gives_its_sharpest_pictures_too(tmp_path, images):
+def test_the_sharpest_images_of_a_folder_are_taken(tmp_path, images):
     blurred = [image if k % 4 == 1 else cv2.GaussianBlur(image, (0, 0), 2.5) for k, image in enumerate(images)]
-    taken = take_frames(write_folder(tmp_path / "shots", blurred), tmp_path / "frames", Selection(count=5))
-    assert [frame.source for frame in taken] == [f"shot{k:03d}.png" for k in (1, 5, 9, 13, 17)]
+    frames = take_frames(write_folder(tmp_path / "shots", blurred), tmp_path / "frames", Selection(count=5))
+    assert [frame.source for frame in frames.taken] == [f"shot{k:03d}.png" for k in (1, 5, 9, 13, 17)]
 
 
-def test_a_rate_takes_so_many_frames_a_second(tmp_path, images):
+def test_a_rate_is_the_number_of_frames_per_second(tmp_path, images):
     video = write_video(tmp_path / "video.mp4", images, rate=10.0)
-    assert len(take_frames(video, tmp_path / "frames", Selection(fps=5.0))) == 10
+    assert len(take_frames(video, tmp_path / "frames", Selection(fps=5.0)).taken) == 10
 
 
-def test_a_rate_above_the_videos_takes_every_frame(tmp_path, images):
+def test_a_rate_above_that_of_the_video_takes_every_frame(tmp_path, images):
     video = write_video(tmp_path / "video.mp4", images, rate=10.0)
-    assert len(take_frames(video, tmp_path / "frames", Selection(fps=1000.0))) == 20
+    assert len(take_frames(video, tmp_path / "frames", Selection(fps=1000.0)).taken) == 20
 
 
-def test_large_pictures_are_scaled_down_and_small_ones_kept(tmp_path, images):
+def test_large_images_are_scaled_down_and_small_ones_kept(tmp_path, images):
     shots = write_folder(tmp_path / "shots", images[:5])
     take_frames(shots, tmp_path / "small", Selection(longest_side=128))
     take_frames(shots, tmp_path / "large", Selection(longest_side=5000))
@@ -53,10 +55,10 @@ def test_large_pictures_are_scaled_down_and_small_ones_kept(tmp_path, images):
 
 def test_the_list_of_frames_is_read_back(tmp_path, images):
     shots = write_folder(tmp_path / "shots", images[:6])
-    assert take_frames(shots, tmp_path / "frames", Selection()) == list_frames(tmp_path / "frames")
+    assert take_frames(shots, tmp_path / "frames", Selection()) == Frames.load(tmp_path / "frames")
 
 
-def test_a_photographs_orientation_tag_turns_it(tmp_path, images):
+def test_an_image_is_rotated_by_its_orientation_tag(tmp_path, images):
     entry = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)
     exif = b"Exif\0\0" + b"MM\0*" + struct.pack(">IH", 8, 1) + entry + struct.pack(">I", 0)
     for k in range(5):
@@ -67,7 +69,7 @@ def test_a_photographs_orientation_tag_turns_it(tmp_path, images):
     assert decode(tmp_path / "frames/frame_000000.png").shape[:2] == images[0].shape[1::-1]
 
 
-def test_a_videos_rotation_tag_turns_it(tmp_path, images):
+def test_a_video_is_rotated_by_its_rotation_tag(tmp_path, images):
     data = write_video(tmp_path / "video.mp4", images[:8]).read_bytes()
     track = data.index(b"tkhd")
     lying = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
@@ -75,9 +77,9 @@ def test_a_videos_rotation_tag_turns_it(tmp_path, images):
     assert lying in data[track:]
     (tmp_path / "tagged.mp4").write_bytes(data[:track] + data[track:].replace(lying, upright, 1))
     take_frames(tmp_path / "tagged.mp4", tmp_path / "frames", Selection())
-    turned = decode(tmp_path / "frames/frame_000000.png")[..., ::-1]
-    assert turned.shape[:2] == images[0].shape[1::-1]
-    assert np.abs(np.rot90(images[0], -1).astype(int) - turned).mean() < 12
+    rotated = decode(tmp_path / "frames/frame_000000.png")[..., ::-1]
+    assert rotated.shape[:2] == images[0].shape[1::-1]
+    assert np.abs(np.rot90(images[0], -1).astype(int) - rotated).mean() < 12
 
 
 @pytest.mark.parametrize(
@@ -91,14 +93,14 @@ def test_a_videos_rotation_tag_turns_it(tmp_path, images):
         (Selection(longest_side=3), "--longest-side"),
     ],
 )
-def test_impossible_selections_are_refused(selection, word):
+def test_invalid_selections_are_refused(selection, word):
     with pytest.raises(ValueError, match=word):
-        selection.check()
+        check_selection(selection)
 
 
-def test_what_is_no_video_is_refused_in_words(tmp_path):
+def test_files_that_are_not_videos_are_refused(tmp_path):
     (tmp_path / "notes.mp4").write_text("hello" * 100)
-    with pytest.raises(ValueError, match=r"notes\.mp4 is no video"):
+    with pytest.raises(ValueError, match=r"notes\.mp4 is not a video"):
         take_frames(tmp_path / "notes.mp4", tmp_path / "frames", Selection())
     with pytest.raises(ValueError, match="is missing"):
         take_frames(tmp_path / "nothing.mp4", tmp_path / "frames", Selection())
@@ -109,18 +111,18 @@ def test_one_frame_is_too_few(tmp_path, images):
         take_frames(write_video(tmp_path / "one.mp4", images[:1]), tmp_path / "frames", Selection())
 
 
-def test_a_folder_without_pictures_is_refused(tmp_path):
+def test_a_folder_without_images_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no"):
         take_frames(tmp_path, tmp_path / "frames", Selection())
 
 
-def test_pictures_of_different_sizes_are_refused_by_name(tmp_path, images):
+def test_images_of_different_sizes_are_refused_by_name(tmp_path, images):
     write_folder(tmp_path / "shots", [*images[:5], cv2.resize(images[5], (64, 48))])
     with pytest.raises(ValueError, match=r"shot005\.png is 64×48, others are 256×192"):
         take_frames(tmp_path / "shots", tmp_path / "frames", Selection())
 
 
-def test_a_rate_makes_no_sense_for_a_folder(tmp_path, images):
+def test_a_rate_is_refused_for_a_folder(tmp_path, images):
     with pytest.raises(ValueError, match="--fps is for videos"):
         take_frames(write_folder(tmp_path / "shots", images[:5]), tmp_path / "frames", Selection(fps=3.0))
 
@@ -128,22 +130,22 @@ def test_a_rate_makes_no_sense_for_a_folder(tmp_path, images):
 def test_numbers_in_names_are_sorted_as_numbers(tmp_path, images):
     for k in (1, 2, 10, 9, 11):
         cv2.imwrite(str(tmp_path / f"shot{k}.png"), images[k])
-    taken = take_frames(tmp_path, tmp_path / "frames", Selection())
-    assert [frame.source for frame in taken] == [f"shot{k}.png" for k in (1, 2, 9, 10, 11)]
+    frames = take_frames(tmp_path, tmp_path / "frames", Selection())
+    assert [frame.source for frame in frames.taken] == [f"shot{k}.png" for k in (1, 2, 9, 10, 11)]
 
 
 @pytest.mark.parametrize("size", [(256, 15), (900, 40)])
-def test_pictures_too_flat_for_optical_flow_are_refused(size, tmp_path, images):
+def test_images_too_flat_for_optical_flow_are_refused(size, tmp_path, images):
     shots = write_folder(tmp_path / "shots", [cv2.resize(image, size) for image in images[:5]])
     with pytest.raises(ValueError, match=rf"shot000\.png of {size[0]}×{size[1]} pixels is too flat"):
         take_frames(shots, tmp_path / "frames", Selection())
 
 
-def test_a_video_that_is_cut_off_is_told_of(tmp_path, images):
+def test_a_truncated_video_is_noted(tmp_path, images):
     video, notes = write_video(tmp_path / "video.avi", images), []
     take_frames(video, tmp_path / "whole", Selection(), notes=notes)
     assert notes == []
     data = video.read_bytes()
     video.write_bytes(data[: len(data) // 2])
-    taken = take_frames(video, tmp_path / "part", Selection(), notes=notes)
-    assert notes == [f"{video} promises 20 frames, only {len(taken)} could be decoded: is it cut off?"]
+    taken = take_frames(video, tmp_path / "part", Selection(), notes=notes).taken
+    assert notes == [f"{video} should have 20 frames, only {len(taken)} could be decoded: is it truncated?"]

@@ -1,4 +1,4 @@
-"""Real photographs of a hand over a shelf of books; only where WARPGS_HAND names their folder."""
+"""Real photographs of a hand in front of a bookshelf; only if WARPGS_HAND names their folder."""
 
 import json
 import os
@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.loaders import load_capture
-from warpgs.prepare.options import Options
-from warpgs.prepare.pipeline import Preparation
+from warpgs.prepare.pipeline import prepare
 
 HAND = os.environ.get("WARPGS_HAND")
 
@@ -20,7 +19,7 @@ pytestmark = pytest.mark.skipif(HAND is None, reason="WARPGS_HAND does not name 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     root = tmp_path_factory.mktemp("hand") / "capture"
-    Preparation(root, Options(Path(HAND) / "images"), quiet=True).run()
+    prepare(Path(HAND) / "images", root)
     return load_capture(root)
 
 
@@ -31,7 +30,7 @@ def painted(polygons: list) -> np.ndarray:
     return canvas > 0
 
 
-def test_every_frame_gets_a_camera_where_others_found_it(capture):
+def test_every_frame_gets_a_camera_near_its_reference_position(capture):
     truth = json.loads((Path(HAND) / "poses.json").read_text())
     names = sorted(truth)
     assert len(capture.cameras) == len(names) == 86
@@ -39,20 +38,20 @@ def test_every_frame_gets_a_camera_where_others_found_it(capture):
     true = np.array([truth[name] for name in names])
     a, b = found - found.mean(0), true - true.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * np.diag(turn)).sum() / (a**2).sum()
-    error = np.linalg.norm(scale * a @ (u @ turn @ vt).T - b, axis=1) / np.linalg.norm(np.ptp(true, axis=0))
+    reflection = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(reflection)).sum() / (a**2).sum()
+    error = np.linalg.norm(scale * a @ (u @ reflection @ vt).T - b, axis=1) / np.linalg.norm(np.ptp(true, axis=0))
     assert np.median(error) < 0.003
     assert error.max() < 0.02
 
 
 def test_hand_and_sleeve_are_masked(capture):
     outlines = json.loads((Path(__file__).parent / "hand_polygons.json").read_text())
-    shares = {}
+    overlaps = {}
     for name, parts in outlines.items():
         counted = ~painted(parts["ignored"])
         true = painted(parts["moving"]) & counted
-        moving = ~capture.frame(f"frame_{int(name[5:]) - 1:06d}").static_mask.numpy() & counted
-        shares[name] = (true & moving).sum() / (true | moving).sum()
-    assert min(shares.values()) > 0.6, shares
-    assert np.mean(list(shares.values())) > 0.75
+        dynamic = ~capture.frame(f"frame_{int(name[5:]) - 1:06d}").static_mask.numpy() & counted
+        overlaps[name] = (true & dynamic).sum() / (true | dynamic).sum()
+    assert min(overlaps.values()) > 0.6, overlaps
+    assert np.mean(list(overlaps.values())) > 0.75

@@ -1,4 +1,4 @@
-"""SAM 2 and Depth Anything as prepare uses them, with tiny networks of random weights; and what is said without any."""
+"""SAM 2 and Depth Anything with tiny networks of random weights, and the errors if they are missing."""
 
 import json
 import sys
@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.cli import main
-from warpgs.prepare import networks
+from warpgs.prepare import weights
 from warpgs.prepare.depth_anything import network_size, predict
-from warpgs.prepare.networks import DEPTH_ANYTHING, SAM2, find_weights, load, normalised
-from warpgs.prepare.sam2 import follow, prompted
+from warpgs.prepare.networks import load, normalized
+from warpgs.prepare.sam2 import choose_prompts, track
+from warpgs.prepare.weights import DEPTH_ANYTHING, SAM2, find_weights
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 
 
 @pytest.fixture(scope="module")
 def sam2(tmp_path_factory):
-    """A SAM 2 of 128 × 128 pixels that has learnt nothing."""
+    """An untrained SAM 2 of 128 × 128 pixels."""
     pytest.importorskip("transformers")
     from transformers import Sam2VideoConfig, Sam2VideoModel
 
@@ -65,7 +66,7 @@ def sam2(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def depth_anything(tmp_path_factory):
-    """A Depth Anything of 70 × 70 pixels that has learnt nothing."""
+    """An untrained Depth Anything of 70 × 70 pixels."""
     pytest.importorskip("transformers")
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
@@ -79,7 +80,7 @@ def depth_anything(tmp_path_factory):
     torch.manual_seed(0)
     network = DepthAnythingForDepthEstimation(config)
     with torch.no_grad():
-        for layer in (network.head.conv1, network.head.conv2, network.head.conv3):  # else nothing gets past the ReLUs
+        for layer in (network.head.conv1, network.head.conv2, network.head.conv3):  # else the ReLUs return zeros
             layer.weight.abs_()
             layer.bias.fill_(1.0)
     folder = tmp_path_factory.mktemp("weights") / "depth"
@@ -87,9 +88,9 @@ def depth_anything(tmp_path_factory):
     return folder
 
 
-def test_without_the_package_one_line_says_what_to_install(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(networks, "find_spec", lambda name: None)
-    shots = filmed.write_folder(tmp_path / "shots", filmed.film(5)[0])
+def test_the_error_without_the_package_says_what_to_install(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(weights, "find_spec", lambda name: None)
+    shots = boards.write_folder(tmp_path / "shots", boards.record(5)[0])
     for options in (["--masks", "sam2"], ["--depth", "anything"]):
         assert main(["prepare", str(shots), str(tmp_path / "capture"), *options]) == 2
         written = capsys.readouterr().err
@@ -99,17 +100,17 @@ def test_without_the_package_one_line_says_what_to_install(tmp_path, capsys, mon
 
 
 @pytest.mark.parametrize("network", [SAM2, DEPTH_ANYTHING])
-def test_missing_weights_are_told_with_where_to_get_them(network, tmp_path, monkeypatch):
-    monkeypatch.setattr(networks, "find_spec", lambda name: object())
+def test_the_error_without_weights_says_where_to_get_them(network, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "find_spec", lambda name: object())
     with pytest.raises(ValueError, match=rf"{network.title}, which are not in .*hf download {network.names[0]}"):
         find_weights(network, tmp_path)
 
 
-def test_weights_of_another_network_or_none_at_all_are_not_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(networks, "find_spec", lambda name: object())
-    for name, kind in (("a", "depth_anything"), ("b", "sam2_video")):
+def test_weights_of_another_network_and_incomplete_ones_are_skipped(tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "find_spec", lambda name: object())
+    for name, model_type in (("a", "depth_anything"), ("b", "sam2_video")):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "config.json").write_text(json.dumps({"model_type": kind}))
+        (tmp_path / name / "config.json").write_text(json.dumps({"model_type": model_type}))
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "config.json").write_text("[damaged")
     (tmp_path / "a" / "model.safetensors").touch()
@@ -118,8 +119,8 @@ def test_weights_of_another_network_or_none_at_all_are_not_taken(tmp_path, monke
         find_weights(SAM2, tmp_path)
 
 
-def test_the_best_weights_of_the_cache_are_taken(tmp_path, monkeypatch):
-    """The layout of the cache is the package's own; here only the order of names counts."""
+def test_the_best_weights_of_the_cache_are_used(tmp_path, monkeypatch):
+    """Only the order of the names is tested; the layout of the cache is that of the package."""
     for name in SAM2.names[1:3]:
         (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
@@ -130,7 +131,7 @@ def test_the_best_weights_of_the_cache_are_taken(tmp_path, monkeypatch):
         def try_to_load_from_cache(name, file):
             return str(tmp_path / name / file) if (tmp_path / name / file).is_file() else None
 
-    monkeypatch.setattr(networks, "find_spec", lambda name: object())
+    monkeypatch.setattr(weights, "find_spec", lambda name: object())
     monkeypatch.setitem(sys.modules, "huggingface_hub", Hub)
     assert find_weights(SAM2, None) == tmp_path / SAM2.names[1]
 
@@ -138,26 +139,26 @@ def test_the_best_weights_of_the_cache_are_taken(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("size", "expected"), [((512, 384), (518, 392)), ((384, 512), (392, 518)), ((960, 540), (924, 518))]
 )
-def test_the_networks_size_is_that_of_its_own_processing(size, expected):
+def test_the_input_size_is_that_of_the_networks_own_preprocessing(size, expected):
     assert network_size(*size, side=518, patch=14) == expected
 
 
-def test_pictures_are_normalised_by_imagenets_mean_and_deviation():
+def test_images_are_normalized_by_imagenets_mean_and_deviation():
     grey = np.full((6, 8, 3), 124, np.uint8)
-    values = normalised(grey, 4, 4)
+    values = normalized(grey, 4, 4)
     assert values.shape == (3, 4, 4)
     assert values[:, 0, 0].tolist() == pytest.approx(
         [(124 / 255 - 0.485) / 0.229, (124 / 255 - 0.456) / 0.224, (124 / 255 - 0.406) / 0.225], abs=1e-5
     )
 
 
-def test_prompts_are_the_frames_of_median_area_of_each_part_that_moves():
+def test_prompts_have_the_median_area_of_each_part_with_motion():
     areas = [1, 9, 5, 0, 0, 0, 2, 4, 3, 7, 8, 6]
     masks = [np.arange(12).reshape(3, 4) < area for area in areas]
-    assert prompted(masks) == [2, 8, 9]
+    assert choose_prompts(masks) == [2, 8, 9]
 
 
-def test_weights_for_what_was_not_asked_for_are_refused(tmp_path, capsys):
+def test_weights_without_a_network_are_refused(tmp_path, capsys):
     (tmp_path / "shots").mkdir()
     assert main(["prepare", str(tmp_path / "shots"), str(tmp_path / "c"), "--weights", str(tmp_path)]) == 2
     assert "--weights is for" in capsys.readouterr().err
@@ -165,26 +166,26 @@ def test_weights_for_what_was_not_asked_for_are_refused(tmp_path, capsys):
 
 @needs_transformers
 @pytest.mark.parametrize("prompts", [[3], [0, 2, 4, 5]])
-def test_sam2_keeps_its_prompts_and_draws_a_mask_for_every_frame(prompts, sam2):
-    images, masks = filmed.film(6)
-    moving = [mask & (k in prompts) for k, mask in enumerate(masks)]
-    assert prompted(moving) == prompts
-    found = follow(images, moving, find_weights(SAM2, sam2.parent))
+def test_sam2_keeps_its_prompts_and_segments_every_frame(prompts, sam2):
+    images, masks = boards.record(6)
+    dynamic = [mask & (k in prompts) for k, mask in enumerate(masks)]
+    assert choose_prompts(dynamic) == prompts
+    found = track(images, dynamic, find_weights(SAM2, sam2.parent))
     assert [mask.shape for mask in found] == [(192, 256)] * 6
     for k in prompts:
         assert (found[k] & masks[k]).sum() / (found[k] | masks[k]).sum() > 0.75
 
 
 @needs_transformers
-def test_sam2_is_not_asked_where_nothing_moves(sam2, monkeypatch):
+def test_sam2_is_not_loaded_if_nothing_moves(sam2, monkeypatch):
     nothing = [np.zeros((4, 5), bool)] * 3
     monkeypatch.setattr("warpgs.prepare.sam2.load", lambda *arguments: pytest.fail("was loaded"))
-    assert follow([np.zeros((4, 5, 3), np.uint8)] * 3, nothing, sam2) == nothing
+    assert track([np.zeros((4, 5, 3), np.uint8)] * 3, nothing, sam2) == nothing
 
 
 @needs_transformers
-def test_depth_anything_knows_all_pixels_and_metric_depth_is_inverted(depth_anything, tmp_path):
-    images = filmed.film(2)[0]
+def test_depth_anything_covers_all_pixels_and_metric_depth_is_inverted(depth_anything, tmp_path):
+    images = boards.record(2)[0]
     relative = predict(images, find_weights(DEPTH_ANYTHING, depth_anything))
     assert [plane.shape for plane in relative] == [(192, 256)] * 2
     assert all(np.isfinite(plane).all() and plane.std() > 0 for plane in relative)
@@ -198,13 +199,13 @@ def test_depth_anything_knows_all_pixels_and_metric_depth_is_inverted(depth_anyt
 
 @needs_transformers
 def test_a_capture_is_made_with_both_networks(sam2, depth_anything, tmp_path, capsys, monkeypatch):
-    weights = tmp_path / "weights"
-    weights.mkdir()
+    folders = tmp_path / "weights"
+    folders.mkdir()
     for folder in (sam2, depth_anything):
-        (weights / folder.name).symlink_to(folder)
-    monkeypatch.setattr("warpgs.prepare.pipeline.WORKING_SIDE", filmed.SIZE[0])
-    shots = filmed.write_folder(tmp_path / "shots", filmed.film(16)[0])
-    options = ["--masks", "sam2", "--depth", "anything", "--weights", str(weights)]
+        (folders / folder.name).symlink_to(folder)
+    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", boards.SIZE[0])
+    shots = boards.write_folder(tmp_path / "shots", boards.record(16)[0])
+    options = ["--masks", "sam2", "--depth", "anything", "--weights", str(folders)]
     assert main(["prepare", str(shots), str(tmp_path / "made"), *options]) == 0
     assert "known on 100% of the pixels" in capsys.readouterr().out
     assert len(list((tmp_path / "made/depth/1x").iterdir())) == 16
@@ -220,5 +221,5 @@ def test_damaged_and_incomplete_weights_are_refused(depth_anything, tmp_path):
     with pytest.raises(ValueError, match=r"tensors of Depth Anything V2 are missing, head\."):
         load(DEPTH_ANYTHING, tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"damaged")
-    with pytest.raises(ValueError, match="weights of Depth Anything V2 can't be read"):
+    with pytest.raises(ValueError, match="weights of Depth Anything V2 cannot be read"):
         load(DEPTH_ANYTHING, tmp_path)

@@ -1,44 +1,44 @@
-"""What is written, and in which units."""
+"""The files of a capture, and its scene units."""
 
 import json
 
 import numpy as np
 import pytest
 
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.data.lens import Lens
-from warpgs.data.loaders.nerfies import load_capture, recognise
-from warpgs.prepare.scene import pinhole_lens, resized_lens, scene_units, static_points
-from warpgs.prepare.sfm import Cameras
+from warpgs.data.loaders import load_capture, recognize
+from warpgs.prepare.cameras import Cameras, pinhole_lens, resized_lens
+from warpgs.prepare.scene import scene_units, static_points
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    return filmed.write_capture(tmp_path_factory.mktemp("scene"), holdout=4)
+    return boards.write_capture(tmp_path_factory.mktemp("scene"), holdout=4)
 
 
-def test_what_is_written_is_read_back_as_nerf_ds(root):
+def test_a_written_capture_is_read_back_as_nerf_ds(root):
     capture = load_capture(root)
-    assert recognise(root) == "nerfds"
+    assert recognize(root) == "nerfds"
     name = capture.train[3]
     frame, k = capture.frame(name), int(name.removeprefix("shot"))
-    images, masks = filmed.film(16)
+    images, masks = boards.record(16)
     assert np.array_equal(frame.image.numpy(), images[k])
     assert np.array_equal(frame.static_mask.numpy(), ~masks[k])
     scene = json.loads((root / "scene.json").read_text())
-    center = -filmed.poses(16)[k, :, :3].T @ filmed.poses(16)[k, :, 3]
+    center = -boards.poses(16)[k, :, :3].T @ boards.poses(16)[k, :, 3]
     expected = (center - np.array(scene["center"])) * scene["scale"]
     assert np.allclose(frame.camera.position.numpy(), expected, atol=1e-5)
 
 
-def test_half_size_is_read_with_factor_2_and_what_moves_in_part_counts_as_moving(root):
+def test_half_size_is_read_with_factor_2_and_partly_dynamic_pixels_count_as_dynamic(root):
     capture = load_capture(root, factor=2)
     name = capture.train[3]
-    frame, mask = capture.frame(name), filmed.film(16)[1][int(name.removeprefix("shot"))]
+    frame, mask = capture.frame(name), boards.record(16)[1][int(name.removeprefix("shot"))]
     blocks = mask.reshape(mask.shape[0] // 2, 2, mask.shape[1] // 2, 2)
     assert np.array_equal(~frame.static_mask.numpy(), blocks.any((1, 3)))
-    assert recognise(root) == "nerfds"
-    assert frame.camera.K[0, 0].item() == pytest.approx(filmed.FOCAL / 2)
+    assert recognize(root) == "nerfds"
+    assert frame.camera.K[0, 0].item() == pytest.approx(boards.FOCAL / 2)
 
 
 def test_every_fourth_frame_is_held_out(root):
@@ -48,44 +48,46 @@ def test_every_fourth_frame_is_held_out(root):
     assert min(capture.cameras[n].time for n in capture.train) == 0.0
 
 
-def test_the_scene_lies_in_the_unit_cube(root):
+def test_the_scene_is_in_the_unit_cube(root):
     capture = load_capture(root)
     assert float(capture.points.abs().quantile(0.95)) <= 1.0
     assert float(capture.points.abs().max()) > 0.8
     assert all(float(camera.position.abs().max()) <= 1.0 + 1e-5 for camera in capture.cameras.values())
 
 
-def test_strays_do_not_shrink_the_scene():
+def test_outlier_points_do_not_shrink_the_scene():
     points = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
-    with_strays = np.vstack([points, np.full((5, 3), 1e4)])
-    assert scene_units(with_strays, points[:5])[1] == pytest.approx(scene_units(points, points[:5])[1], rel=0.1)
+    with_outliers = np.vstack([points, np.full((5, 3), 1e4)])
+    expected = scene_units(points, points[:5]).scale
+    assert scene_units(with_outliers, points[:5]).scale == pytest.approx(expected, rel=0.1)
 
 
-def test_a_straight_lens_stays_and_a_bent_one_zooms_in():
+def test_a_pinhole_lens_is_unchanged_and_a_distorted_one_zooms_in():
     lens = Lens(64, 48, (50.0, 50.0), (32.0, 24.0))
     assert pinhole_lens(lens) == lens
-    bent = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
-    assert pinhole_lens(bent).focal[0] >= 50.0
-    assert pinhole_lens(bent).is_pinhole
+    distorted = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
+    assert pinhole_lens(distorted).focal[0] >= 50.0
+    assert pinhole_lens(distorted).is_pinhole
 
 
-def test_a_resized_lens_sees_the_same():
+def test_a_resized_lens_has_the_same_view():
     small = resized_lens(Lens(64, 48, (50.0, 52.0), (30.0, 25.0)), 32, 24)
     assert (small.width, small.focal, small.center) == (32, (25.0, 26.0), (15.0, 12.5))
 
 
-def test_points_on_what_moves_are_left_out():
+def test_points_in_dynamic_regions_are_omitted():
     poses = np.tile(np.hstack([np.eye(3), np.zeros((3, 1))]), (4, 1, 1))
     points = np.array([[0.0, 0.0, 2.0], [0.5, 0.0, 2.0], [0.0, 0.0, -2.0]])
-    cameras = Cameras(list("abcd"), filmed.lens(), poses, points, 0.1, 9.0)
-    moving = np.zeros((4, 192, 256), bool)
-    moving[:3, 90:100, 120:136] = True
-    assert static_points(cameras, list(moving)).tolist() == [False, True, True]
+    cameras = Cameras(list("abcd"), boards.lens(), poses, points, 0.1, 9.0)
+    dynamic = np.zeros((4, 192, 256), bool)
+    dynamic[:3, 90:100, 120:136] = True
+    assert static_points(cameras, list(dynamic)).tolist() == [False, True, True]
 
 
 def test_cameras_are_saved_and_loaded(tmp_path):
-    cameras = Cameras(["a", "b"], filmed.lens(), filmed.poses(2), filmed.points(7), 0.5, 8.0)
-    cameras.save(tmp_path / "c.npz")
-    loaded = Cameras.load(tmp_path / "c.npz")
+    cameras = Cameras(["a", "b"], boards.lens(), boards.poses(2), boards.points(7), 0.5, 8.0, True)
+    cameras.save(tmp_path / "cameras")
+    loaded = Cameras.load(tmp_path / "cameras")
     assert (loaded.names, loaded.lens, loaded.angle) == (cameras.names, cameras.lens, cameras.angle)
+    assert loaded.weak_features
     assert np.array_equal(loaded.poses, cameras.poses)

@@ -7,7 +7,7 @@ IDENTITY = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product a · b of quaternions (w, x, y, z): first b turns, then a."""
+    """Hamilton product a · b of quaternions (w, x, y, z): the rotation b followed by the rotation a."""
     aw, ax, ay, az = a.unbind(1)
     bw, bx, by, bz = b.unbind(1)
     return torch.stack(
@@ -21,9 +21,9 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
-def activate(static, dynamic, relit, moved):
+def activate(static, dynamic, static_changes, dynamic_changes):
     """Paper Eq. 5, 8 and 11; arguments and results as those of ``warpgs.ops.activation.activate``."""
-    branches = [_branch(*static[:4], *relit), _branch(*dynamic[:4], *moved)]
+    branches = [_branch(*static[:4], *static_changes), _branch(*dynamic[:4], *dynamic_changes)]
     return tuple(torch.cat(parts) for parts in zip(*branches, strict=True))
 
 

@@ -1,4 +1,6 @@
-"""Alpha compositing in plain torch, any dtype: every pixel looks at every Gaussian, and autograd goes back."""
+"""Alpha compositing in plain torch, any dtype: every pixel evaluates every Gaussian, and autograd differentiates it."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -9,16 +11,13 @@ TRANSMITTANCE_MIN = 1e-4
 
 
 def composite(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    depths: Tensor,
-    drawn: Tensor,
-    size: tuple[int, int],
-    background: Tensor,
+    splats: Sequence[Tensor], features: Tensor, is_visible: Tensor, size: tuple[int, int], background: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """image [H, W, C], alpha [H, W], blend weights [N, H, W] of the Gaussians for which ``drawn`` [N] is true."""
+    """image [H, W, C], alpha [H, W], blend weights [N, H, W] of the Gaussians for which ``is_visible`` [N] is true.
+
+    ``splats`` are means2d, conics, depths and opacities of a ``Projection``.
+    """
+    means2d, conics, depths, opacities = splats
     width, height = size
     dtype = means2d.dtype
     x = torch.arange(width, dtype=dtype) + 0.5
@@ -28,7 +27,7 @@ def composite(
     running = torch.ones(height, width, dtype=torch.bool)
     weights = torch.zeros(means2d.shape[0], height, width, dtype=dtype)
     for g in torch.argsort(depths.detach(), stable=True).tolist():
-        if not drawn[g]:
+        if not is_visible[g]:
             continue
         dx, dy = means2d[g, 0] - x[None, :], means2d[g, 1] - y[:, None]
         a, b, c = conics[g]

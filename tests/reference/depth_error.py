@@ -11,7 +11,7 @@ def depth_error(depth: Tensor, alpha: Tensor, inverse_depth: Tensor, alignment: 
 
 
 def random_inputs(height: int, width: int, generator: torch.Generator) -> list[Tensor]:
-    """Depth, alpha, inverse depth, alignment and region, with all that makes a pixel count for nothing."""
+    """Depth, alpha, inverse depth, alignment and region, with pixels of each type that is not compared."""
     size = (height, width)
     alpha, inverse_depth = (torch.rand(size, generator=generator) for _ in range(2))
     inverse_depth[torch.rand(size, generator=generator) > 0.8] = torch.nan

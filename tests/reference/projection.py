@@ -4,24 +4,18 @@ import torch
 from torch import Tensor
 
 from tests.reference.covariance import covariance
+from warpgs.ops.projection import Geometry, View
 
 LOW_PASS = 0.3
 ALPHA_MIN = 1.0 / 255.0
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    size: tuple[int, int],
-    near: float = 0.01,
-    antialias: bool = False,
+    geometry: Geometry, view: View, near: float = 0.01, antialias: bool = False
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """means2d, conics, depths, opacities, visible [N] bool. Values of invisible Gaussians mean nothing."""
-    width, height = size
+    """means2d, conics, depths, opacities, visible [N] bool. Values of invisible Gaussians are undefined."""
+    means, quats, scales, opacities = geometry
+    viewmat, K, width, height = view
     W, translation = viewmat[:3, :3], viewmat[:3, 3]
     t = means @ W.T + translation
     x, y, z = t.unbind(-1)

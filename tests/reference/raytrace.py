@@ -7,15 +7,15 @@ TUBE = 0.3
 FAR = 1e6
 
 
-def hit(kind: int, o: Tensor, d: Tensor) -> Tensor:
+def hit(shape: int, o: Tensor, d: Tensor) -> Tensor:
     """Smallest t > 0 at which each ray meets a unit shape; FAR where it does not."""
     far = torch.full_like(o[:, 0], FAR)
     a, b = (d * d).sum(1), (o * d).sum(1)
-    if kind == 0:
+    if shape == 0:
         root = b * b - a * ((o * o).sum(1) - 1)
         t = (-b - root.clamp_min(0).sqrt()) / a
         return torch.where((root >= 0) & (t > 0), t, far)
-    if kind == 1:
+    if shape == 1:
         low, high = (-1 - o) / d, (1 - o) / d
         enter, leave = torch.minimum(low, high).amax(1), torch.maximum(low, high).amin(1)
         t = torch.where(enter > 0, enter, leave)
@@ -28,17 +28,17 @@ def hit(kind: int, o: Tensor, d: Tensor) -> Tensor:
     return torch.where((distance < 1e-4) & (t < 100), t, far)
 
 
-def normal(kind: int, p: Tensor) -> Tensor:
-    if kind == 0:
+def normal(shape: int, p: Tensor) -> Tensor:
+    if shape == 0:
         return p
-    if kind == 1:
+    if shape == 1:
         return p * torch.nn.functional.one_hot(p.abs().argmax(1), 3)
     around = p[:, :2].norm(dim=1, keepdim=True)
     return torch.cat([p[:, :2] - p[:, :2] / around, p[:, 2:]], 1)
 
 
-def nearest(kinds: Tensor, bodies: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    ts = [hit(int(k), o @ m[:, :3].T + m[:, 3], d @ m[:, :3].T) for k, m in zip(kinds, bodies, strict=True)]
+def nearest(shapes: Tensor, bodies: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    ts = [hit(int(k), o @ m[:, :3].T + m[:, 3], d @ m[:, :3].T) for k, m in zip(shapes, bodies, strict=True)]
     t, body = torch.stack(ts).min(0)
     return t, torch.where(t < FAR, body, -1)
 
@@ -47,8 +47,15 @@ def noise(x: Tensor, y: Tensor) -> Tensor:
     return (52.9829189 * ((0.06711056 * x + 0.00583715 * y) % 1)) % 1
 
 
-def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size):
-    """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace."""
+def checkerboard(p: Tensor, frequency: Tensor) -> Tensor:
+    """[N, 1] fraction of the first colour at points of body space."""
+    wave = (frequency[:, None] * p + torch.tensor([0.4, 0.9, 1.3], dtype=p.dtype)).sin().prod(1)
+    return (0.5 + 0.5 * wave / (wave.abs() + 0.06))[:, None]
+
+
+def raytrace(scene, lamp, samples, viewmat, K, size):
+    """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace; ``scene`` has the fields of ``Bodies``."""
+    shapes, bodies, colors, frequencies = scene
     width, height = size
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([column, row], -1).reshape(-1, 2).to(viewmat.dtype)
@@ -64,30 +71,28 @@ def raytrace(kinds, bodies, colors, frequencies, lamp, samples, viewmat, K, size
     total = torch.zeros(len(pixels), 3, dtype=viewmat.dtype)
     for sample in samples:
         o, d = rays(sample[:2])
-        t, body = nearest(kinds, bodies, o, d)
+        t, body = nearest(shapes, bodies, o, d)
         p = o + t[:, None] * d
         m = bodies[body]
         local = (m[:, :, :3] @ p[:, :, None])[:, :, 0] + m[:, :, 3]
         n = torch.zeros_like(p)
-        for k in range(len(kinds)):
+        for k in range(len(shapes)):
             chosen = body == k
-            n[chosen] = normal(int(kinds[k]), local[chosen]) @ bodies[k][:, :3]
+            n[chosen] = normal(int(shapes[k]), local[chosen]) @ bodies[k][:, :3]
         n = torch.nn.functional.normalize(n, dim=1)
         view = -torch.nn.functional.normalize(d, dim=1)
         n = torch.where((n * view).sum(1, keepdim=True) < 0, -n, n)
         start = p + 1e-3 * n
         to_light = lamp[0] + (2 * ((sample[2:] + shift) % 1) - 1) @ lamp[1:] - start
-        blocked, _ = nearest(kinds, bodies, start, to_light)
+        blocked, _ = nearest(shapes, bodies, start, to_light)
         light = torch.nn.functional.normalize(to_light, dim=1)
         lit = (blocked >= 1) * (n * light).sum(1).clamp_min(0)
-        angle = frequencies[body][:, None] * local + torch.tensor([0.4, 0.9, 1.3], dtype=p.dtype)
-        wave = angle.sin().prod(1)
-        checks = (0.5 + 0.5 * wave / (wave.abs() + 0.06))[:, None]
+        checks = checkerboard(local, frequencies[body])
         color = checks * colors[body, 0] + (1 - checks) * colors[body, 1]
         ambient = 0.24 + (0.42 - 0.24) * (0.5 + 0.5 * n[:, 2])
         half = torch.nn.functional.normalize(light + view, dim=1)
         gloss = 0.18 * (n * half).sum(1).clamp_min(0) ** 40 * lit
         total += torch.where((body >= 0)[:, None], (ambient + 0.72 * lit)[:, None] * color + gloss[:, None], 0.0)
-    t, body = nearest(kinds, bodies, *rays(torch.full((2,), 0.5, dtype=viewmat.dtype)))
+    t, body = nearest(shapes, bodies, *rays(torch.full((2,), 0.5, dtype=viewmat.dtype)))
     image = total / len(samples)
     return image.reshape(height, width, 3), t.reshape(height, width), body.reshape(height, width)

@@ -5,25 +5,28 @@ from torch import Tensor
 from tests.reference import compositing, projection, sh
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
+from warpgs.ops.projection import Geometry, View
 
 
 def render(
-    tensors: dict[str, Tensor], camera: Camera, background: Tensor, drawn: Tensor | None = None, antialias: bool = False
+    tensors: dict[str, Tensor],
+    camera: Camera,
+    background: Tensor,
+    selected: Tensor | None = None,
+    antialias: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """image, alpha, weights of splats given as a dict of ``Splats`` tensors; ``drawn`` [N] picks a branch."""
+    """image, alpha, weights for a dict of ``Splats`` tensors; ``selected`` [N] restricts the splats to a branch."""
     dtype = tensors["means"].dtype
     viewmat, K = camera.viewmat.to(dtype), camera.K.to(dtype)
-    geometry = [tensors[name] for name in ("means", "quats", "scales", "opacities")]
-    means2d, conics, depths, opacities, visible = projection.project(
-        *geometry, viewmat, K, camera.size, antialias=antialias
-    )
+    geometry = Geometry(*(tensors[name] for name in Geometry._fields))
+    *splats, visible = projection.project(geometry, View(viewmat, K, *camera.size), antialias=antialias)
     if tensors.get("colors") is not None:
         features = tensors["colors"]
     else:
         degree = round(tensors["sh"].shape[1] ** 0.5) - 1
         features = sh.spherical_harmonics(tensors["means"], tensors["sh"], viewmat, degree)
-    visible = visible if drawn is None else visible & drawn
-    return compositing.composite(means2d, conics, opacities, features, depths, visible, camera.size, background)
+    visible = visible if selected is None else visible & selected
+    return compositing.composite(splats, features, visible, camera.size, background)
 
 
 def as_dict(splats: Splats, **changes: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What repeats is replayed, and nobody can tell. Without a GPU a graph is stood in for by doing the work again."""
+"""Replayed calls equal eager ones; without a GPU, a replay is simulated by repeating the work."""
 
 import dataclasses
 import gc
@@ -8,7 +8,7 @@ import pytest
 import torch
 import torch.utils.checkpoint
 
-from tests.scenes import as_leaves, gradients, make_camera, make_splats, pulled, random_like
+from tests.scenes import as_leaves, gradients, make_camera, make_splats, random_like, weighted_sum
 from warpgs.config import RenderSettings
 from warpgs.rendering import render
 from warpgs.runtime import replay
@@ -18,7 +18,7 @@ SETTINGS = [RenderSettings(), RenderSettings(branches=True, depth=True, statisti
 
 @pytest.fixture
 def recordings(monkeypatch):
-    """How many graphs were recorded; and a new memory of what was called."""
+    """A list of the graphs that were recorded, from an empty cache."""
     made = []
 
     def record(work, stream, pool):
@@ -30,12 +30,12 @@ def recordings(monkeypatch):
     monkeypatch.setattr(replay, "_stream_and_pool", lambda device: (None, None))
     monkeypatch.setattr(replay, "_stream", lambda device: 0)
     monkeypatch.setattr(replay, "_can_replay", lambda device: True)
-    monkeypatch.setattr(replay, "_kinds", {})
+    monkeypatch.setattr(replay, "_signatures", {})
     return made
 
 
-def draw(seed=0, settings=SETTINGS[0], camera=None):
-    """A new scene's splats, what is rendered of them, and all images of that."""
+def render_scene(seed=0, settings=SETTINGS[0], camera=None):
+    """New splats, their rendering and all of its images."""
     splats = as_leaves(make_splats(seed=seed))
     result = render(splats, camera or make_camera(), torch.linspace(0.1, 0.8, 3), settings)
     layers = [layer for layer in (result.joint, result.static, result.dynamic) if layer is not None]
@@ -43,15 +43,15 @@ def draw(seed=0, settings=SETTINGS[0], camera=None):
 
 
 def warm_up(**options):
-    for _ in range(replay.PLAIN_CALLS):
-        _, _, images = draw(**options)
-        pulled(images, random_like(images)).backward()
+    for _ in range(replay.EAGER_CALLS):
+        _, _, images = render_scene(**options)
+        weighted_sum(images, random_like(images)).backward()
 
 
-def everything(drawn):
-    """Outputs and, after the way back, gradients."""
-    splats, result, images = drawn
-    pulled(images, random_like(images)).backward()
+def everything(scene):
+    """Outputs and, after the backward pass, gradients."""
+    splats, result, images = scene
+    weighted_sum(images, random_like(images)).backward()
     given = (*images, result.radii, result.gradient_norms, result.contributed, result.weights)
     return [t.detach().clone() for t in (*given, *gradients(splats).values()) if t is not None]
 
@@ -62,17 +62,17 @@ def assert_same(actual, expected):
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_replayed_renders_are_the_plain_ones(settings, recordings):
-    plain = [everything(draw(seed, settings)) for seed in range(replay.PLAIN_CALLS)]
+def test_replayed_renders_equal_eager_ones(settings, recordings):
+    plain = [everything(render_scene(seed, settings)) for seed in range(replay.EAGER_CALLS)]
     for _ in range(2):
         for seed, expected in enumerate(plain):
-            assert_same(everything(draw(seed, settings)), expected)
-    assert len(recordings) == 2  # the way forth and the way back
+            assert_same(everything(render_scene(seed, settings)), expected)
+    assert len(recordings) == 2  # forward and backward
 
 
 @pytest.mark.parametrize(("num", "size"), [(0, (40, 30)), (5, (0, 8))])
-def test_empty_renders_too(num, size, recordings):
-    for _ in range(2 * replay.PLAIN_CALLS):
+def test_empty_renders_are_correct_when_repeated(num, size, recordings):
+    for _ in range(2 * replay.EAGER_CALLS):
         splats = as_leaves(make_splats(num))
         image = render(splats, make_camera(*size), torch.full((3,), 0.5)).joint.image
         assert (image == 0.5).all()
@@ -80,110 +80,111 @@ def test_empty_renders_too(num, size, recordings):
         assert not any(g.any() for g in gradients(splats).values())
 
 
-def test_without_gradients_too(recordings):
+def test_renders_without_gradients_are_replayed(recordings):
     with torch.no_grad():
-        plain = [draw(seed)[2] for seed in range(replay.PLAIN_CALLS)]
+        plain = [render_scene(seed)[2] for seed in range(replay.EAGER_CALLS)]
         for seed, expected in enumerate(plain):
-            assert_same(draw(seed)[2], expected)
+            assert_same(render_scene(seed)[2], expected)
     assert len(recordings) == 1
 
 
-def test_what_is_in_use_is_not_replayed(recordings):
+def test_a_recording_in_use_is_not_replayed(recordings):
     warm_up()
-    drawn = [draw(seed) for seed in range(replay.MAX_RECORDINGS + 2)]
+    scenes = [render_scene(seed) for seed in range(replay.MAX_RECORDINGS + 2)]
     assert len(recordings) == replay.MAX_RECORDINGS
-    kept = [[image.clone() for image in images] for _, _, images in drawn]
-    values = [everything(d) for d in drawn]
-    for images, (_, _, still) in zip(kept, drawn, strict=True):
+    kept = [[image.clone() for image in images] for _, _, images in scenes]
+    values = [everything(scene) for scene in scenes]
+    for images, (_, _, still) in zip(kept, scenes, strict=True):
         assert_same(still, images)
-    replay._kinds.clear()
+    replay._signatures.clear()
     for seed, value in enumerate(values):
-        assert_same(value, everything(draw(seed)))
+        assert_same(value, everything(render_scene(seed)))
 
 
-def test_a_recording_is_free_again_with_the_graph_of_its_call(recordings):
+def test_a_recording_is_released_with_the_graph_of_its_call(recordings):
     warm_up()
     gc.disable()
     try:
         for seed in range(10):
-            draw(seed)  # nobody goes its way back
-            everything(draw(seed))
+            render_scene(seed)  # without a backward pass
+            everything(render_scene(seed))
     finally:
         gc.enable()
     assert len(recordings) == 2
 
 
-def test_the_way_back_can_be_gone_again(recordings):
+def test_the_backward_pass_can_be_repeated(recordings):
     warm_up()
     for _ in range(3):
-        splats, _, images = draw()
-        cotangents = random_like(images)
-        pulled(images, cotangents).backward(retain_graph=True)
+        splats, _, images = render_scene()
+        v_outputs = random_like(images)
+        weighted_sum(images, v_outputs).backward(retain_graph=True)
         once = {name: g.clone() for name, g in gradients(splats).items()}
-        pulled(images, cotangents).backward()
+        weighted_sum(images, v_outputs).backward()
         for name, gradient in gradients(splats).items():
             assert torch.equal(gradient, 2 * once[name])
 
 
-def test_every_image_alone_can_be_gone_back_from(recordings):
+def test_each_image_alone_propagates_its_gradient(recordings):
     warm_up(settings=SETTINGS[1])
     for _ in range(3):
         for k in range(9):
-            splats, _, images = draw(settings=SETTINGS[1])
+            splats, _, images = render_scene(settings=SETTINGS[1])
             images[k].sum().backward()
-            plain, _, images = draw(settings=dataclasses.replace(SETTINGS[1], replay=False))
+            plain, _, images = render_scene(settings=dataclasses.replace(SETTINGS[1], replay=False))
             images[k].sum().backward()
             for name, gradient in gradients(plain).items():
                 assert torch.equal(gradients(splats)[name], gradient)
 
 
-def test_a_recording_has_nothing_of_what_its_inputs_came_from(recordings):
-    for _ in range(replay.PLAIN_CALLS + 2):
-        everything(draw())
-    (kind,) = replay._kinds.values()
-    assert not any(t.requires_grad for t in kind.idle[0]._inputs._own_words)
+def test_a_recording_holds_no_graph_of_its_inputs(recordings):
+    for _ in range(replay.EAGER_CALLS + 2):
+        everything(render_scene())
+    (signature,) = replay._signatures.values()
+    assert not any(t.requires_grad for t in signature.idle[0]._inputs._own_words)
 
 
-def sizes_drawn(sizes):
+def render_sizes(sizes):
     for size in sizes:
-        everything(draw(camera=make_camera(*size)))
+        everything(render_scene(camera=make_camera(*size)))
 
 
-def test_kinds_and_recordings_that_are_called_are_kept(recordings):
+def test_recently_used_signatures_and_recordings_are_kept(recordings):
     often = (40, 30)
-    sizes_drawn([often] * (replay.PLAIN_CALLS + 2))
-    others = [(20 + k, 10) for k in range(2 * replay.MAX_KEYS)]
+    render_sizes([often] * (replay.EAGER_CALLS + 2))
+    others = [(20 + k, 10) for k in range(2 * replay.MAX_SIGNATURES)]
     for other in others:
-        sizes_drawn([other, often])
-    assert [kind.recordings for kind in replay._kinds.values()] == [0] * (replay.MAX_KEYS - 1) + [1]
+        render_sizes([other, often])
+    numbers = [signature.recordings for signature in replay._signatures.values()]
+    assert numbers == [0] * (replay.MAX_SIGNATURES - 1) + [1]
     made = len(recordings)
     for other in others[: replay.MAX_RECORDINGS + 1]:
-        sizes_drawn([*[other] * (replay.PLAIN_CALLS + 2), often])
-    sizes_drawn([often])
+        render_sizes([*[other] * (replay.EAGER_CALLS + 2), often])
+    render_sizes([often])
     assert len(recordings) == made + 2 * (replay.MAX_RECORDINGS + 1)
 
 
-@pytest.mark.parametrize("num_before", [0, replay.PLAIN_CALLS])
-def test_mistakes_are_noticed_as_ever(num_before, recordings):
+@pytest.mark.parametrize("num_before", [0, replay.EAGER_CALLS])
+def test_misuse_is_detected_with_and_without_replay(num_before, recordings):
     for _ in range(num_before):
-        everything(draw())
-    _, result, images = draw()
+        everything(render_scene())
+    _, result, images = render_scene()
     result.radii.mul_(2)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         images[0].sum().backward()
-    changed = draw()
+    changed = render_scene()
     with torch.no_grad():
         changed[0].means.add_(1.0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         everything(changed)
-    twice = draw()
+    twice = render_scene()
     everything(twice)
     with pytest.raises(RuntimeError, match="second time"):
         everything(twice)
 
 
-def test_what_is_computed_again_for_the_way_back_may_be_replayed(recordings):
-    for _ in range(2 * replay.PLAIN_CALLS):
+def test_checkpointed_renders_may_be_replayed(recordings):
+    for _ in range(2 * replay.EAGER_CALLS):
         values = []
         for again in (False, True):
             splats = as_leaves(make_splats())
@@ -192,16 +193,16 @@ def test_what_is_computed_again_for_the_way_back_may_be_replayed(recordings):
                 return render(dataclasses.replace(splats, means=means), make_camera()).joint.image
 
             if again:
-                drawn = torch.utils.checkpoint.checkpoint(image, splats.means, use_reentrant=False)
+                rendered = torch.utils.checkpoint.checkpoint(image, splats.means, use_reentrant=False)
             else:
-                drawn = image(splats.means)
-            drawn.square().sum().backward()
+                rendered = image(splats.means)
+            rendered.square().sum().backward()
             values.append(splats.means.grad)
         assert torch.equal(*values)
 
 
 def test_the_camera_has_no_gradient(recordings):
-    for _ in range(2 * replay.PLAIN_CALLS):
+    for _ in range(2 * replay.EAGER_CALLS):
         camera = make_camera()
         camera.viewmat.requires_grad_()
         assert not render(make_splats(), camera).joint.image.requires_grad
@@ -210,37 +211,38 @@ def test_the_camera_has_no_gradient(recordings):
         assert camera.viewmat.grad is None
 
 
-def test_a_recording_that_does_not_fit_any_more_is_dropped(recordings, monkeypatch):
+def test_an_invalid_recording_is_dropped(recordings, monkeypatch):
     warm_up()
-    everything(draw())
+    everything(render_scene())
     monkeypatch.setattr(replay.Recording, "is_valid", lambda self: False)
-    everything(draw())
-    (kind,) = replay._kinds.values()
-    assert (kind.recordings, kind.calls) == (0, 1)
+    everything(render_scene())
+    (signature,) = replay._signatures.values()
+    assert (signature.recordings, signature.calls) == (0, 1)
     warm_up()
     assert len(recordings) == 2
 
 
-def test_other_shapes_and_settings_have_recordings_of_their_own(recordings):
+def test_other_shapes_and_settings_have_their_own_signatures(recordings):
     warm_up()
-    everything(draw())
-    everything(draw(settings=RenderSettings(antialias=True)))
+    everything(render_scene())
+    everything(render_scene(settings=RenderSettings(antialias=True)))
     render(as_leaves(make_splats(59)), make_camera(), torch.linspace(0.1, 0.8, 3))
     render(as_leaves(make_splats(60)), make_camera(32, 24), torch.linspace(0.1, 0.8, 3))
     render(as_leaves(make_splats(60)), make_camera())
     with torch.no_grad():
-        draw()
+        render_scene()
     assert len(recordings) == 1
-    assert len(replay._kinds) == 6
+    assert len(replay._signatures) == 6
 
 
-def test_so_many_recordings_are_kept_and_no_more(recordings):
+def test_the_number_of_recordings_is_limited(recordings):
     for num in range(20, 20 + 2 * replay.MAX_RECORDINGS):
-        for _ in range(replay.PLAIN_CALLS + 2):
+        for _ in range(replay.EAGER_CALLS + 2):
             splats = as_leaves(make_splats(num))
             render(splats, make_camera()).joint.image.sum().backward()
-        kept = [len(kind.idle) for kind in replay._kinds.values()]
-        assert sum(kept) == sum(kind.recordings for kind in replay._kinds.values()) <= replay.MAX_RECORDINGS
+        signatures = replay._signatures.values()
+        kept = [len(signature.idle) for signature in signatures]
+        assert sum(kept) == sum(signature.recordings for signature in signatures) <= replay.MAX_RECORDINGS
         assert kept[-1] == 1
 
 
@@ -256,21 +258,21 @@ def test_only_the_main_thread_outside_of_inference_mode_replays(monkeypatch):
         assert not replay._can_replay(cuda)
 
 
-def test_large_work_is_not_replayed(recordings, monkeypatch):
-    monkeypatch.setattr(replay, "MAX_VALUE", 1000)
+def test_large_calls_are_not_replayed(recordings, monkeypatch):
+    monkeypatch.setattr(replay, "MAX_BYTES", 1000)
     for _ in range(2):
         warm_up()
     assert not recordings
 
 
-def test_only_so_many_kinds_of_calls_are_remembered(recordings):
-    for width in range(1, replay.MAX_KEYS + 10):
+def test_the_number_of_signatures_is_limited(recordings):
+    for width in range(1, replay.MAX_SIGNATURES + 10):
         render(make_splats(3), make_camera(width, 8))
-    assert len(replay._kinds) == replay.MAX_KEYS
+    assert len(replay._signatures) == replay.MAX_SIGNATURES
 
 
 def test_replaying_can_be_switched_off(recordings):
     for _ in range(2):
         warm_up(settings=RenderSettings(replay=False))
     assert not recordings
-    assert not replay._kinds
+    assert not replay._signatures

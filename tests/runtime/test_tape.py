@@ -10,28 +10,28 @@ from warpgs.kernels.covariance import covariance as kernel
 from warpgs.rendering import render
 from warpgs.runtime import tape
 from warpgs.runtime.profiling import profile
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 
 def launch(quats, scales):
-    Run(torch.device("cpu"), []).launch(kernel, 7, quats, scales, torch.zeros(7, 3, 3))
+    OpContext(torch.device("cpu"), []).launch(kernel, 7, quats, scales, torch.zeros(7, 3, 3))
 
 
 @pytest.mark.parametrize(
     "quats",
     [torch.ones(7, 4, dtype=torch.float64), torch.ones(7, 4, dtype=torch.int32), torch.ones(7, 3), torch.ones(7)],
 )
-def test_an_argument_that_the_kernel_would_misread_is_refused(quats):
+def test_a_kernel_argument_of_a_wrong_type_is_refused(quats):
     with pytest.raises(TypeError, match="quats is a 1-d array of vec4"):
         launch(quats, torch.ones(7, 3))
 
 
-def test_an_argument_that_is_not_contiguous_is_refused():
+def test_a_kernel_argument_that_is_not_contiguous_is_refused():
     with pytest.raises(TypeError, match="scales must be contiguous"):
         launch(torch.ones(7, 4), torch.ones(3, 7).T)
 
 
-def picture(seed: int) -> list[torch.Tensor]:
+def image_and_gradients(seed: int) -> list[torch.Tensor]:
     splats = as_leaves(make_splats(80, seed=seed))
     image = render(splats, make_camera(40 + seed, 37)).joint.image
     image.square().sum().backward()
@@ -39,28 +39,28 @@ def picture(seed: int) -> list[torch.Tensor]:
 
 
 @pytest.fixture
-def shared_out(monkeypatch):
-    """Small launches go to all cores, too."""
+def all_cores(monkeypatch):
+    """Small launches use all cores, too."""
     monkeypatch.setattr(tape, "MIN_SHARD", 1)
 
 
-def test_threads_that_render_at_once_draw_what_they_draw_alone(shared_out):
+def test_concurrent_threads_render_the_same_as_alone(all_cores):
     seeds = list(range(4)) * 8
-    alone = [picture(seed) for seed in range(4)]
+    alone = [image_and_gradients(seed) for seed in range(4)]
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(picture, seeds))
+        together = list(pool.map(image_and_gradients, seeds))
     for seed, values in zip(seeds, together, strict=True):
         for value, expected in zip(values, alone[seed], strict=True):
             assert torch.equal(value, expected)
 
 
-def test_one_core_draws_what_two_draw(shared_out):
+def test_one_core_renders_the_same_as_two(all_cores):
     cores = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        single = picture(0)
+        single = image_and_gradients(0)
         torch.set_num_threads(2)
-        double = picture(0)
+        double = image_and_gradients(0)
     finally:
         torch.set_num_threads(cores)
     assert torch.equal(single[0], double[0])
@@ -68,9 +68,9 @@ def test_one_core_draws_what_two_draw(shared_out):
         assert (value - expected).norm() < 1e-6 * expected.norm()
 
 
-def test_a_profile_lists_the_kernels_of_both_ways():
+def test_a_profile_lists_the_kernels_of_forward_and_backward():
     with profile() as taken:
-        picture(0)
+        image_and_gradients(0)
     times = taken.times()
     names = [t.name for t in times]
     forward = ["project_fwd", "pack", "sort_pairs", "count_tiles", "emit_isects", "sort_pairs", "tile_ranges"]
@@ -88,31 +88,31 @@ def test_a_profile_lists_the_kernels_of_both_ways():
     assert [t.start_ms for t in times] == sorted(t.start_ms for t in times)
 
 
-def test_nothing_is_listed_after_a_profile_is_over():
+def test_nothing_is_listed_after_the_end_of_a_profile():
     with profile() as taken:
         pass
-    picture(0)
+    image_and_gradients(0)
     assert taken.times() == []
 
 
 def test_two_profiles_at_once_are_refused():
-    with profile(), pytest.raises(RuntimeError, match="already"), profile():
+    with profile(), pytest.raises(RuntimeError, match="another profile is active"), profile():
         pass
 
 
-@pytest.mark.parametrize("wanted", ["means", "quats", "scales", "opacities", "sh"])
-def test_gradients_flow_only_to_tensors_that_want_them(wanted):
+@pytest.mark.parametrize("name_with_gradient", ["means", "quats", "scales", "opacities", "sh"])
+def test_gradients_flow_only_to_tensors_that_require_them(name_with_gradient):
     everything, one = as_leaves(make_splats()), as_leaves(make_splats())
     for name, tensor in float_tensors(one).items():
-        tensor.requires_grad_(name == wanted)
+        tensor.requires_grad_(name == name_with_gradient)
     for splats in (everything, one):
         render(splats, make_camera()).joint.image.sum().backward()
     for name, gradient in gradients(one).items():
-        if name == wanted:
+        if name == name_with_gradient:
             assert torch.equal(gradient, gradients(everything)[name])
         else:
             assert gradient is None
 
 
-def test_what_wants_no_gradient_records_none():
+def test_without_inputs_that_require_gradients_nothing_is_recorded():
     assert not render(make_splats(), make_camera()).joint.image.requires_grad

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first is noted, the second interrupts, and what was before comes back."""
+"""Ctrl-C: the first is recorded, the second interrupts, and the previous handler is restored."""
 
 import dataclasses
 import signal
@@ -12,11 +12,12 @@ from warpgs.training import command
 from warpgs.training import train as script
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.step import Step
+from warpgs.training.train import TrainingInterrupted
 
 
 @pytest.fixture(autouse=True)
 def _as_in_a_terminal():
-    """A job in the background ignores SIGINT."""
+    """Restores the default handler: background jobs ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -26,15 +27,15 @@ def press():
     signal.raise_signal(signal.SIGINT)
 
 
-def test_nothing_is_wanted_before_ctrl_c():
+def test_no_stop_is_requested_before_ctrl_c():
     with Interrupt() as interrupt:
-        assert not interrupt.wanted
+        assert not interrupt.requested
 
 
-def test_the_first_ctrl_c_is_only_noted():
+def test_the_first_ctrl_c_is_only_recorded():
     with Interrupt() as interrupt:
         press()
-        assert interrupt.wanted
+        assert interrupt.requested
 
 
 def test_the_second_ctrl_c_interrupts():
@@ -53,30 +54,30 @@ def test_a_third_ctrl_c_interrupts_too():
 
 
 @pytest.mark.parametrize("presses", [0, 1])
-def test_what_ctrl_c_did_before_comes_back(presses):
-    heard = []
-    signal.signal(signal.SIGINT, lambda *_: heard.append("before"))
+def test_the_previous_handler_is_restored(presses):
+    pressed = []
+    signal.signal(signal.SIGINT, lambda *_: pressed.append("before"))
     with Interrupt():
         for _ in range(presses):
             press()
-    assert heard == []
+    assert pressed == []
     press()
-    assert heard == ["before"]
+    assert pressed == ["before"]
 
 
-def test_what_ctrl_c_did_before_comes_back_after_an_error():
+def test_the_previous_handler_is_restored_after_an_error():
     with pytest.raises(ValueError, match="wrong"), Interrupt():
         raise ValueError("wrong")
     with pytest.raises(KeyboardInterrupt):
         press()
 
 
-def test_each_context_begins_anew():
+def test_each_context_starts_without_a_request():
     interrupt = Interrupt()
     with interrupt:
         press()
     with Interrupt() as another:
-        assert not another.wanted
+        assert not another.requested
 
 
 # In training --------------------------------------------------------------------------------------------------------
@@ -93,7 +94,7 @@ def config(data, tmp_path, contracts_off):
 
 
 def pressing_in_step(monkeypatch, number, presses):
-    """Ctrl-C in the middle of the ``number``-th step, right after its update."""
+    """Presses Ctrl-C in the ``number``-th step, right after its update."""
     whole, steps = Step.__call__, []
 
     def step(self, *arguments):
@@ -106,12 +107,20 @@ def pressing_in_step(monkeypatch, number, presses):
     monkeypatch.setattr(Step, "__call__", step)
 
 
-def test_after_ctrl_c_the_iteration_in_progress_ends_and_is_saved(config, monkeypatch, capsys):
+def test_after_ctrl_c_the_current_iteration_finishes_and_is_saved(config, monkeypatch):
     pressing_in_step(monkeypatch, number=5, presses=1)
-    assert script.train(config) == 130
+    with pytest.raises(TrainingInterrupted) as stop:
+        script.train(config)
     assert checkpoint.load(checkpoint.list_checkpoints(config.out)[-1]).metadata.iteration == 5
-    said = capsys.readouterr().err
-    assert f"stopped after iteration 5 of {tiny.LENGTH}; go on with --resume {config.out}" in said
+    assert (stop.value.folder, stop.value.iteration, stop.value.num_iterations) == (config.out, 5, tiny.LENGTH)
+
+
+def test_the_command_reports_an_interrupted_training_with_exit_code_130(config, monkeypatch, capsys):
+    pressing_in_step(monkeypatch, number=5, presses=1)
+    monkeypatch.setattr(command, "parse", lambda *_: config)
+    assert command.main([]) == 130
+    stderr = capsys.readouterr().err
+    assert f"stopped after iteration 5 of {tiny.LENGTH}; continue with --resume {config.out}" in stderr
 
 
 def test_a_second_ctrl_c_stops_at_once_and_leaves_whole_checkpoints(config, monkeypatch):
@@ -119,7 +128,7 @@ def test_a_second_ctrl_c_stops_at_once_and_leaves_whole_checkpoints(config, monk
     with pytest.raises(KeyboardInterrupt):
         script.train(config)
     assert [checkpoint.load(path).metadata.iteration for path in checkpoint.list_checkpoints(config.out)] == [0, 7]
-    assert script.start(command.parse(["--resume", str(config.out)])).iteration == 7
+    assert script.make_trainer(command.parse(["--resume", str(config.out)])).iteration == 7
 
 
 def test_a_second_ctrl_c_while_the_checkpoint_is_written_leaves_whole_checkpoints(config, monkeypatch):
@@ -138,14 +147,28 @@ def test_a_second_ctrl_c_while_the_checkpoint_is_written_leaves_whole_checkpoint
     assert list((config.out / "checkpoints").glob("*.partial")) == []
 
 
-def test_ctrl_c_works_after_a_stopped_training(config, monkeypatch):
+def test_ctrl_c_works_after_an_interrupted_training(config, monkeypatch):
     pressing_in_step(monkeypatch, number=3, presses=1)
-    script.train(config)
+    with pytest.raises(TrainingInterrupted):
+        script.train(config)
     with pytest.raises(KeyboardInterrupt):
         press()
 
 
-def test_ctrl_c_is_heard_while_another_thread_works():
+def test_outside_the_main_thread_ctrl_c_is_left_alone():
+    handlers = []
+
+    def work():
+        with Interrupt() as interrupt:
+            handlers.append((signal.getsignal(signal.SIGINT), interrupt.requested))
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    worker.join()
+    assert handlers == [(signal.default_int_handler, False)]
+
+
+def test_ctrl_c_is_recorded_while_another_thread_works():
     done = threading.Event()
     with Interrupt() as interrupt:
         worker = threading.Thread(target=done.wait)
@@ -153,4 +176,4 @@ def test_ctrl_c_is_heard_while_another_thread_works():
         press()
         done.set()
         worker.join()
-        assert interrupt.wanted
+        assert interrupt.requested

@@ -1,9 +1,9 @@
-"""What a run says of itself."""
+"""Progress on the console and TensorBoard events."""
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from warpgs.training import logger as logger
+from warpgs.training import logger
 from warpgs.training.logger import Status, TrainingLogger
 
 TERMS = {"static": 0.25, "depth": 0.5}
@@ -16,7 +16,7 @@ def status(iteration, **changes):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Seconds, to be set."""
+    """The current time, which a test sets [s]."""
     now = [1000.0]
     monkeypatch.setattr(logger.time, "monotonic", lambda: now[0])
     return now
@@ -28,70 +28,70 @@ def events(folder):
     return {tag: [(e.step, e.value) for e in accumulator.Scalars(tag)] for tag in accumulator.Tags()["scalars"]}
 
 
-def test_a_look_is_one_line(tmp_path, capsys):
-    with TrainingLogger(tmp_path, 500, 0) as book:
-        book.show(status(50))
-    said = capsys.readouterr().out
-    assert said.count("\n") == 1
+def test_a_report_is_one_line(tmp_path, capsys):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        log.report(status(50))
+    output = capsys.readouterr().out
+    assert output.count("\n") == 1
     for part in ("50/500", "stage1", "loss 0.7500", "PSNR 21.50", "static 12,345", "dynamic 67"):
-        assert part in said
+        assert part in output
 
 
-def test_speed_and_time_left_are_of_the_iterations_since_the_last_look(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 0) as book:
+def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
         clock[0] += 100.0
-        book.show(status(100))
+        log.report(status(100))
         clock[0] += 20.0
-        book.show(status(200))
+        log.report(status(200))
     first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith("1.0 it/s")  # which compiled kernels, too
+    assert first.endswith("1.0 it/s")  # which includes the compilation of kernels
     assert "5.0 it/s  60 s left" in second
 
 
-def test_speed_of_a_resumed_run_counts_its_own_iterations(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 400) as book:
+def test_the_speed_of_a_resumed_run_covers_its_own_iterations(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 400) as log:
         clock[0] += 5.0
-        book.show(status(450))
+        log.report(status(450))
         clock[0] += 20.0
-        book.show(status(460))
+        log.report(status(460))
     first, second = capsys.readouterr().out.splitlines()
     assert first.endswith("10.0 it/s")
     assert "0.5 it/s  80 s left" in second
 
 
-def test_lines_are_seconds_apart(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 0) as book:
+def test_lines_have_a_minimum_distance_in_time(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
         for iteration in range(10, 70, 10):
-            book.show(status(iteration))
+            log.report(status(iteration))
             clock[0] += logger.LINE_EVERY / 4
     assert [line.split("/")[0] for line in capsys.readouterr().out.splitlines()] == ["10", "60"]
 
 
-def test_the_last_iteration_has_a_line_however_soon_it_comes(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 0) as book:
-        book.show(status(499))
-        book.show(status(500))
+def test_the_last_iteration_always_has_a_line(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        log.report(status(499))
+        log.report(status(500))
     assert capsys.readouterr().out.splitlines()[-1].startswith("500/500")
 
 
-def test_two_looks_at_one_moment_have_a_speed(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 0) as book:
-        book.show(status(500))
+def test_two_reports_at_one_time_have_a_speed(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        log.report(status(500))
     assert "it/s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["[bold]plain[/bold]", "path/[1]/x", "x" * 500])
-def test_what_is_said_is_printed_as_it_is_on_one_line(tmp_path, capsys, text):
-    with TrainingLogger(tmp_path, 500, 0) as book:
-        book.say(text)
+def test_logged_text_is_printed_verbatim_on_one_line(tmp_path, capsys, text):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        log.log(text)
     assert capsys.readouterr().out == f"{text}\n"
 
 
-def test_events_hold_every_look(tmp_path, clock):
-    with TrainingLogger(tmp_path, 500, 0) as book:
+def test_events_hold_every_report(tmp_path, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
         for iteration in (50, 100):
             clock[0] += 5.0
-            book.show(status(iteration, psnr=iteration / 10))
+            log.report(status(iteration, psnr=iteration / 10))
     assert events(tmp_path) == {
         "loss/total": [(50, 0.75), (100, 0.75)],
         "loss/static": [(50, 0.25), (100, 0.25)],
@@ -105,8 +105,8 @@ def test_events_hold_every_look(tmp_path, clock):
 
 def test_events_are_written_when_training_fails(tmp_path):
     def fail():
-        with TrainingLogger(tmp_path, 500, 0) as book:
-            book.show(status(50))
+        with TrainingLogger(tmp_path, 500, 0) as log:
+            log.report(status(50))
             raise ValueError("wrong")
 
     with pytest.raises(ValueError, match="wrong"):
@@ -114,13 +114,23 @@ def test_events_are_written_when_training_fails(tmp_path):
     assert events(tmp_path)["loss/total"] == [(50, 0.75)]
 
 
-def test_in_a_terminal_there_is_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):
+def test_a_terminal_shows_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "200")
-    with TrainingLogger(tmp_path, 500, 100) as book:
-        book.show(status(150))
-        book.say("a word above the bar")
-    said = capsys.readouterr().out
-    assert "150/500" in said
-    assert "a word above the bar" in said
-    assert "s left" not in said
+    with TrainingLogger(tmp_path, 500, 100) as log:
+        log.report(status(150))
+        log.log("a line above the bar")
+    output = capsys.readouterr().out
+    assert "150/500" in output
+    assert "a line above the bar" in output
+    assert "s left" not in output
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_a_quiet_logger_writes_events_only(tmp_path, capsys, monkeypatch, is_terminal):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: is_terminal)
+    with TrainingLogger(tmp_path, 500, 0, quiet=True) as log:
+        log.report(status(500))
+        log.log("nothing")
+    assert capsys.readouterr().out == ""
+    assert events(tmp_path)["loss/total"] == [(500, 0.75)]

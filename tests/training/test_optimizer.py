@@ -1,4 +1,4 @@
-"""The one Adam, its learning rates, and how its moments follow the Gaussians."""
+"""Adam, its learning rates, and how its state follows the Gaussians."""
 
 import itertools
 import math
@@ -6,11 +6,12 @@ import math
 import pytest
 import torch
 
+from tests import tiny
 from tests.scenes import error, generator
 from warpgs.config import ModelConfig, OptimConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.training.optimizer import GROUPS, exponential, forget, gather, learning_rates, make_optimizer
+from warpgs.training.optimizer import GROUPS, exponential, gather, learning_rates, make_optimizer, reset_moments
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=2, width=3)
 NETWORKS = ("deformation", "appearance")
@@ -54,7 +55,7 @@ def step(scene, optimizer, gradients):
 
 def trained(num_steps=3, rate=0.01, **sizes):
     scene = make_scene(**sizes)
-    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), rate))
+    optimizer = make_optimizer(scene, tiny.equal_rates(rate))
     for seed in range(num_steps):
         step(scene, optimizer, random_gradients(scene, seed))
     return scene, optimizer
@@ -63,8 +64,8 @@ def trained(num_steps=3, rate=0.01, **sizes):
 WARM = dict.fromkeys(NETWORKS, 1.0)
 
 
-def rates_at(progress, network_progress, extent=1.0, config=RATES, warmth=WARM):
-    return dict(zip(GROUPS, learning_rates(config, extent, progress, network_progress, warmth), strict=True))
+def rates_at(progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM):
+    return learning_rates(config, extent, progress, network_progress, warmup_factors)
 
 
 # The optimizer -------------------------------------------------------------------------------------------------------
@@ -72,7 +73,7 @@ def rates_at(progress, network_progress, extent=1.0, config=RATES, warmth=WARM):
 
 def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
     scene = make_scene()
-    optimizer = make_optimizer(scene, torch.zeros(len(GROUPS)))
+    optimizer = make_optimizer(scene, tiny.equal_rates(0.0))
     group_from_parameter = {id(p): group["name"] for group in optimizer.param_groups for p in group["params"]}
     for name, parameter in scene.named_parameters():
         network_or_parameter = name.split(".")[0] if name.startswith(NETWORKS) else name
@@ -83,7 +84,7 @@ def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
 def test_steps_are_those_of_adam():
     scene = make_scene()
     start = {name: p.detach().double() for name, p in scene.named_parameters()}
-    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
     first = {name: torch.zeros_like(value) for name, value in start.items()}
     second = {name: torch.zeros_like(value) for name, value in start.items()}
     for iteration in range(1, 5):
@@ -98,29 +99,29 @@ def test_steps_are_those_of_adam():
         assert error(parameter.detach(), start[name]) < 1e-6
 
 
-def test_a_tiny_gradient_counts_as_much_as_a_large_one():
+def test_the_step_does_not_depend_on_the_size_of_the_gradient():
     scene = make_scene()
-    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
     before = scene.static.means.detach().clone()
-    tiny = {name: torch.full_like(p, 1e-10) for name, p in scene.named_parameters()}
-    step(scene, optimizer, tiny)
+    gradients = {name: torch.full_like(p, 1e-10) for name, p in scene.named_parameters()}
+    step(scene, optimizer, gradients)
     assert error(before - scene.static.means.detach(), torch.full_like(before, 0.01)) < 1e-6
 
 
-@pytest.mark.parametrize("group", range(len(GROUPS)))
-def test_each_group_moves_at_its_own_rate(group):
+@pytest.mark.parametrize("group", GROUPS)
+def test_each_group_has_its_own_learning_rate(group):
     scene = make_scene()
-    rates = torch.zeros(len(GROUPS))
+    rates = tiny.equal_rates(0.0)
     optimizer = make_optimizer(scene, rates)
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
-    rates[group] = 0.125  # after the optimizer was made: it reads its rates anew
+    rates[group].fill_(0.125)  # after construction: the optimizer reads its rates in every step
     step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
     for name, parameter in scene.named_parameters():
-        rate = 0.125 if name == GROUPS[group] or name.startswith(GROUPS[group] + ".") else 0.0
+        rate = 0.125 if name == group or name.startswith(group + ".") else 0.0
         assert error(before[name] - parameter.detach(), torch.full_like(parameter, rate)) < 1e-5
 
 
-def test_parameters_without_gradient_stay():
+def test_parameters_without_gradient_stay_constant():
     scene, optimizer = trained()
     before = scene.static.means.detach().clone()
     scene.dynamic.means.grad = torch.ones(4, 3)
@@ -132,21 +133,21 @@ def test_parameters_without_gradient_stay():
 
 
 @pytest.mark.parametrize("branch", ["static", "dynamic"])
-def test_kept_gaussians_keep_their_moments_and_new_ones_begin_at_zero(branch):
+def test_kept_gaussians_keep_their_moments_and_new_ones_start_at_zero(branch):
     scene, optimizer = trained()
     gaussians = getattr(scene, branch)
     before = {name: dict(optimizer.state[getattr(gaussians, name)]) for name in PARAMETERS}
     gather(optimizer, gaussians, torch.tensor([3, 0, 1, 1, 3]), num_kept=3)
     for name in PARAMETERS:
         after = optimizer.state[getattr(gaussians, name)]
-        for moment in ("exp_avg", "exp_avg_sq"):
-            assert after[moment].shape == getattr(gaussians, name).shape
-            assert torch.equal(after[moment][:3], before[name][moment][[3, 0, 1]])
-            assert before[name][moment][[1, 3]].all()
-            assert not after[moment][3:].any()
+        for part in ("exp_avg", "exp_avg_sq"):
+            assert after[part].shape == getattr(gaussians, name).shape
+            assert torch.equal(after[part][:3], before[name][part][[3, 0, 1]])
+            assert before[name][part][[1, 3]].all()
+            assert not after[part][3:].any()
 
 
-def test_values_follow_their_parents_whether_kept_or_new():
+def test_kept_and_new_gaussians_have_the_values_of_their_parents():
     scene, optimizer = trained()
     before = {name: getattr(scene.static, name).detach().clone() for name in PARAMETERS}
     parents = torch.tensor([4, 2, 2, 0])
@@ -155,7 +156,7 @@ def test_values_follow_their_parents_whether_kept_or_new():
         assert torch.equal(getattr(scene.static, name), before[name][parents])
 
 
-def test_the_next_steps_of_kept_gaussians_are_those_without_resizing():
+def test_resizing_does_not_change_the_next_steps_of_kept_gaussians():
     (resized, its_optimizer), (untouched, optimizer) = trained(), trained()
     kept = torch.tensor([4, 1, 2])
     gather(its_optimizer, resized.static, torch.cat([kept, kept[:1]]), num_kept=3)
@@ -172,7 +173,7 @@ def test_the_next_steps_of_kept_gaussians_are_those_without_resizing():
         assert error(getattr(resized.static, name)[:3], expected) < 1e-6
 
 
-def test_resizing_one_branch_leaves_everything_else():
+def test_resizing_one_branch_leaves_everything_else_unchanged():
     scene, optimizer = trained()
     others = {name: p for name, p in scene.named_parameters() if not name.startswith("static.")}
     before = {name: {k: v.clone() for k, v in optimizer.state[p].items()} for name, p in others.items()}
@@ -185,14 +186,14 @@ def test_resizing_one_branch_leaves_everything_else():
 
 def test_resizing_before_the_first_step_needs_no_moments():
     scene = make_scene()
-    optimizer = make_optimizer(scene, torch.full((len(GROUPS),), 0.01))
+    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
     gather(optimizer, scene.static, torch.tensor([1, 1, 1]), num_kept=1)
     before = scene.static.means.detach().clone()
     step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
     assert error(before - scene.static.means.detach(), torch.full((3, 3), 0.01)) < 1e-5
 
 
-def test_all_gaussians_may_go_and_training_goes_on():
+def test_training_continues_after_all_gaussians_were_removed():
     scene, optimizer = trained()
     gather(optimizer, scene.dynamic, torch.zeros(0, dtype=torch.int64), num_kept=0)
     step(scene, optimizer, random_gradients(scene, 9))
@@ -207,19 +208,19 @@ def test_resizing_drops_gradients():
     assert scene.static.means.grad is None
 
 
-def test_forgetting_sets_the_moments_of_one_parameter_to_zero():
+def test_a_reset_sets_the_moments_of_one_parameter_to_zero():
     scene, optimizer = trained()
-    forget(optimizer, scene.static.logit_opacities)
+    reset_moments(optimizer, scene.static.logit_opacities)
     for name, parameter in scene.named_parameters():
         state = optimizer.state[parameter]
-        for moment in ("exp_avg", "exp_avg_sq"):
-            assert state[moment].any() == (name != "static.logit_opacities")
+        for part in ("exp_avg", "exp_avg_sq"):
+            assert state[part].any() == (name != "static.logit_opacities")
 
 
-def test_forgetting_what_was_never_trained_changes_nothing():
+def test_a_reset_of_an_untrained_parameter_changes_nothing():
     scene = make_scene()
-    optimizer = make_optimizer(scene, torch.zeros(len(GROUPS)))
-    forget(optimizer, scene.static.means)
+    optimizer = make_optimizer(scene, tiny.equal_rates(0.0))
+    reset_moments(optimizer, scene.static.means)
     assert not optimizer.state.get(scene.static.means, {})
 
 
@@ -227,12 +228,12 @@ def test_forgetting_what_was_never_trained_changes_nothing():
 
 
 @pytest.mark.parametrize(("start", "end"), [(8e-4, 1.6e-6), (1e-3, 1e-3), (1e-6, 1.0)])
-def test_an_exponential_schedule_runs_from_start_to_end(start, end):
+def test_an_exponential_schedule_interpolates_from_start_to_end(start, end):
     assert exponential(start, end, 0.0) == pytest.approx(start, rel=1e-12)
     assert exponential(start, end, 1.0) == pytest.approx(end, rel=1e-12)
 
 
-def test_halfway_an_exponential_schedule_is_at_the_geometric_mean():
+def test_an_exponential_schedule_is_halfway_at_the_geometric_mean():
     assert exponential(8e-4, 1.6e-6, 0.5) == pytest.approx(math.sqrt(8e-4 * 1.6e-6), rel=1e-12)
 
 
@@ -255,11 +256,11 @@ def test_each_rate_of_the_config_reaches_its_group():
     assert [rates[name] for name in NETWORKS] == pytest.approx([0.7, 0.7])
 
 
-@pytest.mark.parametrize(("progress", "share"), [(0.0, 1.0), (0.5, 0.1), (1.0, 0.01)])
-def test_positions_slow_down_to_a_hundredth_in_units_of_the_extent(progress, share):
+@pytest.mark.parametrize(("progress", "factor"), [(0.0, 1.0), (0.5, 0.1), (1.0, 0.01)])
+def test_the_rate_of_positions_decays_to_a_hundredth_in_units_of_the_extent(progress, factor):
     rates = rates_at(progress, START, extent=3.0)
     for branch in ("static", "dynamic"):
-        assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * share)
+        assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * factor)
 
 
 def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_extent():
@@ -274,7 +275,7 @@ def test_each_network_has_its_own_progress():
     assert rates["appearance"] == pytest.approx(0.07)
 
 
-def test_the_default_rates_of_networks_are_the_papers():
+def test_the_default_rates_of_networks_are_those_of_the_paper():
     now, later = rates_at(0.0, START, config=OptimConfig()), rates_at(1.0, END, config=OptimConfig())
     for name in NETWORKS:
         assert now[name] == pytest.approx(8e-4)
@@ -286,9 +287,9 @@ def test_a_rate_of_zero_stays_zero():
     assert not rates.any()
 
 
-def test_a_network_that_is_not_warm_yet_has_a_share_of_its_rate():
+def test_the_warmup_factor_scales_the_rate_of_one_network():
     progress = dict.fromkeys(NETWORKS, 0.3)
     warm = rates_at(0.3, progress)
     for name in NETWORKS:
-        cold = rates_at(0.3, progress, warmth={**WARM, name: 0.25})
-        assert cold == {**warm, name: pytest.approx(0.25 * warm[name])}
+        scaled = rates_at(0.3, progress, warmup_factors={**WARM, name: 0.25})
+        assert scaled == {**warm, name: pytest.approx(0.25 * warm[name])}

@@ -5,23 +5,24 @@ import dataclasses
 import pytest
 import torch
 
+from tests import tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
 from tests.scenes import error, make_camera, make_splats
 from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.training.optimizer import GROUPS, make_optimizer
+from warpgs.training.optimizer import make_optimizer
 from warpgs.training.prune import prune_invisible, visibility
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
 AHEAD = make_camera()
-SURE = 20.0
-"""Logit of an opacity that is 1 in single precision."""
+OPAQUE_LOGIT = 20.0
+"""Logit of an opacity that rounds to 1 in single precision."""
 
 
 def turned_around(camera):
-    """The same camera looking the other way."""
+    """The same camera with the opposite viewing direction."""
     return dataclasses.replace(camera, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat)
 
 
@@ -40,15 +41,15 @@ def in_front(depths, sizes, opacities):
     viewed = torch.linalg.inv(AHEAD.K) @ torch.tensor([AHEAD.width / 2, AHEAD.height / 2, 1.0])
     points = (depths[:, None] * viewed - AHEAD.viewmat[:3, 3]) @ AHEAD.viewmat[:3, :3]
     gaussians = Gaussians.from_points(points, torch.rand(len(points), 3), torch.tensor(sizes), 0.5)
-    gaussians.logit_opacities.data = torch.tensor(opacities).logit().clamp(max=SURE)
+    gaussians.logit_opacities.data = torch.tensor(opacities).logit().clamp(max=OPAQUE_LOGIT)
     return gaussians
 
 
 def random_gaussians():
-    """Scattered, some seen by no camera and some of them opaque."""
+    """Random positions; some Gaussians are outside all images, some are opaque."""
     splats = make_splats()
     logits = splats.opacities.logit()
-    logits[::7] = SURE
+    logits[::7] = OPAQUE_LOGIT
     return Gaussians(splats.means, splats.quats, splats.scales.log(), logits, splats.sh[:, :1], splats.sh[:, 1:])
 
 
@@ -58,7 +59,7 @@ def make_scene(static, dynamic=None):
 
 def make_scene_and_optimizer(static, dynamic=None):
     scene = make_scene(static, dynamic)
-    return scene, make_optimizer(scene, torch.zeros(len(GROUPS)))
+    return scene, make_optimizer(scene, tiny.equal_rates(0.0))
 
 
 def expected_visibility(gaussians, cameras):
@@ -82,37 +83,37 @@ def test_visibility_is_that_of_equation_15_over_all_views():
     assert (expected == 0).any()
 
 
-def test_an_opaque_gaussian_that_every_view_sees_keeps_a_hundredth():
+def test_an_opaque_gaussian_that_is_always_visible_scores_a_hundredth():
     scores = visibility(make_scene(in_front([2.0], [0.2], [1.0])), [AHEAD] * 3, 3)
     assert error(scores, torch.tensor([0.01])) < 1e-7
 
 
-def test_a_gaussian_that_no_view_sees_scores_nothing():
+def test_a_gaussian_that_is_never_visible_scores_zero():
     scores = visibility(make_scene(in_front([-2.0, 2.0], [0.2, 0.2], [0.5, 0.5])), [AHEAD] * 2, 3)
     assert scores[0] == 0
     assert scores[1] > 0
 
 
-def test_a_gaussian_behind_a_wall_scores_nothing():
+def test_an_occluded_gaussian_scores_zero():
     hidden = in_front([2.0, 2.1, 5.0], [9.0, 9.0, 0.1], [1.0, 1.0, 0.5])
     free = in_front([5.0], [0.1], [0.5])
     assert visibility(make_scene(hidden), [AHEAD], 3)[2] == 0
     assert visibility(make_scene(free), [AHEAD], 3)[0] == 0.5
 
 
-def test_dynamic_gaussians_hide_no_static_ones():
+def test_dynamic_gaussians_do_not_occlude_static_ones():
     walls = in_front([2.0, 2.1], [9.0, 9.0], [1.0, 1.0])
     assert visibility(make_scene(in_front([5.0], [0.1], [0.5]), walls), [AHEAD], 3)[0] == 0.5
 
 
 @pytest.mark.parametrize("unseen", [0, 1, 3])
-def test_views_that_do_not_see_a_gaussian_count_in_the_mean(unseen):
+def test_views_without_the_gaussian_count_in_the_mean(unseen):
     cameras = [AHEAD] + [turned_around(AHEAD)] * unseen
     scores = visibility(make_scene(in_front([2.0], [0.2], [0.25])), cameras, 3)
     assert error(scores, torch.tensor([0.75 / (1 + unseen)])) < 1e-6
 
 
-def test_cameras_may_come_one_by_one():
+def test_cameras_may_be_an_iterator():
     scene = make_scene(random_gaussians())
     assert torch.equal(visibility(scene, iter(CAMERAS), 3), visibility(scene, CAMERAS, 3))
 
@@ -122,11 +123,11 @@ def test_visibility_does_not_depend_on_the_order_of_the_views():
     assert error(visibility(scene, CAMERAS[::-1], 3), visibility(scene, CAMERAS, 3)) < 1e-7
 
 
-def test_visibility_asks_for_no_gradients():
+def test_visibility_requires_no_gradients():
     assert not visibility(make_scene(random_gaussians()), [AHEAD], 3).requires_grad
 
 
-def test_pruning_keeps_those_that_reach_the_threshold_in_their_order():
+def test_pruning_keeps_gaussians_at_or_above_the_threshold_in_order():
     static = random_gaussians()
     scores = expected_visibility(static, CAMERAS)
     middle = 0.5 * scores.sort().values[29:31].sum().item()  # between two scores: half of the sixty are below
@@ -138,7 +139,7 @@ def test_pruning_keeps_those_that_reach_the_threshold_in_their_order():
         assert torch.equal(getattr(scene.static, name), before[name][kept])
 
 
-def test_a_score_at_the_threshold_is_enough():
+def test_a_score_equal_to_the_threshold_is_kept():
     scene, optimizer = make_scene_and_optimizer(in_front([2.0], [0.2], [0.5]))
     assert prune_invisible(scene, optimizer, [AHEAD], 3, threshold=0.5) == 0
     assert len(scene.static) == 1
@@ -158,7 +159,7 @@ def test_dynamic_gaussians_are_never_pruned():
     assert torch.equal(scene.dynamic.means, before)
 
 
-def test_the_moments_of_kept_gaussians_go_with_them():
+def test_kept_gaussians_keep_their_optimizer_state():
     scene, optimizer = make_scene_and_optimizer(in_front([2.0, -2.0, 3.0], [0.1] * 3, [0.5] * 3))
     for parameter in scene.parameters():
         parameter.grad = torch.zeros_like(parameter)

@@ -1,11 +1,12 @@
-"""What happens when: the stages and everything that depends on the iteration."""
+"""What every iteration does: the stages and everything that depends on the iteration."""
 
 import dataclasses
 
 import pytest
 
 from warpgs.config import PRESETS, DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig, scaled
-from warpgs.training.schedule import Protocol
+from warpgs.training.loss_terms import TERMS
+from warpgs.training.schedule import Phase, Protocol
 
 SHORT = Schedule(
     pretrain=20,
@@ -28,7 +29,7 @@ CONFIG = TrainConfig(
     loss=LossConfig(depth=2.0, depth_end=0.02),
 )
 STAGE1, STAGE2, END = 20, 120, 200
-"""First iterations of the stages of ``SHORT``, and how many there are."""
+"""First iterations of the stages of ``SHORT``, and its length."""
 
 
 def protocol(has_depth=True, schedule=None, **changes):
@@ -36,34 +37,39 @@ def protocol(has_depth=True, schedule=None, **changes):
     return Protocol(config, has_depth)
 
 
-def moments(*arguments, **changes):
+def plans(*arguments, **changes):
     made = protocol(*arguments, **changes)
     return [made.at(iteration) for iteration in range(made.num_iterations)]
 
 
 def iterations_where(name, *arguments, **changes):
-    """The iterations of which a property of ``Moment`` is true."""
-    return [i for i, moment in enumerate(moments(*arguments, **changes)) if getattr(moment, name)]
+    """The iterations whose plan has a true attribute of this name."""
+    return [i for i, plan in enumerate(plans(*arguments, **changes)) if getattr(plan, name)]
+
+
+def iterations_in_phases_where(name, *arguments, **changes):
+    """The iterations whose phase has a true attribute of this name."""
+    return [i for i, plan in enumerate(plans(*arguments, **changes)) if getattr(plan.phase, name)]
 
 
 def boundaries(made):
-    """Names of the stages that take place with their first and last iterations."""
+    """Names of the stages that are not empty, with their first and last iterations."""
     stages = [(s.name, s.start, s.end - 1) for s in (made.pretrain, made.stage1, made.stage2) if s.end > s.start]
     for name, first, last in stages:
-        assert {made.at(first).stage.name, made.at(last).stage.name} == {name}
+        assert {made.at(first).phase.stage, made.at(last).phase.stage} == {name}
     return stages
 
 
 # Stages --------------------------------------------------------------------------------------------------------------
 
 
-def test_the_papers_protocol_is_pretraining_then_30k_apart_then_40k_jointly():
+def test_the_protocol_of_the_paper_has_2k_30k_and_40k_iterations():
     stages = boundaries(Protocol(PRESETS["paper"], has_depth=True))
     assert stages == [("pretrain", 0, 1_999), ("stage1", 2_000, 31_999), ("stage2", 32_000, 71_999)]
 
 
 def test_every_iteration_belongs_to_the_stage_it_lies_in():
-    names = [moment.stage.name for moment in moments()]
+    names = [plan.phase.stage for plan in plans()]
     assert names == ["pretrain"] * 20 + ["stage1"] * 100 + ["stage2"] * 80
 
 
@@ -76,12 +82,12 @@ def test_without_stage_2_stage_1_takes_its_iterations():
     assert boundaries(protocol(stage2=False)) == [("pretrain", 0, 19), ("stage1", 20, 199)]
 
 
-def test_without_both_all_is_stage_1():
+def test_without_pretraining_and_stage_2_every_iteration_is_stage_1():
     assert boundaries(protocol(dap=False, stage2=False)) == [("stage1", 0, 199)]
 
 
 @pytest.mark.parametrize("off", ["dap", "vdp", "app", "stage2"])
-def test_runs_with_a_component_off_are_as_long_as_the_whole(off):
+def test_runs_with_a_component_disabled_have_the_full_length(off):
     assert protocol(**{off: False}).num_iterations == protocol().num_iterations == END
 
 
@@ -90,67 +96,81 @@ def test_stages_do_not_depend_on_pruning_or_the_appearance_network(off):
     assert boundaries(protocol(**{off: False})) == boundaries(protocol())
 
 
+def test_equal_phases_are_equal_keys():
+    """A CUDA graph is captured once per phase."""
+    made = [plan.phase for plan in plans()]
+    assert {type(phase) for phase in made} == {Phase}
+    assert made[STAGE2] == made[END - 1]
+    assert hash(made[STAGE2]) == hash(made[END - 1])
+    assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
+
+
 # Networks and losses -------------------------------------------------------------------------------------------------
 
 
-def test_the_joint_image_counts_in_stage_2_alone():
-    assert iterations_where("joint") == list(range(STAGE2, END))
+def iterations_with_joint_term(**changes):
+    is_active = TERMS["joint"].is_active
+    return [i for i, plan in enumerate(plans(**changes)) if is_active(plan.phase, CONFIG.loss)]
 
 
-def test_static_gaussians_are_relit_from_their_iteration_of_stage_1_on():
-    assert iterations_where("relit") == list(range(STAGE1 + 35, END))
+def test_the_joint_term_is_active_in_stage_2_only():
+    assert iterations_with_joint_term() == list(range(STAGE2, END))
 
 
-def test_static_gaussians_are_relit_in_stage_2_in_any_case():
-    assert iterations_where("relit", schedule={"appearance_from": 1000}) == list(range(STAGE2, END))
+def test_the_appearance_network_is_used_from_its_iteration_of_stage_1_on():
+    assert iterations_in_phases_where("use_appearance") == list(range(STAGE1 + 35, END))
 
 
-def test_without_the_appearance_network_stage_2_is_joint_all_the_same():
-    assert iterations_where("relit", app=False) == []
-    assert iterations_where("joint", app=False) == list(range(STAGE2, END))
+def test_the_appearance_network_is_always_used_in_stage_2():
+    assert iterations_in_phases_where("use_appearance", schedule={"appearance_from": 1000}) == list(range(STAGE2, END))
 
 
-def test_without_stage_2_nothing_is_joint():
-    assert iterations_where("joint", stage2=False) == []
+def test_without_the_appearance_network_stage_2_has_its_joint_term():
+    assert iterations_in_phases_where("use_appearance", app=False) == []
+    assert iterations_with_joint_term(app=False) == list(range(STAGE2, END))
 
 
-def test_without_stage_2_networks_begin_when_they_did():
-    assert iterations_where("relit", stage2=False) == iterations_where("relit")
-    assert iterations_where("moving", stage2=False) == iterations_where("moving")
+def test_without_stage_2_there_is_no_joint_term():
+    assert iterations_with_joint_term(stage2=False) == []
 
 
-def test_dynamic_gaussians_move_from_their_iteration_of_stage_1_on():
-    assert iterations_where("moving") == list(range(STAGE1 + 25, END))
+def test_without_stage_2_networks_start_at_the_same_iterations():
+    assert iterations_in_phases_where("use_appearance", stage2=False) == iterations_in_phases_where("use_appearance")
+    assert iterations_in_phases_where("use_deformation", stage2=False) == iterations_in_phases_where("use_deformation")
 
 
-def test_dynamic_gaussians_move_in_stage_2_in_any_case():
-    assert iterations_where("moving", schedule={"deform_from": 1000}) == list(range(STAGE2, END))
+def test_the_deformation_network_is_used_from_its_iteration_of_stage_1_on():
+    assert iterations_in_phases_where("use_deformation") == list(range(STAGE1 + 25, END))
 
 
-def test_the_degree_of_harmonics_rises_step_by_step_from_stage_1_on():
-    degrees = [moment.sh_degree for moment in moments()]
+def test_the_deformation_network_is_always_used_in_stage_2():
+    assert iterations_in_phases_where("use_deformation", schedule={"deform_from": 1000}) == list(range(STAGE2, END))
+
+
+def test_the_sh_degree_rises_in_steps_from_stage_1_on():
+    degrees = [plan.phase.sh_degree for plan in plans()]
     assert degrees == [0] * (STAGE1 + 12) + [1] * 12 + [2] * 12 + [3] * (END - STAGE1 - 36)
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_the_degree_of_harmonics_never_passes_that_of_the_model(degree):
-    degrees = {moment.sh_degree for moment in moments(model=ModelConfig(sh_degree=degree))}
+def test_the_sh_degree_never_exceeds_that_of_the_model(degree):
+    degrees = {plan.phase.sh_degree for plan in plans(model=ModelConfig(sh_degree=degree))}
     assert degrees == set(range(degree + 1))
 
 
-def test_noise_on_time_fades_linearly_from_a_tenth_of_a_frame_interval():
-    noise = [moment.noise for moment in moments()]
+def test_noise_on_time_decays_linearly_from_a_tenth_of_a_frame_interval():
+    noise = [plan.time_noise for plan in plans()]
     expected = [0.0] * STAGE1 + [0.1 * (40 - k) / 40 for k in range(40)] + [0.0] * (END - STAGE1 - 40)
     assert noise == pytest.approx(expected, abs=1e-12)
 
 
-def test_noise_that_ends_at_once_is_gone_after_one_iteration():
-    noise = [moment.noise for moment in moments(schedule={"noise_until": 0})]
+def test_noise_until_iteration_0_ends_after_one_iteration():
+    noise = [plan.time_noise for plan in plans(schedule={"noise_until": 0})]
     assert max(noise[STAGE1 + 1 :]) == 0.0
 
 
-def test_the_weight_of_depth_falls_exponentially_over_the_run():
-    weights = [moment.depth_weight for moment in moments()]
+def test_the_depth_weight_decays_exponentially_over_the_run():
+    weights = [plan.depth_weight for plan in plans()]
     assert weights == pytest.approx([2.0 * 0.01 ** (k / END) for k in range(END)], rel=1e-9)
 
 
@@ -159,31 +179,32 @@ def test_the_weight_of_depth_falls_exponentially_over_the_run():
 )
 def test_without_depth_its_weight_is_zero(has_depth, changes):
     assert iterations_where("depth_weight", has_depth, **changes) == []
+    assert iterations_in_phases_where("with_depth", has_depth, **changes) == []
 
 
 @pytest.mark.parametrize("end", [0.0, 2.0])
-def test_the_weight_of_depth_may_vanish_or_stay(end):
-    weights = [moment.depth_weight for moment in moments(loss=LossConfig(depth=2.0, depth_end=end))]
+def test_the_depth_weight_may_decay_to_zero_or_stay_constant(end):
+    weights = [plan.depth_weight for plan in plans(loss=LossConfig(depth=2.0, depth_end=end))]
     assert weights[0] == pytest.approx(2.0)
     assert weights[-1] == pytest.approx(end, abs=1e-9)
 
 
-def test_progress_runs_evenly_from_zero_to_one():
-    assert [moment.progress for moment in moments()] == pytest.approx([k / END for k in range(END)])
+def test_progress_rises_linearly_from_zero_to_one():
+    assert [plan.progress for plan in plans()] == pytest.approx([k / END for k in range(END)])
 
 
 def network_progress(name, **schedule):
-    return [moment.network_progress[name] for moment in moments(schedule=schedule)]
+    return [plan.network_progress[name] for plan in plans(schedule=schedule)]
 
 
 @pytest.mark.parametrize(("name", "first"), [("deformation", STAGE1 + 25), ("appearance", STAGE1 + 35)])
-def test_a_network_progresses_from_its_first_iteration_to_the_end(name, first):
+def test_the_progress_of_a_network_covers_its_iterations(name, first):
     expected = [0.0] * first + [k / (END - first) for k in range(END - first)]
     assert network_progress(name) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("name", "start"), [("deformation", "deform_from"), ("appearance", "appearance_from")])
-def test_a_network_that_waits_for_stage_2_progresses_from_there(name, start):
+def test_the_progress_of_a_network_that_starts_in_stage_2_covers_stage_2(name, start):
     expected = [0.0] * STAGE2 + [k / (END - STAGE2) for k in range(END - STAGE2)]
     assert network_progress(name, **{start: 1000}) == pytest.approx(expected)
 
@@ -196,7 +217,7 @@ def after(*done):
     return [STAGE1 + number - 1 for number in done]
 
 
-def test_gaussians_are_densified_at_intervals_between_two_iterations_of_stage_1():
+def test_gaussians_are_densified_at_intervals_in_a_range_of_stage_1():
     assert iterations_where("densify") == after(20, 30, 40, 50, 60)
 
 
@@ -204,11 +225,11 @@ def test_gaussians_are_not_densified_in_stage_2():
     assert max(iterations_where("densify", schedule={"densify_until": 1000})) == STAGE2 - 1
 
 
-def test_opacities_are_reset_at_intervals_while_there_is_densification_to_come():
+def test_opacities_are_reset_at_intervals_before_the_last_densification():
     assert iterations_where("reset") == after(20, 40)
 
 
-def test_the_papers_run_resets_opacities_every_3000_iterations_before_15000():
+def test_the_paper_preset_resets_opacities_every_3000_iterations_before_15000():
     made = Protocol(PRESETS["paper"], has_depth=True)
     resets = [k for k in range(1, 30_001, 100) if made.at(2_000 + k + 98).reset]
     assert [k + 99 for k in resets] == [3_000, 6_000, 9_000, 12_000]
@@ -222,7 +243,7 @@ def test_without_visibility_driven_pruning_nothing_is_pruned():
     assert iterations_where("prune", vdp=False) == []
 
 
-def test_without_stage_2_pruning_goes_on_but_not_after_the_last_iteration():
+def test_without_stage_2_pruning_continues_except_after_the_last_iteration():
     assert protocol(stage2=False).num_iterations == STAGE1 + 6 * SHORT.prune_every
     assert iterations_where("prune", stage2=False) == after(30, 60, 90, 120, 150)
 
@@ -256,14 +277,14 @@ def total(schedule):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("iterations", [3, 4, 40, 999, 30_000, 200_001])
-def test_a_scaled_run_takes_exactly_the_iterations_asked_for(preset, iterations):
+def test_a_rescaled_run_has_exactly_the_requested_iterations(preset, iterations):
     config = scaled(with_iterations(preset, iterations))
     assert Protocol(config, has_depth=True).num_iterations == iterations
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("iterations", [3, 4, 40, 999])
-def test_every_stage_of_a_scaled_run_takes_place(preset, iterations):
+def test_no_stage_of_a_rescaled_run_is_empty(preset, iterations):
     schedule = scaled(with_iterations(preset, iterations)).schedule
     assert min(schedule.pretrain, schedule.stage1, schedule.stage2) >= 1
 
@@ -283,7 +304,7 @@ def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule():
 
 @pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])
 @pytest.mark.parametrize("iterations", [5, 50, 1003])
-def test_what_a_schedule_leaves_out_stays_out_when_it_is_scaled(off, iterations):
+def test_zeros_of_a_schedule_stay_zero_when_it_is_rescaled(off, iterations):
     schedule = dataclasses.replace(SHORT, **dict.fromkeys(off, 0))
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
     assert total(after) == iterations
@@ -292,7 +313,7 @@ def test_what_a_schedule_leaves_out_stays_out_when_it_is_scaled(off, iterations)
 
 @pytest.mark.parametrize("lengths", [(2_000, 70_000, 1_000), (1, 1, 100_000), (40_000, 1, 40_000), (5, 5, 5)])
 @pytest.mark.parametrize("iterations", [3, 4, 5, 100])
-def test_no_stage_is_lost_however_short_the_run(lengths, iterations):
+def test_no_stage_becomes_empty_in_a_short_run(lengths, iterations):
     pretrain, stage1, stage2 = lengths
     schedule = dataclasses.replace(SHORT, pretrain=pretrain, stage1=stage1, stage2=stage2)
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
@@ -300,7 +321,7 @@ def test_no_stage_is_lost_however_short_the_run(lengths, iterations):
     assert min(after.pretrain, after.stage1, after.stage2) >= 1
 
 
-def test_scaling_changes_nothing_but_schedules():
+def test_rescaling_changes_only_the_schedule():
     config = with_iterations("quick", 40)
     changed = scaled(config)
     assert dataclasses.replace(changed, schedule=config.schedule, iterations=40) == config
@@ -308,11 +329,11 @@ def test_scaling_changes_nothing_but_schedules():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_without_a_number_of_iterations_nothing_is_scaled(preset):
+def test_without_a_number_of_iterations_nothing_is_rescaled(preset):
     assert scaled(PRESETS[preset]) == PRESETS[preset]
 
 
-def test_scaling_twice_is_scaling_once():
+def test_rescaling_is_idempotent():
     once = scaled(with_iterations("paper", 1234))
     assert scaled(once) == once
 
@@ -327,21 +348,21 @@ def test_too_few_iterations_are_refused(iterations):
     ("name", "value"), [("prune_every", 0), ("reset_every", 0), ("sh_degree_every", -1), ("stage1", -1)]
 )
 @pytest.mark.parametrize("iterations", [None, 100])
-def test_a_schedule_that_cannot_be_is_refused_by_name(name, value, iterations):
+def test_an_invalid_schedule_is_refused_by_name(name, value, iterations):
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SHORT, **{name: value}), iterations=iterations)
     with pytest.raises(ValueError, match=f"schedule.{name} must be a number of at least ., got {value}"):
         scaled(config)
 
 
-def test_a_network_begins_slowly():
-    made = moments(schedule={"warmup": 10})
-    for name, begins in (("deformation", lambda m: m.moving), ("appearance", lambda m: m.relit)):
-        first = next(k for k, moment in enumerate(made) if begins(moment))
-        values = [moment.network_warmth[name] for moment in made]
+def test_the_learning_rate_of_a_network_warms_up():
+    made = plans(schedule={"warmup": 10})
+    for name in ("deformation", "appearance"):
+        first = next(k for k, plan in enumerate(made) if getattr(plan.phase, f"use_{name}"))
+        values = [plan.warmup_factors[name] for plan in made]
         assert values[:first] == [0.0] * first
         assert values[first : first + 12] == pytest.approx([*((k + 1) / 10 for k in range(10)), 1.0, 1.0])
         assert values[-1] == 1.0
 
 
-def test_without_warmup_networks_begin_at_their_full_rate():
-    assert all(set(m.network_warmth.values()) == {1.0} for m in moments(schedule={"warmup": 0}))
+def test_without_warmup_networks_start_at_their_full_rate():
+    assert all(set(plan.warmup_factors.values()) == {1.0} for plan in plans(schedule={"warmup": 0}))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.prepare import filmed
+from tests.prepare import boards
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
@@ -51,7 +51,7 @@ def test_a_run_that_is_being_trained_is_not_resumed_beside(finished):
     with runs.held(finished[1]):
         second = train("--resume", finished[1], "--device", "cpu")
     assert second.returncode == 2
-    assert f"error: {finished[1]} is being trained by another process" in second.stderr
+    assert f"train.py: {finished[1]} is being trained by another process" in second.stderr
     with runs.held(finished[1]):
         pass  # free again
 
@@ -143,7 +143,7 @@ def test_training_in_vain_is_refused_with_one_line_and_exit_code_1(tmp_path):
 
 
 def test_one_time_for_all_frames_is_only_warned_of_where_all_is_static(tmp_path, capsys):
-    root = filmed.write_capture(tmp_path / "film")
+    root = boards.write_capture(tmp_path / "film")
     names = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({name: {"time_id": 0} for name in names}))
     capture = load_capture(root)

@@ -1,4 +1,4 @@
-"""Training views are the same, wherever they are kept."""
+"""Training views are the same whether they are resident or read on demand."""
 
 import dataclasses
 
@@ -17,19 +17,19 @@ PLENTY = 1 << 30
 
 @pytest.fixture(scope="module", params=["nerfds", "iphone", "builtin"])
 def capture(request, tmp_path_factory):
-    """With masks; with depth; with both."""
+    """Captures with masks, with depth and with both."""
     folder = tmp_path_factory.mktemp(request.param)
     return load_capture(tiny.write(folder) if request.param == "builtin" else write_capture(folder, request.param))
 
 
-def views_of(capture, resident_bytes=PLENTY, **options):
+def views_of(capture, resident_bytes=PLENTY):
     if capture.frame(capture.train[0]).static_mask is None:
-        options = {"assume": "static", **options}
-    return Views(capture, CPU, resident_bytes, **options)
+        capture = capture.assuming("static")
+    return Views(capture, CPU, resident_bytes)
 
 
 def without(capture, **changes):
-    """The capture with parts of its frames changed."""
+    """The capture with changed frames."""
 
     def read(name):
         return dataclasses.replace(capture.frame(name), **changes)
@@ -47,25 +47,25 @@ def assert_same(a, b):
     assert a.camera.size == b.camera.size
 
 
-def test_views_fit_or_do_not(capture):
+def test_views_are_resident_if_they_fit(capture):
     assert views_of(capture).resident
     assert not views_of(capture, resident_bytes=0).resident
 
 
-def test_resident_views_are_the_same_as_those_that_are_read(capture):
+def test_resident_views_equal_those_that_are_read_on_demand(capture):
     kept, read = views_of(capture), views_of(capture, resident_bytes=0)
     assert len(kept) == len(read) == len(capture.train)
     for index in range(len(kept)):
         assert_same(kept[index], read[index])
 
 
-def test_a_view_picked_on_the_device_is_the_one_of_its_index(capture):
+def test_a_view_picked_on_the_device_has_the_given_index(capture):
     views = views_of(capture)
     for index in range(len(views)):
         assert_same(views.pick(torch.tensor([index])), views[index])
 
 
-def test_a_view_has_its_frames_picture_time_and_mask(capture):
+def test_a_view_has_the_image_time_and_mask_of_its_frame(capture):
     views = views_of(capture)
     for index, name in enumerate(capture.train):
         frame, view = capture.frame(name), views[index]
@@ -76,7 +76,7 @@ def test_a_view_has_its_frames_picture_time_and_mask(capture):
             assert torch.equal(view.static_mask, frame.static_mask)
 
 
-def test_inverse_depth_is_kept_to_half_precision_and_unknown_where_it_is(capture):
+def test_inverse_depth_is_stored_in_half_precision_and_stays_unknown(capture):
     view, frame = views_of(capture)[1], capture.frame(capture.train[1])
     if frame.inverse_depth is None:
         assert view.inverse_depth.isnan().all()
@@ -85,19 +85,19 @@ def test_inverse_depth_is_kept_to_half_precision_and_unknown_where_it_is(capture
         assert torch.allclose(view.inverse_depth, frame.inverse_depth, rtol=2**-11, atol=1e-7, equal_nan=True)
 
 
-def test_evaluation_frames_are_no_training_views(capture):
+def test_evaluation_frames_are_not_training_views(capture):
     assert len(views_of(capture)) == len(capture.train) < len(capture.train) + len(capture.val)
 
 
 @pytest.mark.parametrize(("assume", "is_static"), [("static", True), ("dynamic", False)])
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])
-def test_what_is_assumed_goes_before_masks(capture, resident_bytes, assume, is_static):
-    views = Views(capture, CPU, resident_bytes, assume)
+def test_an_assumption_overrides_masks(capture, resident_bytes, assume, is_static):
+    views = Views(capture.assuming(assume), CPU, resident_bytes)
     assert all(bool((views[index].static_mask == is_static).all()) for index in range(len(views)))
 
 
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])
-def test_a_frame_without_a_mask_is_refused_by_name_with_what_to_try(capture, resident_bytes):
+def test_a_frame_without_a_mask_is_refused_by_name_with_advice(capture, resident_bytes):
     bare = without(capture, static_mask=None)
     with pytest.raises(
         ValueError, match=rf"frame {capture.train[0]} has no mask .*--assume static or --assume dynamic"
@@ -105,8 +105,8 @@ def test_a_frame_without_a_mask_is_refused_by_name_with_what_to_try(capture, res
         Views(bare, CPU, resident_bytes)
 
 
-def test_frames_of_different_sizes_are_read_as_they_are_needed(tmp_path):
-    """They make no stack."""
+def test_frames_of_different_sizes_are_read_on_demand(tmp_path):
+    """They cannot be stacked."""
     whole = load_capture(write_capture(tmp_path))
     smaller = ids_of("nerfds")[0][2]
     cameras = {**whole.cameras, smaller: dataclasses.replace(whole.cameras[smaller], width=20, height=10)}

@@ -1,4 +1,4 @@
-"""Camera paths: they begin and end where they should, keep what they look at in view, and stay in the scene."""
+"""Camera paths start and end at the right cameras, keep their target in view and stay in the scene."""
 
 import math
 
@@ -30,17 +30,17 @@ def is_rigid(path):
     return bool((R @ R.transpose(1, 2) - torch.eye(3)).abs().max() < 1e-5) and bool((torch.linalg.det(R) > 0).all())
 
 
-# Between cameras ----------------------------------------------------------------------------------------------------
+# Interpolation ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("target", "up"), [((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), ((1.0, 2.0, 5.0), (0.0, 0.0, -2.0))])
-def test_a_camera_that_looks_nowhere_or_along_up_is_refused(target, up):
-    with pytest.raises(ValueError, match="there must be a way to go, and not along up"):
+def test_a_camera_without_a_direction_or_parallel_to_up_is_refused(target, up):
+    with pytest.raises(ValueError, match="position and target coincide, or the view direction is parallel to up"):
         Camera.looking_at(torch.tensor([1.0, 2.0, 3.0]), torch.tensor(target), torch.tensor(up), 9.0, (4, 4))
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_a_path_goes_through_its_cameras(smooth):
+def test_a_path_passes_through_its_cameras(smooth):
     cameras = [camera(0.0, 0.2), camera(0.5, 0.4, focal=80.0), camera(-0.3, 0.9)]
     path = paths.interpolated(cameras, [0.0, 1.0, 4.0], [0.0, 1.0, 4.0], smooth)
     for a, b in zip(path, cameras, strict=True):
@@ -50,7 +50,7 @@ def test_a_path_goes_through_its_cameras(smooth):
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_between_two_cameras_a_path_is_between_them(smooth):
+def test_halfway_between_two_cameras_everything_is_halfway(smooth):
     a, b = camera(0.0, 0.0, focal=50.0), camera(1.0, 1.0, focal=200.0)
     middle = paths.interpolated([a, b], [3.0, 5.0], [4.0], smooth)[0]
     assert (middle.position - torch.tensor([0.5, 0.0, -2.0])).abs().max() < 1e-5
@@ -67,66 +67,66 @@ def test_smooth_paths_do_not_overshoot():
     assert (x.diff() > -1e-6).all()
 
 
-def test_one_camera_stays_where_it_is():
+def test_a_path_of_one_camera_is_constant():
     assert paths.interpolated([camera(0.3)], [0.0], [0.0, 0.0])[1].position[0] == pytest.approx(0.3)
 
 
-# The filming camera -------------------------------------------------------------------------------------------------
+# The training camera's path -----------------------------------------------------------------------------------------
 
 
-def test_the_filming_path_is_in_the_order_of_time_and_time_runs_over_all_of_it():
-    film = capture([0.4, 0.0, 0.2], [1.0, 0.0, 0.5])
-    path = paths.training_path(film, 5, smoothing=0.0)
+def test_the_training_path_is_sorted_by_time_and_covers_all_times():
+    unsorted = capture([0.4, 0.0, 0.2], [1.0, 0.0, 0.5])
+    path = paths.training_path(unsorted, 5, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-5)
     assert [c.time for c in path] == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
-def test_before_the_first_frame_the_filming_camera_waits():
+def test_before_the_first_time_the_training_path_stays_at_the_first_camera():
     path = paths.training_path(capture([0.1, 0.5], [0.5, 1.0]), 3, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.1, 0.5], abs=1e-5)
     assert path[0].time == 0.0
 
 
-def test_of_frames_at_one_time_the_first_counts():
+def test_of_cameras_at_the_same_time_the_first_is_used():
     path = paths.training_path(capture([0.1, 0.9, 0.5], [0.0, 0.0, 1.0]), 2, smoothing=0.0)
     assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.5], abs=1e-5)
 
 
-def test_smoothing_takes_shaking_out():
-    film = capture([0.05 * (k % 2) for k in range(21)], [k / 20 for k in range(21)])
-    rough, smooth = (positions(paths.training_path(film, 21, s))[:, 0] for s in (0.0, 0.1))
+def test_smoothing_removes_shaking():
+    shaking = capture([0.05 * (k % 2) for k in range(21)], [k / 20 for k in range(21)])
+    rough, smooth = (positions(paths.training_path(shaking, 21, s))[:, 0] for s in (0.0, 0.1))
     assert smooth[3:-3].diff().abs().max() < 0.05 * rough.diff().abs().max()
-    assert is_rigid(paths.training_path(film, 21, 0.1))
+    assert is_rigid(paths.training_path(shaking, 21, 0.1))
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_short_paths_are_paths(frames):
+def test_paths_of_one_and_two_frames_have_that_length(frames):
     assert len(paths.training_path(capture([0.0, 1.0], [0.0, 1.0]), frames)) == frames
 
 
-# Around what moves --------------------------------------------------------------------------------------------------
+# Spiral and bullet time ---------------------------------------------------------------------------------------------
 
 
-def test_the_focus_is_the_middle_depth_of_what_is_seen():
+def test_the_focus_is_the_median_depth_of_the_visible_points():
     behind = torch.tensor([[0.0, 0.0, -9.0]])
     ahead = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.1, 0.0, 3.0], [math.nan, 0.0, 0.0]])
     assert paths.focus(camera(), torch.cat([behind, ahead])) == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -9.0]])])
-def test_without_anything_in_view_the_focus_is_one_unit_away(points):
+def test_without_visible_points_the_focus_is_one_unit_away(points):
     assert paths.focus(camera(), points) == 1.0
 
 
-def _off(c, point):
-    """Distance of a point from the middle of a camera's picture [px]."""
-    seen = c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])
-    return float((seen[:2] / seen[2] - c.K[:2, 2]).norm())
+def distance_from_center(c, point):
+    """Distance of a point from the image center [px]."""
+    projected = c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])
+    return float((projected[:2] / projected[2] - c.K[:2, 2]).norm())
 
 
-def test_a_spiral_keeps_its_point_in_the_middle_and_its_reach():
+def test_a_spiral_keeps_its_target_centered_and_its_radius():
     path = paths.spiral(camera(), 2.0, 0.3, paths.evenly_spaced(40))
-    assert max(_off(c, torch.zeros(3)) for c in path) < 1e-3
+    assert max(distance_from_center(c, torch.zeros(3)) for c in path) < 1e-3
     distances = (positions(path) - torch.tensor([0.0, 0.0, -2.0])).norm(dim=1)
     assert distances.max() < 0.4
     assert distances.max() > 0.25
@@ -134,71 +134,73 @@ def test_a_spiral_keeps_its_point_in_the_middle_and_its_reach():
     assert [c.time for c in path] == paths.evenly_spaced(40)
 
 
-def test_a_spiral_closes():
+def test_a_spiral_is_closed():
     path = paths.spiral(camera(), 2.0, 0.3, [0.0] * 200)
     assert (path[0].position - path[-1].position).norm() < 2 * (path[0].position - path[1].position).norm()
 
 
-@pytest.mark.parametrize("moment", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("stop", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
-def test_bullet_time_stands_still_while_the_camera_swings(moment, frames):
-    path = paths.bullet(camera(), 2.0, moment, frames)
+def test_time_stops_while_the_camera_swings(stop, frames):
+    path = paths.bullet(camera(), 2.0, stop, frames)
     assert len(path) == frames
     moved = (positions(path) - camera().position).norm(dim=1) > 1e-4
-    assert all(c.time == moment for c, m in zip(path, moved, strict=True) if m)
-    assert max(_off(c, torch.zeros(3)) for c in path) < 1e-3
+    assert all(c.time == stop for c, m in zip(path, moved, strict=True) if m)
+    assert max(distance_from_center(c, torch.zeros(3)) for c in path) < 1e-3
     assert [c.time for c in path] == sorted(c.time for c in path)
 
 
-def test_bullet_time_runs_from_the_first_moment_to_the_last():
+def test_bullet_time_runs_from_the_first_time_to_the_last():
     path = paths.bullet(camera(), 2.0, 0.5, 120)
     assert path[0].time == 0.0
     assert path[-1].time == 1.0
 
 
 def test_bullet_time_swings_to_both_sides_and_keeps_its_distance():
-    at = positions(paths.bullet(camera(), 2.0, 0.5, 120))
-    assert at[:, 0].max() == pytest.approx(2 * math.sin(paths.BULLET_ARC), rel=0.01)
-    assert at[:, 0].min() == pytest.approx(-2 * math.sin(paths.BULLET_ARC), rel=0.01)
-    assert at.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
+    centers = positions(paths.bullet(camera(), 2.0, 0.5, 120))
+    assert centers[:, 0].max() == pytest.approx(2 * math.sin(paths.BULLET_ARC), rel=0.01)
+    assert centers[:, 0].min() == pytest.approx(-2 * math.sin(paths.BULLET_ARC), rel=0.01)
+    assert centers.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
 
 
-# The scene's ball ---------------------------------------------------------------------------------------------------
+# Bounding sphere ----------------------------------------------------------------------------------------------------
 
 
-def test_a_few_gaussians_far_away_do_not_make_the_scene_larger():
+def test_outliers_do_not_enlarge_the_bounding_sphere():
     points = torch.randn(5000, 3)
     points[:20] *= 1e4
     points[20] = math.nan
-    ball = paths.Ball.around(points)
-    assert ball.center.norm() < 0.2
-    assert 2 < ball.radius < 5
+    sphere = paths.BoundingSphere.around(points)
+    assert sphere.center.norm() < 0.2
+    assert 2 < sphere.radius < 5
 
 
-def test_the_filming_camera_is_always_in_the_scene():
+def test_training_cameras_are_always_within_the_scene():
     far = torch.tensor([[0.0, 0.0, -50.0]])
-    paths.Ball.around(torch.randn(100, 3), far).check([Camera.looking_at(far[0], torch.zeros(3), UP, 9.0, (4, 4))], "x")
+    paths.BoundingSphere.around(torch.randn(100, 3), far).check(
+        [Camera.looking_at(far[0], torch.zeros(3), UP, 9.0, (4, 4))], "x"
+    )
 
 
-def test_a_path_that_leaves_the_scene_is_refused_with_its_camera():
-    ball = paths.Ball.around(torch.randn(1000, 3) * 0.1)
+def test_a_path_that_leaves_the_scene_is_refused_and_its_camera_named():
+    sphere = paths.BoundingSphere.around(torch.randn(1000, 3) * 0.1)
     with pytest.raises(ValueError, match=r"^orbit leaves the scene: camera 1 at \(0, 0, -2\) is 2(\.\d+)? from its"):
-        ball.check([Camera(torch.eye(4), torch.eye(3), 4, 4), camera()], "orbit")
+        sphere.check([Camera(torch.eye(4), torch.eye(3), 4, 4), camera()], "orbit")
 
 
-def test_a_camera_that_is_nowhere_is_refused():
+def test_a_camera_at_nan_is_refused():
     viewmat = torch.eye(4)
     viewmat[0, 3] = math.nan
     with pytest.raises(ValueError, match="leaves the scene"):
-        paths.Ball(torch.zeros(3), 1.0).check([Camera(viewmat, torch.eye(3), 4, 4)], "orbit")
+        paths.BoundingSphere(torch.zeros(3), 1.0).check([Camera(viewmat, torch.eye(3), 4, 4)], "orbit")
 
 
-def test_a_scene_without_gaussians_has_no_ball():
+def test_a_scene_without_gaussians_has_no_bounding_sphere():
     with pytest.raises(ValueError, match="the scene has no Gaussians"):
-        paths.Ball.around(torch.zeros(0, 3))
+        paths.BoundingSphere.around(torch.zeros(0, 3))
 
 
-# Sizes --------------------------------------------------------------------------------------------------------------
+# Image sizes --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0, 0.37])
@@ -206,11 +208,13 @@ def test_a_resized_camera_sees_the_same_view(factor):
     point = torch.tensor([0.3, -0.2, 0.5])
     a, b = camera(), paths.resized(camera(), factor)
     assert b.size == (round(64 * factor), round(48 * factor))
-    shares = [(c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])) for c in (a, b)]
-    at = [s[:2] / s[2] / torch.tensor([float(c.width), float(c.height)]) for s, c in zip(shares, (a, b), strict=True)]
-    assert (at[0] - at[1]).abs().max() < 1e-6
+    projected = [(c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])) for c in (a, b)]
+    relative = [
+        p[:2] / p[2] / torch.tensor([float(c.width), float(c.height)]) for p, c in zip(projected, (a, b), strict=True)
+    ]
+    assert (relative[0] - relative[1]).abs().max() < 1e-6
 
 
-def test_a_camera_of_no_pixels_is_refused():
+def test_an_image_without_pixels_is_refused():
     with pytest.raises(ValueError, match=r"64 × 48 times 0\.001 has no pixels"):
         paths.resized(camera(), 0.001)

@@ -1,4 +1,4 @@
-"""Keyframes in a JSON file: the camera is where they say, and what is no path is refused in a line."""
+"""Paths follow the keyframes of a JSON file; an invalid file is refused with a one-line message."""
 
 import json
 
@@ -10,7 +10,7 @@ from tests.export.scenes import refusal
 from tests.video.test_camera_paths import capture, is_rigid, positions
 from warpgs.video.keyframes import read_path
 
-FILM = capture([0.0, 0.4], [0.0, 1.0])
+CAPTURE = capture([0.0, 0.4], [0.0, 1.0])
 
 
 @pytest.fixture
@@ -20,49 +20,49 @@ def path(tmp_path):
 
 def read(path, keyframes, frames=5, **others):
     path.write_text(json.dumps({"keyframes": keyframes, **others}))
-    return read_path(path, FILM, frames)
+    return read_path(path, CAPTURE, frames)
 
 
-PLACED = {"position": [0.1, 0.2, -1.0], "target": [0.0, 0.0, 0.5], "time": 0.5}
+AIMED = {"position": [0.1, 0.2, -1.0], "target": [0.0, 0.0, 0.5], "time": 0.5}
 
 
-def test_views_of_the_capture_are_gone_through(path):
+def test_a_path_passes_through_the_views_of_its_keyframes(path):
     cameras = read(path, [{"view": "1", "time": 0.0}, {"view": "0", "time": 1.0}])
-    assert (cameras[0].viewmat - FILM.cameras["1"].viewmat).abs().max() < 1e-5
-    assert (cameras[-1].viewmat - FILM.cameras["0"].viewmat).abs().max() < 1e-5
+    assert (cameras[0].viewmat - CAPTURE.cameras["1"].viewmat).abs().max() < 1e-5
+    assert (cameras[-1].viewmat - CAPTURE.cameras["0"].viewmat).abs().max() < 1e-5
     assert [c.time for c in cameras] == pytest.approx([0, 0.25, 0.5, 0.75, 1])
     assert is_rigid(cameras)
 
 
-def test_a_position_looks_at_its_target_the_right_way_up(path):
-    camera = read(path, [PLACED])[0]
-    assert (camera.position - torch.tensor(PLACED["position"])).abs().max() < 1e-5
-    seen = camera.viewmat[:3, :3] @ torch.tensor(PLACED["target"]) + camera.viewmat[:3, 3]
-    assert seen[:2].abs().max() < 1e-5
-    assert seen[2] > 0
+def test_a_position_looks_at_its_target_and_is_upright(path):
+    camera = read(path, [AIMED])[0]
+    assert (camera.position - torch.tensor(AIMED["position"])).abs().max() < 1e-5
+    target = camera.viewmat[:3, :3] @ torch.tensor(AIMED["target"]) + camera.viewmat[:3, 3]
+    assert target[:2].abs().max() < 1e-5
+    assert target[2] > 0
     assert camera.viewmat[1, 1] > 0.9
 
 
-def test_up_may_be_told(path):
-    assert read(path, [PLACED], up=[1, 0, 0])[0].viewmat[1, 0] < -0.9
+def test_the_upward_direction_can_be_given(path):
+    assert read(path, [AIMED], up=[1, 0, 0])[0].viewmat[1, 0] < -0.9
 
 
-def test_a_focal_length_may_be_told(path):
-    K = read(path, [{**PLACED, "focal": 75}])[0].K
+def test_a_focal_length_can_be_given(path):
+    K = read(path, [{**AIMED, "focal": 75}])[0].K
     assert [float(K[0, 0]), float(K[1, 1])] == pytest.approx([75.0, 75.0])
 
 
-def test_places_on_the_path_are_kept(path):
-    keyframes = [{**PLACED, "time": time, "at": at} for time, at in ((0.0, 0), (1.0, 1), (0.2, 4))]
+def test_keyframes_can_be_unevenly_spaced(path):
+    keyframes = [{**AIMED, "time": time, "at": at} for time, at in ((0.0, 0), (1.0, 1), (0.2, 4))]
     assert [c.time for c in read(path, keyframes)] == pytest.approx([0.0, 1.0, 0.2 + 0.8 * 2 / 3, 0.2 + 0.8 / 3, 0.2])
 
 
-def test_what_the_viewer_saves_is_a_path(path):
-    cameras = [FILM.cameras["0"], FILM.cameras["1"]]
+def test_keyframes_of_the_viewer_are_read_unchanged(path):
+    cameras = [CAPTURE.cameras["0"], CAPTURE.cameras["1"]]
     sizes = {"width": 64, "height": 48}
     keyframes = [{"time": c.time, "viewmat": c.viewmat.tolist(), "K": c.K.tolist(), **sizes} for c in cameras]
-    back = read(path, keyframes, frames=2)
-    for a, b in zip(back, cameras, strict=True):
+    read_back = read(path, keyframes, frames=2)
+    for a, b in zip(read_back, cameras, strict=True):
         assert (a.viewmat - b.viewmat).abs().max() < 1e-5
         assert (a.K - b.K).abs().max() < 1e-4
         assert (a.size, a.time) == (b.size, b.time)
@@ -71,22 +71,22 @@ def test_what_the_viewer_saves_is_a_path(path):
 SAVED = {"viewmat": torch.eye(4).tolist(), "time": 0.0}
 
 
-def test_keyframes_of_other_sizes_show_as_much_in_the_first_ones(path):
-    own = {"K": [[100, 0, 80], [0, 100, 60], [0, 0, 1]], "width": 160, "height": 120}
+def test_keyframes_of_other_sizes_keep_their_field_of_view_at_the_first_size(path):
+    large = {"K": [[100, 0, 80], [0, 100, 60], [0, 0, 1]], "width": 160, "height": 120}
     wide = {"K": [[50, 0, 70], [0, 50, 20], [0, 0, 1]], "width": 120, "height": 60}
-    cameras = read(path, [{**SAVED, **own}, {**SAVED, **wide}], frames=2)
+    cameras = read(path, [{**SAVED, **large}, {**SAVED, **wide}], frames=2)
     assert [c.size for c in cameras] == [(160, 120)] * 2
     assert (cameras[1].K - torch.tensor([[100.0, 0, 100], [0, 100, 40], [0, 0, 1]])).abs().max() < 1e-3
 
 
-def test_one_keyframe_is_held(path):
-    assert len({tuple(p.tolist()) for p in positions(read(path, [PLACED], frames=4))}) == 1
+def test_a_single_keyframe_gives_a_constant_path(path):
+    assert len({tuple(p.tolist()) for p in positions(read(path, [AIMED], frames=4))}) == 1
 
 
 @pytest.mark.parametrize(
     ("keyframe", "words"),
     [
-        (3, "keyframe 1 is no object"),
+        (3, "keyframe 1 must be a JSON object, got int"),
         ({}, "must have either a view, or a position and a target, or a viewmat"),
         ({"view": "0", "position": [0, 0, 0], "target": [0, 0, 1], "time": 0}, "must have either a view"),
         ({"position": [0, 0, 0], "time": 0}, "must have either a view"),
@@ -103,19 +103,19 @@ def test_one_keyframe_is_held(path):
         ({"view": "0", "time": 10**400}, "time must be a number, got 1000"),
         ({**SAVED, "K": [[1e-300, 0, 1], [0, 1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
         ({**SAVED, "K": [[1, 0, 1], [0, -1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
-        ({**PLACED, "target": PLACED["position"]}, "its target is nowhere"),
-        ({**PLACED, "target": [0.1, 9.0, -1.0]}, "straight up or down"),
-        ({**PLACED, "position": [0, 0]}, "position must be three numbers"),
-        ({**PLACED, "position": [0, 0, 1e300]}, "position must be a number"),
+        ({**AIMED, "target": AIMED["position"]}, "position and target coincide"),
+        ({**AIMED, "target": [0.1, 9.0, -1.0]}, "the view direction is parallel to up"),
+        ({**AIMED, "position": [0, 0]}, "position must be three numbers"),
+        ({**AIMED, "position": [0, 0, 1e300]}, "position must be a number"),
         ({**SAVED, "viewmat": [[1, 0], [0, 1]]}, "viewmat must be 4 rows of 4 numbers"),
-        ({**SAVED, "viewmat": (2 * torch.eye(4)).tolist()}, "viewmat is no rotation and translation"),
-        ({**SAVED, "viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1])).tolist()}, "viewmat is no rotation"),
+        ({**SAVED, "viewmat": (2 * torch.eye(4)).tolist()}, "viewmat must be a rotation and a translation"),
+        ({**SAVED, "viewmat": torch.diag(torch.tensor([1.0, 1, -1, 1])).tolist()}, "viewmat must be a rotation"),
         ({**SAVED, "K": torch.eye(3).tolist()}, "must have all of K, width and height"),
         ({**SAVED, "K": torch.eye(3).tolist(), "width": 10, "height": 0}, "expected a width and a height"),
         ({**SAVED, "K": torch.ones(3, 3).tolist(), "width": 10, "height": 9}, "K must be"),
     ],
 )
-def test_a_keyframe_that_is_none_is_refused_with_its_number(path, keyframe, words):
+def test_an_invalid_keyframe_is_refused_with_its_number(path, keyframe, words):
     with pytest.raises(ValueError, match=words) as error:
         read(path, [{"view": "0", "time": 0.0}, keyframe])
     assert str(error.value).startswith(f"{path}: keyframe 1")
@@ -124,68 +124,68 @@ def test_a_keyframe_that_is_none_is_refused_with_its_number(path, keyframe, word
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "is no JSON"),
-        ("{", "is no JSON"),
-        ('{"keyframes": [{"view": "0", "time": ' + 5000 * "1" + "}]}", "is no JSON"),
-        ("[" * 100_000, "is no JSON"),
-        ("[]", "expected an object with keyframes, got list"),
+        ("", "is not valid JSON"),
+        ("{", "is not valid JSON"),
+        ('{"keyframes": [{"view": "0", "time": ' + 5000 * "1" + "}]}", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("[]", "must hold a JSON object, got list"),
         ("{}", "has no list of keyframes"),
         ('{"keyframes": []}', "has no list of keyframes"),
         ('{"keyframes": {}}', "has no list of keyframes"),
         ('{"keyframes": [], "fps": 3}', "unknown field 'fps'"),
         ('{"keyframes": [{"view": "0", "time": 0}], "up": 1}', "up must be three numbers"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0}]}', "every keyframe has a field"),
-        ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0, "at": 1}]}', "at must grow"),
+        ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0, "at": 1}]}', "at must increase"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1' + 400 * "0" + "}]}", "at must be a number"),
     ],
 )
-def test_a_file_that_is_no_path_is_refused_in_a_line(path, text, words):
+def test_an_invalid_path_is_refused_with_a_one_line_message(path, text, words):
     path.write_text(text)
     with pytest.raises(ValueError, match=words) as error:
-        read_path(path, FILM, 3)
+        read_path(path, CAPTURE, 3)
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path):
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(ValueError, match="is no file"):
-            read_path(path, FILM, 3)
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    for path, message in ((tmp_path / "none.json", r"none\.json is missing"), (tmp_path, "is not a file")):
+        with pytest.raises(ValueError, match=message):
+            read_path(path, CAPTURE, 3)
 
 
-def test_a_file_that_is_no_text_is_refused(path):
+def test_a_binary_file_is_refused(path):
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match="is no JSON"):
-        read_path(path, FILM, 3)
+    with pytest.raises(ValueError, match="is not valid JSON"):
+        read_path(path, CAPTURE, 3)
 
 
 def test_a_huge_file_is_not_read(path):
     path.write_text(" " * ((1 << 20) + 1))
     with pytest.raises(ValueError, match="has 1,048,577 bytes, more than"):
-        read_path(path, FILM, 3)
+        read_path(path, CAPTURE, 3)
 
 
 def test_a_device_is_not_read(path):
-    """It would never end; its size is 0."""
+    """It would never end, although its size is 0."""
     path.symlink_to("/dev/zero")
-    with pytest.raises(ValueError, match="is no file"):
-        read_path(path, FILM, 3)
+    with pytest.raises(ValueError, match="is not a file"):
+        read_path(path, CAPTURE, 3)
 
 
-def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(path):
-    saved = {**SAVED, "K": FILM.cameras["0"].K.tolist(), "width": 32, "height": 24}
-    text = json.dumps({"up": [0, -1, 0], "keyframes": [{"view": "0", "time": 0.0}, PLACED, saved]}).encode()
+def test_a_damaged_file_is_either_read_or_refused_with_a_one_line_message(path):
+    saved = {**SAVED, "K": CAPTURE.cameras["0"].K.tolist(), "width": 32, "height": 24}
+    text = json.dumps({"up": [0, -1, 0], "keyframes": [{"view": "0", "time": 0.0}, AIMED, saved]}).encode()
     path.write_bytes(text)
-    assert len(read_path(path, FILM, 3)) == 3
+    assert len(read_path(path, CAPTURE, 3)) == 3
     random = np.random.default_rng(0)
     for _ in range(600):
         data = bytearray(text)
-        for place in random.integers(0, len(data), random.integers(1, 4)):
-            data[place] = random.choice([random.integers(256), *b'0123456789eE"[]{},:-.'])
+        for index in random.integers(0, len(data), random.integers(1, 4)):
+            data[index] = random.choice([random.integers(256), *b'0123456789eE"[]{},:-.'])
         path.write_bytes(data[: random.integers(len(data))] if random.random() < 0.2 else data)
-        said = refusal(lambda path: read_path(path, FILM, 3), path)
-        assert said is None or (str(path) in said and "\n" not in said)
-        for camera in [] if said is not None else read_path(path, FILM, 3):
+        message = refusal(lambda path: read_path(path, CAPTURE, 3), path)
+        assert message is None or (str(path) in message and "\n" not in message)
+        for camera in [] if message is not None else read_path(path, CAPTURE, 3):
             assert bool(camera.viewmat.isfinite().all())
             assert bool(camera.K.isfinite().all())
             assert min(float(camera.K[0, 0]), float(camera.K[1, 1])) > 0

@@ -1,1 +1,1 @@
-"""``warpgs bench``: times of renders, training steps and playback."""
+"""``warpgs bench``: render times, training step times and playback frame rates."""

@@ -7,35 +7,36 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Bench:
-    """Times rendering on random scenes: medians in milliseconds, stage by stage and as a whole."""
+    """Measures rendering times on random scenes: medians in milliseconds, in total and per stage."""
 
     scenes: tuple[Literal["small", "large", "wide"], ...] = ()
     """Scenes to measure: small (480x270, 100k Gaussians of 3 px), large (1920x1080, 1M of 4 px), wide (1920x1080, 200k
     of 20 px). By default all on CUDA and small on CPU."""
     device: Literal["cpu", "cuda"] | None = None
-    """Where to render; CUDA if there is a GPU."""
+    """Device to render on; CUDA by default if there is a GPU."""
     repeats: int = 30
-    """Runs that the medians are taken over."""
+    """Number of runs to take the medians over."""
     branches: Literal["none", "random", "disc"] = "none"
-    """Measure three images (joint, static, dynamic) against one; each Gaussian is dynamic with probability 1/2
-    (random), or where it projects into a disc of 20 % of the image (disc)."""
+    """Compare rendering three images (joint, static, dynamic) with rendering one; a Gaussian is dynamic with
+    probability 1/2 (random), or if it projects into a disc that covers 20 % of the image (disc)."""
     depth: bool = False
-    """Render depth too."""
+    """Also render depth."""
     graph: bool = False
-    """Also time the render and its way back as a replayed CUDA graph."""
+    """Also measure forward and backward pass as a replayed CUDA graph."""
     against: Literal["gsplat"] | None = None
-    """Also time another renderer, in turn with this one, and compare images and gradients."""
+    """Also measure another renderer, alternating with this one, and compare images and gradients."""
     json: Path | None = None
-    """File for all figures."""
+    """JSON file to write all measurements to."""
     profile: Path | None = None
-    """File for a Chrome trace (chrome://tracing) of the kernels of one render and its way back."""
+    """File for a Chrome trace (chrome://tracing) of the kernels of one forward and backward pass."""
     steps: bool = False
-    """Instead of scenes, time whole training steps, by number of Gaussians and size of image."""
+    """Measure whole training steps instead, for several numbers of Gaussians and image sizes."""
     fps: Path | None = None
-    """Instead of scenes, measure the frames a second of this run."""
+    """Measure the frames per second of this run folder instead."""
 
     def run(self) -> None:
-        """Measures and prints; raises as ``run_bench``."""
+        """Measures and prints the results; raises as ``run_bench``."""
         from .run_bench import run_bench
 
-        run_bench(self)
+        for path in run_bench(self):
+            print(f"wrote {path}")

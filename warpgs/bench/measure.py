@@ -1,4 +1,4 @@
-"""Measurements of one random scene: times, memory, kernels, and differences from another renderer."""
+"""Measurements of rendering one random scene: times, memory, kernels, and differences from another renderer."""
 
 import dataclasses
 import statistics
@@ -12,26 +12,26 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.ops.projection import record_projection
+from warpgs.ops.projection import Geometry, View, record_projection
 from warpgs.ops.rows import Rows
 from warpgs.ops.ssim import ssim
 from warpgs.ops.tiles import record_tiles
 from warpgs.runtime.graphs import capture
 from warpgs.runtime.profiling import KernelTime, profile
-from warpgs.runtime.replay import PLAIN_CALLS
-from warpgs.runtime.tape import Run
+from warpgs.runtime.replay import EAGER_CALLS
+from warpgs.runtime.tape import OpContext
 
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
 from .workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
 
-WARM_UPS = {"cuda": 50 + PLAIN_CALLS, "cpu": 1}
-"""Runs before the first that counts, until replays are recorded and clocks and threads are as in the long run; on CPU
-only compilation is to be kept out, and runs are long."""
+WARM_UPS = {"cuda": 50 + EAGER_CALLS, "cpu": 1}
+"""Runs before the first measured one. On CUDA they record replays and bring clock rates and threads to a steady state;
+on CPU, where runs take long, one run compiles the kernels."""
 
 VISIBLE_DIFFERENCE = 1e-3
-"""Pixels that differ by more than this in any channel are counted."""
+"""A pixel that differs by more than this in any channel counts as visibly different."""
 
 STAGES = {
     "project": ("project_fwd", "sh_fwd", "pack", "pack_features"),
@@ -42,13 +42,16 @@ STAGES = {
     "unproject": ("unpack", "sh_bwd", "project_bwd"),
     "ssim": ("ssim_fwd", "ssim_bwd"),
 }
+"""Kernels of each stage of a render."""
+
 STAGE_OF_KERNEL = {kernel: stage for stage, kernels in STAGES.items() for kernel in kernels}
 
 Measurements = dict[str, Any]
+"""Measured values by name; nested for stages and comparisons."""
 
 
 def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, list[KernelTime]]:
-    """All figures of a scene (see ``bench_report``), and the kernels of one render and its way back."""
+    """All measurements of a scene, and the kernels of one forward and backward pass."""
     splats, camera = scene.make(options.branches, device)
     for name in PARAMETERS:
         getattr(splats, name).requires_grad_()
@@ -61,42 +64,42 @@ def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, li
     own = list(workloads)
     if options.against == "gsplat":
         workloads["gsplat"] = make_gsplat_workload(one, camera, options.depth)
-    figures = {name: peak_memory(workload) for name, workload in workloads.items()}
-    for (name, figure), median in time_passes(workloads, own if options.graph else [], device, options.repeats).items():
-        figures[name][figure] = median
+    measured = {name: peak_memory(workload) for name, workload in workloads.items()}
+    for (name, metric), median in time_passes(workloads, own if options.graph else [], device, options.repeats).items():
+        measured[name][metric] = median
     for name in own:
-        figures[name]["stages_ms"] = time_stages(workloads[name], device, options.repeats)
+        measured[name]["stages_ms"] = time_stages(workloads[name], device, options.repeats)
     result = {
         **dataclasses.asdict(scene),
         "intersections": count_intersections(splats, camera, settings),
-        **figures,
-        "ratios_to_one_image": {n: ratios(figures[n], figures["one_image"]) for n in figures if n != "one_image"},
+        **measured,
+        "ratios_to_one_image": {n: ratios(measured[n], measured["one_image"]) for n in measured if n != "one_image"},
     }
     if "gsplat" in workloads:
         result["differences_from_gsplat"] = differences(one, workloads["gsplat"])
-    with profile() as taken:
+    with profile() as kernels:
         workloads[own[-1]].forward_backward()
-    return result, taken.times()
+    return result, kernels.times()
 
 
 def time_passes(
     workloads: dict[str, Workload], graphed: list[str], device: str, repeats: int
 ) -> dict[tuple[str, str], float]:
-    """Median times [ms] by workload and figure; each figure has a loop of its own."""
+    """Median times [ms] by workload and metric, measured one metric after the other."""
     passes = {"forward_ms": Workload.forward, "forward_backward_ms": Workload.forward_backward}
     if device == "cuda":
         passes["one_thread_forward_backward_ms"] = Workload.forward_backward_on_one_thread
-    figures: dict[str, dict[str, Callable[[], object]]] = {
-        figure: {name: partial(go, workload) for name, workload in workloads.items()} for figure, go in passes.items()
+    metrics: dict[str, dict[str, Callable[[], object]]] = {
+        metric: {name: partial(run, workload) for name, workload in workloads.items()} for metric, run in passes.items()
     }
-    figures["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphed}
+    metrics["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphed}
     return {
-        (n, figure): ms for figure, steps in figures.items() for n, ms in time_in_turn(steps, device, repeats).items()
+        (n, metric): ms for metric, steps in metrics.items() for n, ms in time_in_turn(steps, device, repeats).items()
     }
 
 
 def time_in_turn(steps: dict[str, Callable[[], object]], device: str, repeats: int) -> dict[str, float]:
-    """Median times [ms] of steps that take turns, so that all see the same clock rates, and threads as awake."""
+    """Median times [ms] of alternating steps, so that clock rates and sleeping threads affect all of them equally."""
     for _ in range(WARM_UPS[device]):
         for step in steps.values():
             step()
@@ -108,16 +111,16 @@ def time_in_turn(steps: dict[str, Callable[[], object]], device: str, repeats: i
 
 
 def time_stages(workload: Workload, device: str, repeats: int) -> dict[str, float]:
-    """Median time [ms] of each stage's kernels, with SSIM of the rendered image and of noise."""
+    """Median time [ms] of the kernels of each stage, and of SSIM between the rendered image and noise."""
     image = workload.forward()[0].contiguous().requires_grad_()
     noise = torch.rand(image.shape, generator=torch.Generator().manual_seed(SEED)).to(image.device)
     samples: list[dict[str, float]] = []
     for _ in range(WARM_UPS[device] + repeats):
-        with profile() as taken:
+        with profile() as kernels:
             workload.forward_backward()
             torch.autograd.grad(ssim(image, noise), image)
         sums: dict[str, float] = defaultdict(float)
-        for kernel in taken.times():
+        for kernel in kernels.times():
             sums[STAGE_OF_KERNEL.get(kernel.name, kernel.name)] += kernel.duration_ms
         samples.append(sums)
     samples = samples[WARM_UPS[device] :]
@@ -126,7 +129,7 @@ def time_stages(workload: Workload, device: str, repeats: int) -> dict[str, floa
 
 
 def peak_memory(workload: Workload) -> Measurements:
-    """The most that torch had allocated [bytes] during a render and its way back; nothing on CPU."""
+    """Maximum memory allocated by torch during a forward and backward pass [bytes]; empty on CPU."""
     workload.forward_backward()
     if not workload.parameters[0].is_cuda:
         return {}
@@ -138,27 +141,28 @@ def peak_memory(workload: Workload) -> Measurements:
 
 @torch.no_grad()
 def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings) -> int:
-    """Pairs of a Gaussian and a tile that it touches."""
-    run = Run(splats.means.device, [])
-    geometry = (splats.means, splats.quats, splats.scales, splats.opacities, camera.viewmat, camera.K)
-    projection = record_projection(run, *geometry, camera.size, settings.near, settings.antialias)
-    rows = Rows(run, projection, splats.num_channels, settings.depth, camera.size)
-    begins, ends = record_tiles(run, rows, camera.size).ranges.unbind(-1)
+    """Number of pairs of a Gaussian and a tile that it intersects."""
+    ctx = OpContext(splats.means.device, [])
+    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
+    view = View(camera.viewmat, camera.K, *camera.size)
+    projection = record_projection(ctx, geometry, view, settings.near, settings.antialias)
+    rows = Rows(ctx, projection, splats.num_channels, settings.depth, camera.size)
+    begins, ends = record_tiles(ctx, rows, camera.size).ranges.unbind(-1)
     return int((ends - begins).sum())
 
 
-def ratios(figures: Measurements, base: Measurements) -> Measurements:
-    """Times over those of ``base``; without a graph of its own, also over the base's graph."""
+def ratios(measured: Measurements, base: Measurements) -> Measurements:
+    """Times relative to those of ``base``; without a graph, plain calls are compared with the graph of ``base``."""
     passes = ("forward", "forward_backward", "one_thread_forward_backward")
-    result = {f: figures[f"{f}_ms"] / base[f"{f}_ms"] for f in passes if f"{f}_ms" in base}
+    result = {f: measured[f"{f}_ms"] / base[f"{f}_ms"] for f in passes if f"{f}_ms" in base}
     graph = "graph_forward_backward_ms"
     if graph in base:
-        result["graph_forward_backward"] = figures.get(graph, figures["forward_backward_ms"]) / base[graph]
+        result["graph_forward_backward"] = measured.get(graph, measured["forward_backward_ms"]) / base[graph]
     return result
 
 
 def differences(ours: Workload, theirs: Workload) -> Measurements:
-    """Absolute differences of images, and of gradients relative to the length of theirs."""
+    """Absolute differences of the images, and norms of the differences of gradients relative to the norms of theirs."""
     difference = (ours.forward()[0] - theirs.forward()[0]).abs()
     gradients = zip(ours.forward_backward(), theirs.forward_backward(), strict=True)
     relative = [float((a - b).norm() / b.norm()) for a, b in gradients]

@@ -1,8 +1,7 @@
-"""What ``warpgs bench`` prints and writes."""
+"""Tables, traces and machine data for the output of ``warpgs bench``."""
 
 import importlib.metadata
 import platform
-import subprocess
 from collections.abc import Iterable
 from datetime import datetime, timezone
 from pathlib import Path
@@ -11,18 +10,24 @@ from typing import Any
 import torch
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from warpgs.evaluation.evaluate_run import commit
 from warpgs.runtime.profiling import KernelTime
 
 WIDTH = 120
 """Columns of the output when it is not a terminal."""
 
-CONTESTANTS = ("one_image", "three_images", "gsplat")
+WORKLOADS = ("one_image", "three_images", "gsplat")
+"""Workloads in the order of their columns."""
+
+UNITS = {"_ms": " [ms]", "_mb": " [MB]", "_bytes": " [bytes]"}
+"""Units by the suffixes of keys in JSON."""
 
 
 def machine(device: str) -> dict[str, Any]:
-    """Where and with which versions the figures were measured."""
+    """Hardware, versions, date and commit of the measurements."""
     if device == "cuda":
         hardware: dict[str, Any] = {"gpu": torch.cuda.get_device_name()}
     else:
@@ -37,7 +42,7 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def cpu_model() -> str:
-    """The processor's name, as far as the system tells."""
+    """The name of the processor, or its architecture if the system does not provide the name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -46,28 +51,18 @@ def cpu_model() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def commit() -> str | None:
-    """The commit of the repository that this package lies in; None outside of one or without git."""
-    command = ["git", "rev-parse", "HEAD"]
-    try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
-
-
 def print_machine(head: dict[str, Any]) -> None:
-    """Prints the machine on one line."""
+    """Prints the result of ``machine`` on one line."""
     _console().print(", ".join(f"{name}: {value}" for name, value in head.items()), highlight=False, soft_wrap=True)
 
 
 def print_result(result: dict[str, Any]) -> None:
-    """Prints a table of a scene: one column for each renderer, one row for each figure."""
+    """Prints a table of a scene with one column per workload and one row per measurement."""
     console = _console()
-    names = [name for name in CONTESTANTS if name in result]
+    names = [name for name in WORKLOADS if name in result]
     columns = [_flat(result[name]) for name in names]
     for name, column in zip(names, columns, strict=True):
-        column |= {f"{k} over one_image": v for k, v in result["ratios_to_one_image"].get(name, {}).items()}
+        column |= {f"{_label(k)} over one image": v for k, v in result["ratios_to_one_image"].get(name, {}).items()}
         if name == "gsplat":
             column |= {f"difference {k}": v for k, v in _flat(result["differences_from_gsplat"]).items()}
     title = (
@@ -77,25 +72,25 @@ def print_result(result: dict[str, Any]) -> None:
     table = _titled(console, title)
     table.add_column("")
     for name in names:
-        table.add_column(name, justify="right")
-    for figure in dict.fromkeys(figure for column in columns for figure in column):
-        table.add_row(figure, *("" if (value := c.get(figure)) is None else _text(value) for c in columns))
+        table.add_column(_label(name), justify="right")
+    for row in dict.fromkeys(row for column in columns for row in column):
+        table.add_row(row, *("" if (value := c.get(row)) is None else _text(value) for c in columns))
     console.print(table)
 
 
 def print_rows(title: str, rows: list[dict[str, Any]]) -> None:
-    """Prints a table with one line for each row; all rows have the same figures."""
+    """Prints a table of rows, which all have the same keys."""
     console = _console()
     table = _titled(console, title)
     for name in rows[0]:
-        table.add_column(name, justify="right")
+        table.add_column(_label(name), justify="right")
     for row in rows:
-        table.add_row(*(value if isinstance(value, str) else _text(value) for value in row.values()))
+        table.add_row(*(escape(value) if isinstance(value, str) else _text(value) for value in row.values()))
     console.print(table)
 
 
 def trace_events(scene: str, kernels: Iterable[KernelTime], process: int) -> list[dict[str, Any]]:
-    """A scene's kernels in the Trace Event Format [µs], as a process of their own."""
+    """The kernels of a scene in the Trace Event Format [µs], as one process."""
     common = {"pid": process, "tid": 0}
     title = {"name": "process_name", "ph": "M", "args": {"name": scene}, **common}
     return [
@@ -110,17 +105,26 @@ def _console() -> Console:
 
 
 def _titled(console: Console, title: str) -> Table:
-    """Prints a title on a line of its own, however wide the table that is to follow."""
+    """Prints a title on one line, also if it is wider than its table; returns an empty table."""
     console.print(f"\n{title}", highlight=False, soft_wrap=True)
     return Table(box=box.SIMPLE if console.is_terminal else None)
 
 
-def _flat(figures: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested figures with the names of the levels in one."""
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flattens nested values; the labels of all levels are joined."""
     flat: dict[str, Any] = {}
-    for name, value in figures.items():
-        flat |= _flat(value, f"{prefix}{name} ") if isinstance(value, dict) else {prefix + name: value}
+    for name, value in values.items():
+        label = prefix + _label(name)
+        flat |= _flat(value, f"{label} ") if isinstance(value, dict) else {label: value}
     return flat
+
+
+def _label(name: str) -> str:
+    """The label of a JSON key, as rich markup: "forward [ms]" for "forward_ms"."""
+    for suffix, unit in UNITS.items():
+        if name.endswith(suffix):
+            name = name.removesuffix(suffix) + unit
+    return escape(name.replace("_", " "))
 
 
 def _text(value: int | float) -> str:

@@ -1,15 +1,14 @@
-"""``warpgs bench``: measures what the options ask for, prints the results and writes them to files."""
+"""``warpgs bench``: measures, prints the results as tables and writes them to files."""
 
 import dataclasses
 import importlib.util
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from warpgs.files import write_json
-from warpgs.ops.tiles import forget_budgets
+from warpgs.ops.tiles import reset_budgets
 
 from .command import Bench
 from .measure import Measurements, measure
@@ -18,11 +17,11 @@ from .scenes import SCENES, Scene
 from .training import bench_fps, bench_steps
 
 
-def run_bench(options: Bench) -> None:
-    """Measures scenes, or training steps and playback if the options ask for them.
+def run_bench(options: Bench) -> list[Path]:
+    """Measures scenes, or training steps and playback with ``--steps`` and ``--fps``; returns the files written.
 
     Raises:
-        ValueError: If an option cannot be used on this machine.
+        ValueError: If an option is not valid or not supported on this machine.
         ImportError: If the other renderer is not installed.
         OSError: If a file cannot be written.
     """
@@ -30,17 +29,16 @@ def run_bench(options: Bench) -> None:
     options = dataclasses.replace(options, device=device)
     check(options)
     if options.steps or options.fps is not None:
-        bench_training(options, device)
-        return
+        return bench_training(options, device)
     names: Sequence[str] = options.scenes or (tuple(SCENES) if device == "cuda" else ("small",))
-    bench(options, [SCENES[name] for name in names], device)
+    return bench(options, [SCENES[name] for name in names], device)
 
 
 def check(options: Bench) -> None:
-    """Refuses options that cannot be measured on this machine, before time is spent on them.
+    """Checks the options before anything is measured.
 
     Raises:
-        ValueError: If an option needs another device, or a file cannot be written.
+        ValueError: If an option is not valid or needs another device, or a file cannot be written.
         ImportError: If the other renderer is not installed.
     """
     if options.repeats < 1:
@@ -59,25 +57,23 @@ def check(options: Bench) -> None:
             raise ValueError(f"cannot write {path}: it is a folder")
 
 
-def bench(options: Bench, scenes: Iterable[Scene], device: str) -> None:
-    """Measures scenes, prints the results and writes the files of ``--json`` and ``--profile``."""
+def bench(options: Bench, scenes: Iterable[Scene], device: str) -> list[Path]:
+    """Measures scenes, prints the results and writes the files of ``--json`` and ``--profile``; returns their paths."""
     head = machine(device)
     print_machine(head)
     results, trace = [], []
     for scene in scenes:
-        forget_budgets()  # of the previous scene
+        reset_budgets()  # of the previous scene
         result, kernels = measure(options, scene, device)
         print_result(result)
         results.append(result)
         trace += trace_events(scene.name, kernels, len(results))
-    if options.json is not None:
-        write(options.json, {"machine": head, "repeats": options.repeats, "results": results})
-    if options.profile is not None:
-        write(options.profile, {"traceEvents": trace})
+    report = {"machine": head, "repeats": options.repeats, "results": results}
+    return write((options.json, report), (options.profile, {"traceEvents": trace}))
 
 
-def bench_training(options: Bench, device: str) -> None:
-    """Measures whole training steps (``--steps``) and playback of a run (``--fps``)."""
+def bench_training(options: Bench, device: str) -> list[Path]:
+    """Measures training steps (``--steps``) and playback (``--fps``); returns the paths of the written files."""
     head = machine(device)
     print_machine(head)
     report: Measurements = {"machine": head, "repeats": options.repeats}
@@ -85,11 +81,14 @@ def bench_training(options: Bench, device: str) -> None:
         report["steps"] = bench_steps(device, options.repeats)
     if options.fps is not None:
         report["fps"] = bench_fps(options.fps, device)
-    if options.json is not None:
-        write(options.json, report)
+    return write((options.json, report))
 
 
-def write(path: Path, values: dict[str, Any]) -> None:
-    """Writes measurements or a trace, and prints the path."""
-    write_json(path, values)
-    print(f"wrote {path}")
+def write(*files: tuple[Path | None, Measurements]) -> list[Path]:
+    """Writes values as JSON to each path that is given; returns these paths."""
+    written = []
+    for path, values in files:
+        if path is not None:
+            write_json(path, values)
+            written.append(path)
+    return written

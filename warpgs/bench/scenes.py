@@ -1,4 +1,4 @@
-"""Random scenes to measure rendering with."""
+"""Random scenes for measurements."""
 
 import dataclasses
 import math
@@ -15,17 +15,17 @@ Branches = Literal["none", "random", "disc"]
 
 SEED = 0
 DISC_AREA = 0.2
-"""Share of the image that the disc of dynamic Gaussians covers."""
+"""Fraction of the image area that the disc of dynamic Gaussians covers."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a random scene is made of.
+    """Specification of a random scene.
 
     Attributes:
-        name: How it is called on the command line.
+        name: Name on the command line.
         width, height: Size of the image [px].
-        num_gaussians: All of them inside the image.
+        num_gaussians: Number of Gaussians; all project into the image.
         pixels: Twice the median standard deviation of a Gaussian on screen [px].
     """
 
@@ -36,7 +36,7 @@ class Scene:
     pixels: float
 
     def make(self, branches: Branches, device: str) -> tuple[Splats, Camera]:
-        """The scene, with ``is_dynamic`` unless ``branches`` is none."""
+        """The splats and the camera; ``is_dynamic`` is set unless ``branches`` is none."""
         splats, camera = random_splats(self.num_gaussians, self.width, self.height, self.pixels, SEED)
         if branches == "random":
             coins = torch.rand(self.num_gaussians, generator=torch.Generator().manual_seed(SEED + 1))
@@ -59,13 +59,13 @@ SCENES = {
 def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> tuple[Splats, Camera]:
     """Gaussians spread evenly over an image and over depths of 2 to 10, with random shapes, opacities and colours.
 
-    A seed stands for the same scene on every machine: all values are drawn on CPU, in a fixed order.
+    A seed gives the same scene on every machine: all values are sampled on the CPU, in a fixed order.
 
     Args:
         N: Number of Gaussians.
         width, height: Size of the image [px].
         pixels: Twice the median standard deviation of a Gaussian on screen [px].
-        seed: Of torch's CPU generator.
+        seed: Seed of torch's CPU generator.
 
     Returns:
         Splats with three colour channels, and a camera at the origin that looks along +z, with a focal length of 0.9
@@ -86,8 +86,8 @@ def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> 
 
 
 def in_disc(means: Tensor, camera: Camera) -> Tensor:
-    """[N] whether centres, in camera space, project into a disc of ``DISC_AREA`` around the middle of the image."""
-    middle = torch.tensor([camera.width / 2, camera.height / 2])
+    """[N] whether means in camera space project into a disc around the image center that covers ``DISC_AREA`` of it."""
+    center = torch.tensor([camera.width / 2, camera.height / 2])
     homogeneous = means @ camera.K.T
-    centers = homogeneous[:, :2] / homogeneous[:, 2:]
-    return (centers - middle).square().sum(-1) < DISC_AREA * camera.width * camera.height / math.pi
+    means2d = homogeneous[:, :2] / homogeneous[:, 2:]
+    return (means2d - center).square().sum(-1) < DISC_AREA * camera.width * camera.height / math.pi

@@ -1,4 +1,4 @@
-"""How long something takes, on the device's own clock."""
+"""Measures times on the clock of the device."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import torch
 
 
 def milliseconds(step: Callable[[], object], device: str) -> float:
-    """Time that a step takes [ms]: by CUDA events on a GPU, by the wall clock on CPU."""
+    """Duration of a step [ms]: by CUDA events on a GPU, by the wall clock on CPU."""
     if device == "cpu":
         start = time.perf_counter()
         step()

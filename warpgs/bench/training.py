@@ -17,9 +17,10 @@ from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.runs.run import Run
-from warpgs.training import point_cloud as init
-from warpgs.training.schedule import Moment, Protocol
-from warpgs.training.step import WARM_UPS, Draw, Step
+from warpgs.runtime.graphs import WARM_UPS
+from warpgs.training.point_cloud import scene_box
+from warpgs.training.schedule import IterationPlan, Protocol
+from warpgs.training.step import Sample, Step
 from warpgs.training.views import Views
 
 from .report import print_rows
@@ -34,16 +35,16 @@ STEPS = {
     ],
     "cpu": [(num, (240, 136)) for num in (5_000, 10_000)],
 }
-"""Numbers of Gaussians and sizes of images to measure. 133,000 is what Deformable-3DGS ends with on such a capture."""
+"""Numbers of Gaussians and image sizes to measure; Deformable-3DGS ends with 133,000 on a capture of this size."""
 
 PIXELS = 3.0
-"""Twice the median standard deviation of a Gaussian on screen, for each 480 pixels of the image's width [px]."""
+"""Twice the median standard deviation of a Gaussian on screen, per 480 pixels of image width [px]."""
 
 NUM_VIEWS = 4
 
 
 def random_capture(splats: Splats, camera: Camera) -> Capture:
-    """Views of noise, a disc of which moves; its points are the centres of the Gaussians."""
+    """A capture of noise with a disc as dynamic region; its points are the means of the Gaussians."""
     generator = torch.Generator().manual_seed(SEED)
     width, height = camera.size
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -61,12 +62,12 @@ def random_capture(splats: Splats, camera: Camera) -> Capture:
 
 
 def random_scene(splats: Splats, camera: Camera) -> SplitScene:
-    """The Gaussians in raw form, those in a disc in the middle dynamic, with the networks of the paper."""
+    """The Gaussians before activation, dynamic within a disc in the image center, with the networks of the paper."""
     config = PRESETS["paper"].model
     assert splats.colors is not None
-    moving = in_disc(splats.means, camera)
+    dynamic = in_disc(splats.means, camera)
     parts = []
-    for part in (~moving, moving):
+    for part in (~dynamic, dynamic):
         parts.append(
             Gaussians(
                 splats.means[part],
@@ -77,18 +78,18 @@ def random_scene(splats: Splats, camera: Camera) -> SplitScene:
                 torch.zeros(int(part.sum()), (config.sh_degree + 1) ** 2 - 1, 3),
             )
         )
-    return SplitScene(parts[0], parts[1], config, *init.scene_box(splats.means))
+    return SplitScene(parts[0], parts[1], config, *scene_box(splats.means))
 
 
 def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
-    """Times whole training steps (render, loss, way back, Adam) of both stages; prints and returns the figures."""
+    """Measures training steps (render, loss, backward pass, Adam) of both stages; prints and returns the results."""
     rows = [measure_steps(num, size, device, repeats) for num, size in STEPS[device]]
     print_rows("whole training steps, medians", rows)
     return rows
 
 
 def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int) -> dict[str, Any]:
-    """Median time [ms] of a step of stage I and of stage II, and the most memory that tensors took meanwhile."""
+    """Median time [ms] of a step of stage I and of stage II, and on CUDA the maximum memory of tensors [MB]."""
     splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / MIN_SIZE[0], SEED)
     config = dataclasses.replace(PRESETS["paper"], device="cuda" if device == "cuda" else "cpu")
     capture = random_capture(splats, camera)
@@ -101,24 +102,24 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
     for stage in (protocol.stage1, protocol.stage2):
         step = Step(config, scene, views, alignments, capture.extent)
-        moment = protocol.at((stage.start + stage.end) // 2)
-        result[f"{stage.name}_ms"] = statistics.median(_times(step, moment, device, repeats))
+        plan = protocol.at((stage.start + stage.end) // 2)
+        result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     if device == "cuda":
         result["peak_memory_mb"] = torch.cuda.max_memory_allocated() // 10**6
     return result
 
 
-def _times(step: Step, moment: Moment, device: str, repeats: int) -> Iterable[float]:
-    draws = [
-        Draw(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k))) for k in range(repeats)
+def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterable[float]:
+    samples = [
+        Sample(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k))) for k in range(repeats)
     ]
-    for draw in [draws[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
-        step(moment, draw)
-    return [milliseconds(partial(step, moment, draw), device) for draw in draws]
+    for sample in [samples[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
+        step(plan, sample)
+    return [milliseconds(partial(step, plan, sample), device) for sample in samples]
 
 
 def bench_fps(folder: Path, device: str) -> dict[str, Any]:
-    """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the figures."""
+    """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the results."""
     run = Run.open(folder, "cuda" if device == "cuda" else "cpu")
     capture, scene = run.open_capture(), run.trained_scene()
     cameras = [capture.cameras[name].to(scene.device) for name in capture.val or capture.train]
@@ -130,7 +131,7 @@ def bench_fps(folder: Path, device: str) -> dict[str, Any]:
         "dynamic": len(scene.scene.dynamic),
         "frames_per_second": frame_rate(scene.play, cameras),
     }
-    if device == "cuda":  # on CPU nothing is replayed
+    if device == "cuda":  # on CPU both are the same
         result["eager_frames_per_second"] = frame_rate(scene.render, cameras)
     print_rows("frames per second, both networks evaluated for every frame", [result])
     return result

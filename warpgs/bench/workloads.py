@@ -1,4 +1,4 @@
-"""Renders that ``warpgs bench`` measures, this package's own and others."""
+"""Renders for ``warpgs bench`` to measure, by this package and by others."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,55 +18,55 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 
 @dataclass(frozen=True)
 class Workload:
-    """A render and its way back.
+    """A render and its backward pass.
 
     Attributes:
-        draw: Makes the images.
-        parameters: What gradients are asked for, in the order of ``PARAMETERS``.
-        cotangents: One for each image.
+        render: Renders the images.
+        parameters: Tensors to compute gradients of, in the order of ``PARAMETERS``.
+        v_images: Gradient with respect to each image.
     """
 
-    draw: Callable[[], tuple[Tensor, ...]]
+    render: Callable[[], tuple[Tensor, ...]]
     parameters: tuple[Tensor, ...]
-    cotangents: tuple[Tensor, ...]
+    v_images: tuple[Tensor, ...]
 
     def forward(self) -> tuple[Tensor, ...]:
         with torch.no_grad():
-            return self.draw()
+            return self.render()
 
     def forward_backward(self) -> tuple[Tensor, ...]:
-        return torch.autograd.grad(self.draw(), self.parameters, self.cotangents)
+        return torch.autograd.grad(self.render(), self.parameters, self.v_images)
 
     def forward_backward_on_one_thread(self) -> tuple[Tensor, ...]:
-        """The same without autograd's thread for the device, which costs waking up and cold caches."""
+        """The same without autograd's thread for the device, which has to wake up and starts with cold caches."""
         with torch.autograd.set_multithreading_enabled(False):
             return self.forward_backward()
 
 
 def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> Workload:
-    """This package's render with random cotangents, the same for every render of these images."""
+    """A render by this package, with random gradients that depend only on the sizes of its images."""
 
-    def draw() -> tuple[Tensor, ...]:
+    def run() -> tuple[Tensor, ...]:
         rendering = render(splats, camera, settings=settings)
         layers = [layer for layer in (rendering.joint, rendering.static, rendering.dynamic) if layer is not None]
         return tuple(t for layer in layers for t in (layer.image, layer.depth) if t is not None)
 
     with torch.no_grad():
-        images = draw()
+        images = run()
     generator = torch.Generator().manual_seed(SEED)
-    cotangents = tuple(torch.randn(image.shape, generator=generator).to(image.device) for image in images)
-    return Workload(draw, tuple(getattr(splats, name) for name in PARAMETERS), cotangents)
+    v_images = tuple(torch.randn(image.shape, generator=generator).to(image.device) for image in images)
+    return Workload(run, tuple(getattr(splats, name) for name in PARAMETERS), v_images)
 
 
 def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
-    """The same render by gsplat."""
+    """The render of ``ours`` by gsplat."""
     from gsplat import rasterization
 
     views, intrinsics = camera.viewmat[None], camera.K[None]
     mode = "RGB+ED" if depth else "RGB"
 
-    def draw() -> tuple[Tensor, ...]:
+    def run() -> tuple[Tensor, ...]:
         images, _, _ = rasterization(*ours.parameters, views, intrinsics, *camera.size, packed=False, render_mode=mode)
         return (images[0, ..., :-1], images[0, ..., -1]) if depth else (images[0],)
 
-    return Workload(draw, ours.parameters, ours.cotangents)
+    return Workload(run, ours.parameters, ours.v_images)

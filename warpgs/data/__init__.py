@@ -1,1 +1,1 @@
-"""Captures: what a camera filmed, with poses, masks and depth."""
+"""Captures: images of a dynamic scene with camera poses, masks, depth and sparse points."""

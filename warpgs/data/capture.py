@@ -1,8 +1,10 @@
-"""A capture: posed pictures of a moving scene, read frame by frame."""
+"""A capture: posed images of a dynamic scene, read frame by frame."""
 
+import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -11,20 +13,24 @@ from torch import Tensor
 from warpgs.cameras import Camera
 
 MIN_EXTENT = 0.05
-"""Keeps the rates of training above zero where the camera hardly moves; captures are normalised to about [-1, 1]."""
+"""Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
+
+Assumption = Literal["masks", "static", "dynamic"]
+"""What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture with all that is known of it, on the CPU.
+    """One image and everything that is known about it, on the CPU.
 
     Attributes:
-        name: Its id in the capture.
+        name: Id in the capture.
         camera: Undistorted pinhole camera in scene units, with the frame's time in [0, 1].
         image: [H, W, 3] 8-bit RGB.
-        static_mask: [H, W] true where the scene is static; None where the capture has no masks.
-        inverse_depth: [H, W] inverse depth up to a scale and an offset of this frame, NaN where unknown; None without.
-        covisible: [H, W] true where masked metrics look (iPhone captures); None without.
+        static_mask: [H, W] true where the scene is static; None if the frame has no mask.
+        inverse_depth: [H, W] inverse depth up to a scale and an offset per frame, NaN where unknown; None if the frame
+            has no depth.
+        covisible: [H, W] true where masked metrics are computed (iPhone captures); None if the frame has no such mask.
     """
 
     name: str
@@ -35,49 +41,56 @@ class Frame:
     covisible: Bool[Tensor, "H W"] | None = None
 
 
+@dataclass(eq=False)
 class Capture:
-    """A capture in scene units: positions are (p − center) · scale of the files.
+    """A capture in scene units: a position p of the files is (p − center) · scale.
 
     Attributes:
         name: For messages and reports.
-        train, val: Ids of the frames to train on and to evaluate on.
         cameras: The camera of each id of ``train`` and ``val``.
+        train, val: Ids of the frames to train on and to evaluate on.
         points: [P, 3] sparse static points, P may be 0.
-        point_colors: [P, 3] 8-bit RGB of the points; None where the capture has none.
-        extent: Radius of the training cameras' positions around their mean, times 1.1, at least 0.05: the unit of
-            3DGS's position learning rate and of its densification [scene units].
+        point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
+        read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
+        cache_frames: Number of frames to keep in memory.
+        assumption: What is taken as dynamic; see ``assuming``.
+        extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
+            unit of 3DGS's position learning rate and densification thresholds [scene units].
+
+    Raises:
+        ValueError: If there are no training frames.
     """
 
-    def __init__(
-        self,
-        name: str,
-        cameras: dict[str, Camera],
-        train: Sequence[str],
-        val: Sequence[str],
-        points: Float[Tensor, "P 3"],
-        point_colors: UInt8[Tensor, "P 3"] | None,
-        read: Callable[[str], Frame],
-        cache_frames: int = 256,
-    ) -> None:
-        """Keeps what is given; ``read`` is called for frames that are not among the last ``cache_frames``.
+    name: str
+    cameras: dict[str, Camera]
+    train: Sequence[str]
+    val: Sequence[str]
+    points: Float[Tensor, "P 3"]
+    point_colors: UInt8[Tensor, "P 3"] | None
+    read: Callable[[str], Frame]
+    cache_frames: int = 256
+    assumption: Assumption = field(default="masks", init=False)
+    extent: float = field(init=False)
 
-        Raises:
-            ValueError: If there is no frame to train on.
-        """
-        if not train:
-            raise ValueError(f"{name} has no frames to train on")
-        self.name = name
-        self.cameras = cameras
-        self.train = tuple(train)
-        self.val = tuple(val)
-        self.points = points
-        self.point_colors = point_colors
-        positions = torch.stack([cameras[name].position for name in train])
+    def __post_init__(self) -> None:
+        if not self.train:
+            raise ValueError(f"{self.name} has no frames to train on")
+        self.train, self.val = tuple(self.train), tuple(self.val)
+        positions = torch.stack([self.cameras[name].position for name in self.train])
         self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
-        self._read = lru_cache(maxsize=cache_frames)(read)
+        self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
+
+    def assuming(self, assumption: Assumption) -> "Capture":
+        """The same capture with static masks as in the files ("masks"), all true ("static") or all false ("dynamic").
+
+        The captures have one cache of frames. ``assuming("masks")`` restores the masks of the files for evaluation.
+        """
+        capture = copy.copy(self)
+        capture.assumption = assumption
+        return capture
 
     def frame(self, name: str) -> Frame:
-        """Reads a frame, or takes it from the cache of the last ``cache_frames`` read.
+        """A frame, from the cache if it is among the last ``cache_frames`` read.
 
         Raises:
             KeyError: If the capture has no frame of this id.
@@ -85,4 +98,7 @@ class Capture:
         """
         if name not in self.cameras:
             raise KeyError(name)
-        return self._read(name)
+        frame = self._cached(name)
+        if self.assumption == "masks":
+            return frame
+        return replace(frame, static_mask=torch.full(frame.image.shape[:2], self.assumption == "static"))

@@ -1,4 +1,4 @@
-"""Alignment of monocular depth: a scale and an offset of inverse depth for every frame (paper, Sec. DAP)."""
+"""Alignment of monocular depth: a scale and an offset of inverse depth per frame (paper, Sec. DAP)."""
 
 import torch
 from jaxtyping import Float
@@ -8,27 +8,27 @@ from warpgs.cameras import Camera
 from warpgs.kernels.constants import MIN_INVERSE_DEPTH
 
 REWEIGHTINGS = 50
-"""Rounds of iteratively reweighted least squares: with 30 % outliers the fit has settled by then."""
+"""Iterations of reweighted least squares; enough to converge with 30 % outliers."""
 
 MIN_SAMPLES = 16
-"""Samples under which a frame is not aligned and its depth not used."""
+"""Minimum number of samples; frames with fewer are not aligned and their depth is not used."""
 
 
 def fit_scale_offset(values: Float[Tensor, " S"], targets: Float[Tensor, " S"]) -> Float[Tensor, "2"]:
-    """(a, b) that minimise Σ |a · values + b − targets|.
+    """(a, b) that minimise Σ |a · values + b − targets|, by iteratively reweighted least squares in float64.
 
-    By iteratively reweighted least squares: each round solves the two normal equations in closed form with weights
-    1 / |residual|, so that points seen through other surfaces do not count. Float64 inside.
+    Each iteration solves the two normal equations in closed form with weights 1 / |residual|, so that outliers, such as
+    points hidden behind other surfaces, have little weight.
 
     Returns:
-        [2]; NaN if there are fewer than 16 samples, they all have one value, or the fit turns depth around (a ≤ 0).
+        [2]; NaN if there are fewer than ``MIN_SAMPLES``, all samples have the same value, or a ≤ 0.
     """
     nothing = values.new_full((2,), torch.nan)
     if values.shape[0] < MIN_SAMPLES:
         return nothing
     x, y = values.double(), targets.double()
     weights = torch.ones_like(x)
-    floor = 1e-4 * y.abs().median().clamp_min(1e-12)  # keeps the weight of a perfect sample finite
+    floor = 1e-4 * y.abs().median().clamp_min(1e-12)  # keeps the weight of an exact sample finite
     a = b = x.new_tensor(0.0)
     for _ in range(REWEIGHTINGS):
         total = weights.sum()
@@ -48,7 +48,7 @@ def align_to_points(
     camera: Camera,
     points: Float[Tensor, "P 3"],
 ) -> Float[Tensor, "2"]:
-    """Scale and offset of a frame's inverse depth against the sparse points that it sees in its static region."""
+    """Scale and offset that align a frame's inverse depth with the visible sparse points in its static region."""
     row, column, z, inside = camera.project(points)
     values = inverse_depth[row, column]
     known = inside & values.isfinite() & static[row, column]
@@ -61,12 +61,12 @@ def align_to_rendering(
     depth: Float[Tensor, "H W"],
     alpha: Float[Tensor, "H W"],
 ) -> Float[Tensor, "2"]:
-    """Scale and offset of a frame's inverse depth against the depth rendered of the static Gaussians."""
+    """Scale and offset that align a frame's inverse depth with the rendered depth of the static Gaussians."""
     known = static & inverse_depth.isfinite() & (alpha > 0.9) & (depth > 0)
     return fit_scale_offset(inverse_depth[known], 1.0 / depth[known])
 
 
 def metric_depth(inverse_depth: Float[Tensor, "H W"], alignment: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:
-    """Depth in scene units of an aligned frame; NaN where unknown, and where the alignment says at or past infinity."""
+    """Depth of an aligned frame [scene units]; NaN where unknown, or where aligned inverse depth is not positive."""
     aligned = alignment[0] * inverse_depth + alignment[1]
     return torch.where(aligned > MIN_INVERSE_DEPTH, 1.0 / aligned, torch.nan)

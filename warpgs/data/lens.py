@@ -1,6 +1,6 @@
-"""Straightening pictures: what a pinhole camera in the place of a real lens would have seen.
+"""Undistorting images: lens models, and the pinhole camera of the undistorted image.
 
-The files' camera (google/nerfies, camera.py), with x, y on the plane z = 1 and r² = x² + y²:
+The camera model of the files (google/nerfies, camera.py), with x, y on the plane z = 1 and r² = x² + y²:
 
     d  = 1 + k1 r² + k2 r⁴ + k3 r⁶
     x' = x d + 2 p1 x y + p2 (r² + 2 x²)
@@ -8,8 +8,8 @@ The files' camera (google/nerfies, camera.py), with x, y on the plane z = 1 and 
     u  = focal x' + cx
     v  = focal aspect y' + cy
 
-u, v are measured from the corner of the picture: Nerfies casts the ray of a pixel through its index + 0.5. So K is
-ours as it stands. OpenCV puts pixel centres at whole numbers, hence the − 0.5 in the maps.
+u, v are measured from the corner of the image: Nerfies casts the ray of a pixel through its index + 0.5, as we do, so K
+needs no conversion. OpenCV has pixel centres at integers, hence the − 0.5 in the maps.
 """
 
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
-STRONGEST_ZOOM = 2.0
-"""A lens that needs more to fill the straight picture is taken for a mistake in its file."""
+MAX_ZOOM = 2.0
+"""Maximum zoom of the undistorted image; distortion that needs more is considered an error in the file."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a file's camera.
+    """Intrinsics of a camera with distortion.
 
     Attributes:
-        width, height: Size of its pictures [px].
+        width, height: Size of the image [px].
         focal: (x, y) focal lengths [px].
-        center: (x, y) principal point from the corner [px].
-        radial: k1, k2, k3.
-        tangential: p1, p2.
+        center: (x, y) principal point from the corner of the image [px].
+        radial: Distortion coefficients k1, k2, k3.
+        tangential: Distortion coefficients p1, p2.
     """
 
     width: int
@@ -44,27 +44,27 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether it is a pinhole already."""
+        """Whether there is no distortion."""
         return not (any(self.radial) or any(self.tangential))
 
     def image(self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "2 ..."]:
-        """u, v of points on the plane z = 1 [px from the corner]."""
+        """Projects points on the plane z = 1 to u, v [px from the corner]."""
         k1, k2, k3 = self.radial
         p1, p2 = self.tangential
         r2 = x * x + y * y
         d = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        bent_x = x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        bent_y = y * d + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
-        return np.stack([self.focal[0] * bent_x + self.center[0], self.focal[1] * bent_y + self.center[1]])
+        distorted_x = x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        distorted_y = y * d + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
+        return np.stack([self.focal[0] * distorted_x + self.center[0], self.focal[1] * distorted_y + self.center[1]])
 
     def rays(
         self, zoom: float, u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """x, y on the plane z = 1 that a pinhole of ``zoom`` times the focal length shows at u, v."""
+        """x, y on the plane z = 1 that a pinhole camera with ``zoom`` times the focal length sees at u, v."""
         return (u - self.center[0]) / (zoom * self.focal[0]), (v - self.center[1]) / (zoom * self.focal[1])
 
-    def fills(self, zoom: float) -> bool:
-        """Whether every pixel of the straight picture lies on the lens's picture, which is not folded there."""
+    def covers(self, zoom: float) -> bool:
+        """Whether every pixel of an image undistorted with ``zoom`` has a source, and the distortion is invertible."""
         across, down = np.arange(self.width) + 0.5, np.arange(self.height) + 0.5
         left, top = np.full_like(down, 0.5), np.full_like(across, 0.5)
         border_u = np.concatenate([across, across, left, self.width - left])
@@ -74,33 +74,33 @@ class Lens:
         inside = (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
         k1, k2, k3 = self.radial
         r2 = np.linspace(0.0, float((x * x + y * y).max()), 64)
-        rising = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0  # d(r d)/dr: further out stays further
-        return bool(inside.all() and rising.all())
+        increasing = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0  # d(r d)/dr > 0
+        return bool(inside.all() and increasing.all())
 
 
 @lru_cache(maxsize=4096)
 def filling_zoom(lens: Lens) -> float:
-    """The least factor ≥ 1 on the focal length with which the straight picture has no pixel from outside the lens's.
+    """The smallest factor ≥ 1 on the focal length with which every pixel of the undistorted image has a source pixel.
 
-    Masks say static or dynamic, not unknown: pixels without truth would have to be learnt as one of both. A slightly
-    longer focal length leaves none, and costs a rim of the picture.
+    Masks say static or dynamic, not unknown, so pixels without a source would be learned as one of the two. A slightly
+    longer focal length avoids them and crops the border of the image.
 
     Raises:
-        ValueError: If that takes more than ``STRONGEST_ZOOM``.
+        ValueError: If the factor is larger than ``MAX_ZOOM``.
     """
-    if lens.is_pinhole or lens.fills(1.0):
+    if lens.is_pinhole or lens.covers(1.0):
         return 1.0
-    low, high = 1.0, STRONGEST_ZOOM
-    if not lens.fills(high):
-        raise ValueError(f"the distortion is too strong to straighten: {lens.radial}, {lens.tangential}")
+    low, high = 1.0, MAX_ZOOM
+    if not lens.covers(high):
+        raise ValueError(f"the distortion is too strong to undistort: {lens.radial}, {lens.tangential}")
     for _ in range(16):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if lens.fills(middle) else (middle, high)
+        low, high = (low, middle) if lens.covers(middle) else (middle, high)
     return high
 
 
 def pinhole_matrix(lens: Lens) -> Float[np.ndarray, "3 3"]:
-    """K of the straight pictures, pixel centres at +0.5.
+    """K of the undistorted images, pixel centres at +0.5.
 
     Raises:
         ValueError: If the distortion is too strong.
@@ -118,17 +118,19 @@ def _maps(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
 
-def undistort(picture: Shaped[np.ndarray, "H W ..."], lens: Lens) -> Shaped[np.ndarray, "H W ..."]:
-    """What the pinhole of ``pinhole_matrix`` sees; 8-bit pictures are interpolated, masks and depth are not mixed.
+def undistort(image: Shaped[np.ndarray, "H W ..."], lens: Lens) -> Shaped[np.ndarray, "H W ..."]:
+    """The image that the pinhole camera of ``pinhole_matrix`` sees.
+
+    Images are interpolated linearly; masks and depth take the nearest pixel.
 
     Args:
-        picture: [H, W, 3] 8-bit, [H, W] bool or [H, W] float as the lens took it.
-        lens: Its intrinsics.
+        image: [H, W, 3] 8-bit image, [H, W] bool mask or [H, W] float depth.
+        lens: Intrinsics of the image.
     """
     if lens.is_pinhole:
-        return picture
-    interpolation = cv2.INTER_LINEAR if picture.ndim == 3 else cv2.INTER_NEAREST
-    plane = picture.astype(np.uint8) if picture.dtype == bool else picture
-    # Repeating the border fills the outer half of its pixels, the only place the maps reach past pixel centres.
-    straight = cv2.remap(plane, *_maps(lens), interpolation, borderMode=cv2.BORDER_REPLICATE)
-    return straight.astype(picture.dtype)
+        return image
+    interpolation = cv2.INTER_LINEAR if image.ndim == 3 else cv2.INTER_NEAREST
+    source = image.astype(np.uint8) if image.dtype == bool else image
+    # The maps reach at most half a pixel beyond the centres of the border pixels; replicating the border covers that.
+    undistorted = cv2.remap(source, *_maps(lens), interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return undistorted.astype(image.dtype)

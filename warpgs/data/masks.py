@@ -1,4 +1,4 @@
-"""Damage to masks on purpose (paper, robustness under mask perturbations)."""
+"""Perturbation of training masks (paper, robustness under mask perturbations)."""
 
 import hashlib
 
@@ -9,58 +9,58 @@ from jaxtyping import Bool
 from warpgs.config import MaskPerturbation
 
 HOLE_RADIUS = 0.03
-"""Radius of a hole, as a share of the picture's height."""
+"""Radius of a hole as a fraction of the image height."""
 
-WIDEST = 256
-"""Pixels of erosion and dilation, at most."""
+MAX_RADIUS = 256
+"""Maximum radius of erosion and dilation [px]."""
 
 
 def check_perturbation(perturbation: MaskPerturbation) -> None:
-    """Raises ``ValueError`` if erosion, dilation or the share of holes is out of range."""
+    """Raises ``ValueError`` if erosion, dilation or the fraction of holes is out of range."""
     for name in ("erode", "dilate"):
-        if not 0 <= getattr(perturbation, name) <= WIDEST:
-            raise ValueError(f"masks: {name} must be 0 to {WIDEST} pixels, got {getattr(perturbation, name)}")
+        if not 0 <= getattr(perturbation, name) <= MAX_RADIUS:
+            raise ValueError(f"masks: {name} must be 0 to {MAX_RADIUS} pixels, got {getattr(perturbation, name)}")
     if not 0.0 <= perturbation.holes < 1.0:
-        raise ValueError(f"masks: holes must be a share in [0, 1), got {perturbation.holes}")
+        raise ValueError(f"masks: holes must be a fraction in [0, 1), got {perturbation.holes}")
 
 
 def perturb(static_mask: Bool[np.ndarray, "H W"], perturbation: MaskPerturbation, name: str) -> Bool[np.ndarray, "H W"]:
-    """A static mask whose dynamic region is eroded, dilated and then holed.
+    """The mask after its dynamic region is eroded, dilated and then perforated.
 
-    Holes are discs around random pixels of the dynamic region, until they cover ``holes`` of it; which ones depends on
-    the frame's name and region only. For training only: evaluation tells regions by the true masks.
+    Holes are discs around random pixels of the dynamic region until they cover the fraction ``holes`` of it; they
+    depend only on the mask and the name of the frame. For training only: evaluation uses the true masks.
 
     Args:
         static_mask: [H, W] true where static.
-        perturbation: What to do.
-        name: Of the frame, the seed of the holes.
+        perturbation: Sizes of the perturbation.
+        name: Id of the frame, the seed of the holes.
 
     Raises:
         ValueError: If the perturbation is out of range.
     """
     check_perturbation(perturbation)
-    moving = (~static_mask).astype(np.uint8)
+    dynamic = (~static_mask).astype(np.uint8)
     if perturbation.erode:
-        # What lies outside the picture counts as moving: an object that it cuts is not eroded along the cut.
-        moving = cv2.erode(moving, _disc(perturbation.erode), borderType=cv2.BORDER_CONSTANT, borderValue=1)
+        # Outside of the image counts as dynamic: objects are not eroded along the border of the image.
+        dynamic = cv2.erode(dynamic, _disc(perturbation.erode), borderType=cv2.BORDER_CONSTANT, borderValue=1)
     if perturbation.dilate:
-        moving = cv2.dilate(moving, _disc(perturbation.dilate))
-    if perturbation.holes and moving.any():
-        moving = _pierce(moving, perturbation.holes, name)
-    return moving == 0
+        dynamic = cv2.dilate(dynamic, _disc(perturbation.dilate))
+    if perturbation.holes and dynamic.any():
+        dynamic = _with_holes(dynamic, perturbation.holes, name)
+    return dynamic == 0
 
 
 def _disc(radius: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
 
 
-def _pierce(moving: np.ndarray, share: float, name: str) -> np.ndarray:
+def _with_holes(dynamic: np.ndarray, fraction: float, name: str) -> np.ndarray:
     seed = int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "big")
-    rows, columns = moving.nonzero()
-    radius = max(1, round(HOLE_RADIUS * moving.shape[0]))
-    pierced = moving.copy()
-    for place in np.random.default_rng(seed).permutation(len(rows)):
-        if pierced.sum() <= (1.0 - share) * len(rows):
+    rows, columns = dynamic.nonzero()
+    radius = max(1, round(HOLE_RADIUS * dynamic.shape[0]))
+    remaining = dynamic.copy()
+    for index in np.random.default_rng(seed).permutation(len(rows)):
+        if remaining.sum() <= (1.0 - fraction) * len(rows):
             break
-        cv2.circle(pierced, (int(columns[place]), int(rows[place])), radius, 0, thickness=-1)
-    return pierced
+        cv2.circle(remaining, (int(columns[index]), int(rows[index])), radius, 0, thickness=-1)
+    return remaining

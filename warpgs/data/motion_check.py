@@ -1,4 +1,4 @@
-"""Motion between two frames that their cameras do not explain, inside and outside of the mask."""
+"""Motion between two frames that their cameras do not explain, inside and outside the mask."""
 
 from dataclasses import dataclass
 
@@ -8,44 +8,45 @@ from jaxtyping import Float
 
 from .capture import Frame
 
-MIN_SIDE, FLATTEST = 16, 16
-"""Shorter side [px], and largest ratio of the sides: optical flow crashes on less."""
+MIN_SIDE, MAX_ASPECT = 16, 16
+"""Minimum side [px] and maximum ratio of the sides: OpenCV's optical flow crashes on images beyond them."""
 
-LONGEST_SIDE = 512
-"""Pictures are compared at this size [px]."""
+COMPARED_SIDE = 512
+"""Images are scaled down to this longer side [px]."""
 
 MIN_PIXELS = 200
+"""Minimum number of pixels of a median."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Median distances of pixels from their epipolar lines, textured pixels only [px].
+    """Median distances of textured pixels from their epipolar lines [px].
 
     Attributes:
-        static: Of pixels that the mask calls static.
-        moving: Of the others; None where there are too few.
+        static: Median of the pixels that the mask marks as static.
+        dynamic: Median of the other pixels; None if there are too few.
     """
 
     static: float
-    moving: float | None
+    dynamic: float | None
 
 
 def motion_between(first: Frame, second: Frame) -> Motion | None:
-    """Optical flow (DIS) from the first frame to the second against the epipolar lines of their cameras.
+    """Compares the optical flow (DIS) from the first frame to the second with the epipolar lines of their cameras.
 
     Returns:
-        None where too few pixels have texture, or the pictures are too flat for optical flow.
+        The motion; None if too few pixels have texture, or the images are too small for optical flow.
     """
     height, width = first.image.shape[:2]
-    factor = min(1.0, LONGEST_SIDE / max(height, width))
+    factor = min(1.0, COMPARED_SIDE / max(height, width))
     size = round(width * factor), round(height * factor)
     if min(size) < MIN_SIDE:
         return None
     a, b = (_grey(frame, size) for frame in (first, second))
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(a, b, None)
     distance = _epipolar_distance(first, second, flow)
-    slope = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
-    textured = slope > max(np.quantile(slope, 0.6), 8.0)
+    gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
+    textured = gradient > max(np.quantile(gradient, 0.6), 8.0)
     static = np.ones(a.shape, bool)
     if first.static_mask is not None:
         mask = first.static_mask.numpy().astype(np.uint8)
@@ -53,8 +54,8 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     values = [distance[textured & region] for region in (static, ~static)]
     if len(values[0]) < MIN_PIXELS:
         return None
-    moving = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
-    return Motion(float(np.median(values[0])), moving)
+    dynamic = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
+    return Motion(float(np.median(values[0])), dynamic)
 
 
 def _grey(frame: Frame, size: tuple[int, int]) -> np.ndarray:
@@ -73,12 +74,12 @@ def _epipolar_distance(first: Frame, second: Frame, flow: Float[np.ndarray, "H W
     t = relative[:3, 3]
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x, y, np.ones_like(x)], -1)
-    there = pixels[..., :2] + flow
+    target = pixels[..., :2] + flow
     rotated = pixels @ (matrices[1] @ relative[:3, :3] @ np.linalg.inv(matrices[0])).T
-    if np.linalg.norm(t) < 1e-6:  # the camera has only turned: every pixel's place is known
-        return np.linalg.norm(there - rotated[..., :2] / rotated[..., 2:], axis=-1)
+    if np.linalg.norm(t) < 1e-6:  # pure rotation: the position of every pixel is known
+        return np.linalg.norm(target - rotated[..., :2] / rotated[..., 2:], axis=-1)
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     essential = cross @ relative[:3, :3]
     lines = pixels @ (np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])).T
     norm = np.maximum(np.hypot(lines[..., 0], lines[..., 1]), 1e-12)
-    return np.abs(lines[..., 0] * there[..., 0] + lines[..., 1] * there[..., 1] + lines[..., 2]) / norm
+    return np.abs(lines[..., 0] * target[..., 0] + lines[..., 1] * target[..., 1] + lines[..., 2]) / norm

@@ -7,20 +7,21 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .reading import read_array
+from warpgs.files import read_array
+
 from .units import SceneUnits
 
 MAX_POINTS = 50_000_000
-"""More are refused: a header may claim anything."""
+"""Maximum number of points, because the header of a file may claim any number."""
 
 
 def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"] | None]:
-    """Points in scene units and their colours, from points.npy or else from a COLMAP model in sparse/0.
+    """Points in scene units and their colours, from points.npy (without colours) or else a COLMAP model in sparse/0.
 
-    points.npy has no colours. Without either there are no points.
+    A capture that has neither has zero points.
 
     Raises:
-        ValueError: If the file is damaged or holds no finite points.
+        ValueError: If the file is damaged, empty or has points that are not finite.
     """
     path, model = root / "points.npy", root / "sparse" / "0"
     colors = None
@@ -37,12 +38,12 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
 
 
 def _read_colmap(model: Path) -> tuple[np.ndarray, Tensor]:
-    import pycolmap  # takes a fifth of a second, and captures with points.npy do without
+    import pycolmap  # takes 0.2 s, and only captures without points.npy need it
 
     try:
         found = [p for _, p in sorted(pycolmap.Reconstruction(str(model)).points3D.items())]
     except (ValueError, RuntimeError, IndexError) as error:
-        raise ValueError(f"{model} is no COLMAP model: {error}") from error
+        raise ValueError(f"{model} is not a COLMAP model: {error}") from error
     points = np.array([p.xyz for p in found], dtype=np.float64).reshape(-1, 3)
     colors = np.array([p.color for p in found], dtype=np.uint8).reshape(-1, 3)
     return points, torch.from_numpy(colors)

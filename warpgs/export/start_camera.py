@@ -52,7 +52,7 @@ def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
         chosen = camera_paths.evenly_spaced_indices(len(names), NUM_SAMPLES)
         return [capture.cameras[names[k]] for k in chosen]
     times = camera_paths.evenly_spaced(NUM_SAMPLES)
-    scene = camera_paths.Ball.around(_means(clouds.at(0.5)))
+    scene = camera_paths.BoundingSphere.around(_means(clouds.at(0.5)))
     return [camera_paths.default_camera(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
 
 
@@ -68,7 +68,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
     cloud = clouds.at(0.5)
     cloud = cloud.select(cloud.finite)
     track: list[Camera] = []
-    camera = camera_paths.default_camera(camera_paths.Ball.around(_means(cloud)))
+    camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
     if capture is not None:
         names = capture.val or capture.train
         camera, track = capture.cameras[names[len(names) // 2]], camera_paths.training_path(capture, keys)

@@ -1,1 +1,1 @@
-"""What is trained: Gaussians, static and dynamic, and the two networks."""
+"""The trained scene: static and dynamic Gaussians and the two networks."""

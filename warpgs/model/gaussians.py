@@ -1,4 +1,4 @@
-"""Gaussians as the optimizer holds them."""
+"""Gaussians as they are optimized."""
 
 import torch
 from jaxtyping import Float, Int64
@@ -7,24 +7,25 @@ from torch import Tensor, nn
 from warpgs.ops.activation import Raw
 
 MAX_SH_DEGREE = 3
-"""Highest degree of spherical harmonics that the kernels know."""
+"""Maximum degree of spherical harmonics that the kernels support."""
 
 SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 · coefficient."""
+"""Value of the spherical harmonic of degree 0: colour = 0.5 + SH_C0 · coefficient."""
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest")
+"""Names of the parameters of ``Gaussians``."""
 
 
 class Gaussians(nn.Module):
-    """N Gaussians in raw form: unconstrained values, activated where they are used.
+    """N Gaussians as unconstrained parameters, activated where they are used.
 
     Attributes:
         means: [N, 3] positions.
-        quats: [N, 4] rotations (w, x, y, z), not normalised.
+        quats: [N, 4] rotations (w, x, y, z), not normalized.
         log_scales: [N, 3] logarithms of the standard deviations.
         logit_opacities: [N] logits of the opacities.
-        sh_dc: [N, 1, 3] constant coefficients of the colour.
-        sh_rest: [N, 0 | 3 | 8 | 15, 3] the other coefficients, of degrees 1 to 0 | 1 | 2 | 3.
+        sh_dc: [N, 1, 3] SH coefficients of degree 0.
+        sh_rest: [N, 0 | 3 | 8 | 15, 3] SH coefficients of degrees 1 to 0 | 1 | 2 | 3.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class Gaussians(nn.Module):
         opacity: float,
         sh_degree: int = MAX_SH_DEGREE,
     ) -> "Gaussians":
-        """Round Gaussians at points, of standard deviations ``scales``, colours in [0, 1] and one opacity."""
+        """Isotropic Gaussians at points, with standard deviations ``scales``, colours in [0, 1] and one opacity."""
         N = points.shape[0]
         quats = points.new_zeros(N, 4)
         quats[:, 0] = 1.0
@@ -67,7 +68,7 @@ class Gaussians(nn.Module):
 
     @staticmethod
     def empty(num: int, sh_degree: int = MAX_SH_DEGREE) -> "Gaussians":
-        """``num`` Gaussians of no particular value, to load others into."""
+        """``num`` Gaussians with arbitrary values, to load a state into."""
         return Gaussians.from_points(torch.zeros(num, 3), torch.zeros(num, 3), torch.ones(num), 0.5, sh_degree)
 
     def __len__(self) -> int:
@@ -86,14 +87,17 @@ class Gaussians(nn.Module):
         return torch.cat([self.sh_dc, self.sh_rest], 1)
 
     def raw(self) -> Raw:
-        """The parameters as the op that activates them wants them."""
+        """The parameters as arguments of ``ops.activation``."""
         return Raw(self.means, self.quats, self.log_scales, self.logit_opacities, self.sh_dc, self.sh_rest)
 
     @torch.no_grad()
     def gather(self, parents: Int64[Tensor, " M"]) -> None:
-        """Replaces the Gaussians by copies of ``parents``: the one way in which their number changes.
+        """Replaces the Gaussians by copies of ``parents``; nothing else changes their number.
 
-        Gradients are dropped; an optimizer follows by ``optim.gather``.
+        Gradients are dropped. ``training.optimizer.gather`` also updates the optimizer's state.
+
+        Args:
+            parents: [M] indices of Gaussians.
         """
         for parameter in self.parameters():
             parameter.data = parameter.data[parents]

@@ -1,4 +1,4 @@
-"""The scene of the paper: static Gaussians whose appearance changes, dynamic ones that move (Eq. 5)."""
+"""The scene of the paper: static Gaussians whose appearance changes, dynamic Gaussians that are deformed (Eq. 5)."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,8 @@ from warpgs.config import ModelConfig
 from warpgs.ops.activation import Changes, activate, join_sh
 from warpgs.runtime.streams import join, on_side_stream
 
-from .fields import AppearanceField, DeformationField
+from .appearance import AppearanceField
+from .fields import make_deformation
 from .gaussians import Gaussians
 from .splats import Splats
 
@@ -16,11 +17,19 @@ from .splats import Splats
 class SplitScene(nn.Module):
     """G_s ∪ G_d with their networks (paper Eq. 5).
 
+    Args:
+        static, dynamic: The Gaussians of the two branches.
+        config: Which networks, and their sizes.
+        center, half_size: [3] box of the scene, by which the networks normalize positions.
+
     Attributes:
-        static: Gaussians of fixed geometry; w⁰ of Eq. 8 is their own appearance.
-        dynamic: Gaussians in canonical space, of fixed appearance.
+        static: Gaussians of constant geometry; w⁰ of Eq. 8 is their own appearance.
+        dynamic: Gaussians in canonical space, of constant appearance.
         deformation: F_θ of Eq. 10.
         appearance: MLP_app of Eq. 8.
+
+    Raises:
+        ValueError: If there is no deformation model of the configured name.
     """
 
     def __init__(
@@ -34,49 +43,49 @@ class SplitScene(nn.Module):
         super().__init__()
         self.static = static
         self.dynamic = dynamic
-        self.deformation = DeformationField(config, center, half_size)
+        self.deformation = make_deformation(config, center, half_size)
         self.appearance = AppearanceField(config, center, half_size)
 
     @staticmethod
     def empty(num_static: int, num_dynamic: int, config: ModelConfig) -> "SplitScene":
-        """A scene of no particular values, to load a checkpoint into."""
+        """A scene with arbitrary values, to load a checkpoint into."""
         static, dynamic = (Gaussians.empty(num, config.sh_degree) for num in (num_static, num_dynamic))
         return SplitScene(static, dynamic, config, torch.zeros(3), torch.ones(3))
 
     def splats(
         self,
         time: Float[Tensor, "1"],
-        moving: bool = True,
-        relit: bool = True,
+        use_deformation: bool = True,
+        use_appearance: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, "1"] | None = None,
         late_sh: bool = False,
     ) -> Splats:
-        """The scene at a moment, static Gaussians first.
+        """The activated Gaussians at a time, static ones first.
 
         Args:
-            time: Moment in [0, 1].
-            moving: Whether the deformation network moves the dynamic Gaussians (paper Eq. 11).
-            relit: Whether the appearance network changes the static ones (paper Eq. 8).
-            sh_degree: Highest degree of spherical harmonics in use; all that there are if None.
-            time_noise: Added to the time that the deformation network sees (Deformable-3DGS, annealed smoothing).
-            late_sh: Whether ``sh`` may still be on its way on ``sh_stream``, for ``render`` to wait for; ``time`` must
+            time: Time in [0, 1].
+            use_deformation: Whether the deformation network deforms the dynamic Gaussians (paper Eq. 11).
+            use_appearance: Whether the appearance network changes the static ones (paper Eq. 8).
+            sh_degree: Maximum degree of spherical harmonics to use; all if None.
+            time_noise: Added to the time that the deformation network sees (annealed smoothing of Deformable-3DGS).
+            late_sh: Whether ``sh`` may still be computed on ``sh_stream``, for which ``render`` waits; ``time`` must
                 stay alive until then.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = None
         with on_side_stream(device) as stream:
-            if relit and len(static):
+            if use_appearance and len(static):
                 residuals, logit_residuals = self.appearance(static.means, time)
             sh = join_sh(static.raw(), dynamic.raw(), residuals)
         offsets = None
-        if moving and len(dynamic):
+        if use_deformation and len(dynamic):
             offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
         if not late_sh or logit_residuals is not None:
             join(stream)
             stream = None
-        relit_by, moved_by = Changes(logit_residuals=logit_residuals), Changes(offsets)
-        geometry = activate(static.raw(), dynamic.raw(), relit_by, moved_by)
+        static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
+        geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
         return Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, sh_stream=stream)
 

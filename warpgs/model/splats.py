@@ -18,15 +18,15 @@ class Splats:
 
     Attributes:
         means: [N, 3] centres.
-        quats: [N, 4] rotations (w, x, y, z), of any length but zero.
+        quats: [N, 4] rotations (w, x, y, z) of any length but zero.
         scales: [N, 3] standard deviations along the Gaussians' own axes.
         opacities: [N] in [0, 1].
-        colors: [N, C] features to blend as they are, any number of channels.
+        colors: [N, C] features that are blended directly, any number of channels.
         sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
-        sh_degree: Highest degree of ``sh`` to use; all by default.
-        sh_stream: CUDA stream that ``sh`` is still being computed on; ``render`` waits for it where it needs colours.
-            None if it is there, or as soon as the current stream comes to it.
+        sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
+        sh_stream: CUDA stream on which ``sh`` may still be computed, which ``render`` joins before it reads ``sh``;
+            None if ``sh`` is computed on the current stream.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -62,14 +62,16 @@ class Splats:
 
     @staticmethod
     def tensor_names() -> tuple[str, ...]:
+        """Names of the attributes that are tensors."""
         return ("means", "quats", "scales", "opacities", "colors", "sh", "is_dynamic")
 
     @property
     def num_channels(self) -> int:
-        """Channels of an image of these splats."""
+        """Number of channels of an image of these splats."""
         return 3 if self.colors is None else self.colors.shape[1]
 
     def to(self, device: torch.device | str) -> "Splats":
+        """A copy on another device."""
         join(self.sh_stream)
-        moved = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
-        return dataclasses.replace(self, **moved, sh_stream=None)
+        tensors = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
+        return dataclasses.replace(self, **tensors, sh_stream=None)

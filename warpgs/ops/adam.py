@@ -4,22 +4,21 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from warpgs.kernels import adam as kernels
-from warpgs.runtime.tape import Run
+from warpgs.runtime.tape import OpContext
 
 
 class Adam(torch.optim.Optimizer):
-    """Adam, as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, in one small launch for each parameter.
+    """Adam as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, with one launch for each parameter.
 
-    Torch's own hands each of its blocks 65,536 numbers, so that a set of Gaussians keeps only a few of them busy. All
-    that changes between steps is on the device, so that a step can be part of a CUDA graph.
+    Torch's kernel gives each CUDA block 65,536 numbers, so that the parameters of the Gaussians occupy only a few
+    blocks. All state that changes between steps is on the device, so that a step can be part of a CUDA graph.
 
     Args:
-        groups: Each with ``params`` and ``lr``, a tensor of one number that is read anew in every step.
-        betas: Decay rates of the moments.
-        epsilon: Added to the root of the second moment.
+        groups: Parameter groups with ``params`` and ``lr``, a tensor of one element that every step reads.
+        betas: Decay rates of the first and of the second moment.
+        epsilon: Added to the square root of the second moment.
     """
 
     def __init__(self, groups: list[dict[str, Any]], betas: tuple[float, float], epsilon: float) -> None:
@@ -27,7 +26,7 @@ class Adam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Changes every parameter that has a gradient."""
+        """Updates every parameter that has a gradient; ``closure`` is not used."""
         trained = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
         if not trained:
             return
@@ -38,23 +37,19 @@ class Adam(torch.optim.Optimizer):
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
         torch._foreach_add_([self.state[parameter]["step"] for _, parameter in trained], 1.0)
-        run = Run(trained[0][1].device, [])
+        ctx = OpContext(trained[0][1].device, [])
         for group, parameter in trained:
             state = self.state[parameter]
             betas = [value for beta in group["betas"] for value in (beta, 1.0 - beta, math.log(beta))]
-            run.launch(
+            ctx.launch(
                 kernels.adam_step,
                 parameter.numel(),
                 parameter.grad.contiguous().view(-1),
-                _one(group["lr"]),
-                _one(state["step"]),
+                group["lr"].view(1),
+                state["step"].view(1),
                 *betas,
                 group["eps"],
                 parameter.view(-1),
                 state["exp_avg"].view(-1),
                 state["exp_avg_sq"].view(-1),
             )
-
-
-def _one(value: Tensor) -> Tensor:
-    return value.view(1)

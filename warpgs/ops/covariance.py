@@ -5,11 +5,11 @@ from torch import Tensor
 
 from warpgs.kernels import covariance as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import Run, adjoint_launch, differentiable
+from warpgs.runtime.tape import OpContext, differentiable, launch_with_generated_adjoint
 
 
 def covariance(quats: Float[Tensor, "N 4"], scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
-    """Σ = R diag(s)² Rᵀ, differentiable in both.
+    """Σ = R diag(s)² Rᵀ, differentiable in both (3DGS, Eq. 6).
 
     Args:
         quats: [N, 4] as (w, x, y, z), of any length; a zero quaternion gives a zero covariance.
@@ -26,9 +26,9 @@ def covariance(quats: Float[Tensor, "N 4"], scales: Float[Tensor, "N 3"]) -> Flo
     check_tensor("scales", scales, ("N", 3), sizes)
     check_same_device({"quats": quats, "scales": scales})
 
-    def op(run: Run, quats: Tensor, scales: Tensor) -> tuple[Tensor, ...]:
-        covariances = run.zeros(quats.shape[0], 3, 3)
-        adjoint_launch(run, kernels.covariance, quats.shape[0], [quats, scales], [covariances])
+    def op(ctx: OpContext, quats: Tensor, scales: Tensor) -> tuple[Tensor, ...]:
+        covariances = ctx.zeros(quats.shape[0], 3, 3)
+        launch_with_generated_adjoint(ctx, kernels.covariance, quats.shape[0], [quats, scales], [covariances])
         return (covariances,)
 
     return differentiable(op, quats, scales)[0]

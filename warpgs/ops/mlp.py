@@ -1,10 +1,12 @@
-"""A multilayer perceptron with its own way back: few launches, few passes over memory, half precision where it is fast.
+"""Multilayer perceptron with a hand-written backward pass and optional half precision (kernels/mlp.py).
 
-Layer k computes h_{k+1} = max(0, W_k x_k + b_k) in one call, the last one without max, where x_k is h_k and, where the
-encoding e enters, [h_k, e]. Room for h beside e is left in the tensor that e comes in. On the way back
-g_k = (g_{k+1} W_k) · [h_k > 0]; the gradients of W_k and b_k are g_{k+1}ᵀ x_k and the sum of g_{k+1}.
+Layer k computes h_{k+1} = max(0, W_k x_k + b_k) in one call, the last layer without max. Its input x_k is h_k or, for
+the first layer and the skip connection, the encoding e or [h_k, e]; the tensor of e has free columns for h_k. The
+backward pass is g_k = (g_{k+1} W_k) · [h_k > 0]; the gradients of W_k and b_k are g_{k+1}ᵀ x_k and the sum of g_{k+1}
+over its rows.
 
-All weights and biases are one tensor, and so are their gradients: what is done to all of them is done in one launch.
+All weights and biases are views of one tensor, and so are their gradients, so that an operation on all of them is one
+launch.
 """
 
 from collections.abc import Sequence
@@ -12,19 +14,28 @@ from itertools import chain
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float16, Float32
 from torch import Tensor
 
+from warpgs.kernels import mlp as kernels
+from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.tape import OpContext
+
 from .encoding import ALIGNMENT
-from .relu import num_sums, relu_backward
 
 MAX_GRADIENT = 1024.0
-"""In half precision gradients are scaled until the largest one at the output has this size: far enough from the largest
-number, 65504, and with 34 bits below it until a gradient becomes zero."""
+"""In half precision, gradients are scaled so that the largest one at the output has this magnitude: far enough below
+the largest number, 65504, and with 34 bits until a gradient underflows."""
+
+MAX_CHUNKS = 4096
+"""Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
+
+ROWS_PER_CHUNK = 4
+"""Minimum number of rows of a partial sum."""
 
 
 class Layer(NamedTuple):
-    """One layer's part of the one tensor.
+    """Parameters of one layer, as views.
 
     Attributes:
         weight: [rows, columns].
@@ -36,12 +47,12 @@ class Layer(NamedTuple):
 
 
 def num_values(shapes: Sequence[tuple[int, int]]) -> int:
-    """Weights and biases of layers whose weights have these shapes."""
+    """Number of weights and biases of layers whose weights have these shapes."""
     return sum(rows * columns + rows for rows, columns in shapes)
 
 
 def split(values: Float[Tensor, " values"], shapes: Sequence[tuple[int, int]]) -> list[Layer]:
-    """The layers, as views: in memory the weights of all of them come first, then all biases."""
+    """The layers as views of ``values``, which has the weights of all layers first, then all biases."""
     rows = [r for r, _ in shapes]
     *weights, biases = values.split([r * c for r, c in shapes] + [sum(rows)])
     pairs = zip(weights, biases.split(rows), shapes, strict=True)
@@ -55,25 +66,24 @@ def perceptron(
     skip: int,
     num_outputs: int,
 ) -> Float[Tensor, "N outputs"]:
-    """Runs the layers. No gradient flows to ``inputs``.
+    """Evaluates the layers; differentiable in ``values`` only.
 
     Args:
-        inputs: [N, R + E] whose last E columns are the encoding that the first layer reads; the first R are overwritten
-            by the features that enter layer ``skip`` beside it, R of them, 0 without ``skip``. If it has half
-            precision, so have all factors of products; sums, gradients of ``values`` and the result are single
-            precision.
-        values: Weights and biases, as ``split`` finds them.
-        shapes: Of the weights: [width, E], [width, width] …; the one at ``skip`` is [width, R + E], the last one has
-            ``num_outputs`` rows or more. In half precision all numbers are multiples of 8, and hidden layers have
-            one width.
-        skip: Index of the layer that reads the encoding again, after its features; 0 if none does.
-        num_outputs: Rows of the last layer that count; what the others give is left out.
+        inputs: [N, R + E] whose last E columns are the encoding, the input of the first layer; the first R columns are
+            overwritten by the input features of layer ``skip``; R = 0 without ``skip``. If it is half precision, all
+            matrix factors are, too; sums, gradients of ``values`` and the result are single precision.
+        values: Weights and biases in the layout of ``split``.
+        shapes: Of the weights: [width, E], [width, width] …; that of layer ``skip`` is [width, R + E], and the last
+            one has at least ``num_outputs`` rows. In half precision all sizes must be multiples of 8, and all hidden
+            layers must have the same width.
+        skip: Index of the layer that reads the encoding again, after its features; 0 for none.
+        num_outputs: Number of rows of the last layer to return; the others are padding.
 
     Returns:
         [N, num_outputs].
 
     Raises:
-        ValueError: In half precision, unless the numbers are such.
+        ValueError: If the sizes do not fit half precision.
     """
     if inputs.dtype == torch.float16 and any(number % ALIGNMENT for number in chain([inputs.shape[1]], *shapes)):
         raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(shapes)}")
@@ -88,22 +98,22 @@ class _Perceptron(torch.autograd.Function):
         copy = values.to(inputs.dtype)
         *hidden, head = split(copy, shapes)
         x = inputs[:, inputs.shape[1] - shapes[0][1] :]
-        read = []
+        layer_inputs = []
         for k, layer in enumerate(hidden):
             if skip and k == skip:
-                # A product that wrote here by itself would need two more passes, for the bias and for max.
-                _in_pieces(inputs)[:, : _in_pieces(x).shape[1]] = _in_pieces(x)
+                # Writing the product here directly would need two more passes, for the bias and for max.
+                _copy_columns(x, inputs)
                 x = inputs
-            read.append(x)
+            layer_inputs.append(x)
             x = torch._addmm_activation(layer.bias, x, layer.weight.t())
-        ctx.save_for_backward(*read, x, copy)
+        ctx.save_for_backward(*layer_inputs, x, copy)
         ctx.shapes = shapes
         bias = split(values, shapes)[-1].bias[:num_outputs]
         return _product(x, head.weight.t())[:, :num_outputs] + bias
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        *read, copy = ctx.saved_tensors
+        *layer_inputs, copy = ctx.saved_tensors
         layers = split(copy, ctx.shapes)
         is_half = copy.dtype == torch.float16
         v_values = torch.empty_like(copy, dtype=gradient.dtype)
@@ -116,13 +126,13 @@ class _Perceptron(torch.autograd.Function):
         else:
             gradient = torch.nn.functional.pad(gradient, (0, num_padding))
         for k in reversed(range(len(layers))):
-            _product(gradient.t(), read[k], v_layers[k].weight)
+            _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0:
                 gradient = torch.mm(gradient, layers[k].weight[:, : len(layers[k - 1].bias)])
                 if is_half:
-                    relu_backward(read[k], gradient, sums[k - 1])
+                    relu_backward(layer_inputs[k], gradient, sums[k - 1])
                 else:
-                    features = read[k][:, : gradient.shape[1]]
+                    features = layer_inputs[k][:, : gradient.shape[1]]
                     torch.ops.aten.threshold_backward(gradient, features, 0, grad_input=gradient)
                     torch.sum(gradient, 0, out=v_layers[k - 1].bias)
         if is_half:
@@ -134,8 +144,8 @@ class _Perceptron(torch.autograd.Function):
 
 
 def _scaled(gradient: Tensor, columns: int) -> tuple[Tensor, Tensor]:
-    """The gradient at the output in half precision, with zeros up to ``columns``, and what undoes its scale."""
-    # With a row of zeros, because of no rows at all there is no largest.
+    """The output's gradient in half precision, scaled and padded to ``columns``, and the inverse of the scale."""
+    # A row of zeros is appended because the maximum of no rows is undefined.
     largest = torch.linalg.vector_norm(torch.nn.functional.pad(gradient, (0, 0, 0, 1)), torch.inf)
     largest = largest.clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
     scaled = gradient.new_zeros(len(gradient), columns, dtype=torch.float16)
@@ -143,15 +153,54 @@ def _scaled(gradient: Tensor, columns: int) -> tuple[Tensor, Tensor]:
     return scaled, largest / MAX_GRADIENT
 
 
-def _in_pieces(matrix: Tensor) -> Tensor:
-    """Seen as numbers of 16 bytes, which are copied faster, where rows are made of such."""
-    return matrix.view(torch.complex128) if matrix.shape[1] * matrix.element_size() % 16 == 0 else matrix
+def _copy_columns(source: Tensor, target: Tensor) -> None:
+    """Copies ``source`` to the first columns of ``target``, in elements of 16 bytes if possible, which is faster."""
+    if all(matrix.shape[1] * matrix.element_size() % 16 == 0 for matrix in (source, target)):
+        source, target = source.view(torch.complex128), target.view(torch.complex128)
+    target[:, : source.shape[1]] = source
 
 
 def _product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
-    """The product in single precision."""
+    """The matrix product in single precision."""
     if a.dtype != torch.float16:
         return torch.mm(a, b, out=out)
     if out is None:
         return torch.mm(a, b, out_dtype=torch.float32)
     return torch.ops.aten.mm.dtype_out(a, b, torch.float32, out=out)
+
+
+def num_sums(num_rows: int) -> int:
+    """Number of partial sums that ``relu_backward`` writes for a number of rows."""
+    return min(MAX_CHUNKS, -(-num_rows // ROWS_PER_CHUNK))
+
+
+def relu_backward(
+    features: Float16[Tensor, "N read"],
+    gradients: Float16[Tensor, "N columns"],
+    sums: Float32[Tensor, "chunks columns"],
+) -> None:
+    """Sets gradients to zero, in place, where features are not positive, and sums them over the rows.
+
+    Args:
+        features: [N, ≥ columns] output of ReLU, in the first columns.
+        gradients: [N, columns] its gradient; the number of columns is a multiple of 8.
+        sums: [num_sums(N), columns] output: partial sums of the masked gradients, whose sum over the first axis is the
+            gradient of the bias.
+
+    Raises:
+        ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
+    """
+    sizes: dict[str, int] = {"chunks": num_sums(len(gradients))}
+    check_tensor("features", features, ("N", "read"), sizes, (torch.float16,))
+    check_tensor("gradients", gradients, ("N", "columns"), sizes, (torch.float16,))
+    check_tensor("sums", sums, ("chunks", "columns"), sizes)
+    check_same_device({"features": features, "gradients": gradients, "sums": sums})
+    columns = gradients.shape[1]
+    if columns % kernels.PIECE or columns > features.shape[1]:
+        raise ValueError(
+            f"gradients must have a multiple of {kernels.PIECE} columns, "
+            f"{features.shape[1]} at most as features have, got {columns}"
+        )
+    ctx = OpContext(gradients.device, [])
+    pieces = columns // kernels.PIECE
+    ctx.launch(kernels.relu_bwd, len(sums) * pieces, features, gradients, sums, work=ROWS_PER_CHUNK)

@@ -8,17 +8,48 @@ from torch import Tensor, int32
 from warpgs.config import RenderSettings
 from warpgs.kernels import projection as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
-from warpgs.runtime.tape import Run, differentiable
+from warpgs.runtime.tape import OpContext, differentiable
+
+
+class Geometry(NamedTuple):
+    """Where N Gaussians are and how opaque they are.
+
+    Attributes:
+        means: [N, 3] centres in the world.
+        quats: [N, 4] rotations (w, x, y, z) of any length but zero.
+        scales: [N, 3] standard deviations along the Gaussians' own axes.
+        opacities: [N] in [0, 1].
+    """
+
+    means: Float[Tensor, "N 3"]
+    quats: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+
+
+class View(NamedTuple):
+    """A pinhole camera.
+
+    Attributes:
+        viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
+        K: [3, 3] intrinsics [px] with pixel centres at +0.5; skew is not used.
+        width, height: Size of the image [px].
+    """
+
+    viewmat: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    width: int
+    height: int
 
 
 class Projection(NamedTuple):
-    """N Gaussians as a camera sees them; everything is zero for a culled one.
+    """N Gaussians as a camera sees them; all values of a culled Gaussian are zero.
 
     Attributes:
         means2d: [N, 2] centres [px], x right, y down, pixel centres at +0.5.
         conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] camera-space z, in scene units.
-        opacities: [N] in [0, 1], compensated for the low-pass filter where that was asked for.
+        depths: [N] z in camera space [scene units].
+        opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
         radii: [N, 2] int32 half sizes of the box outside which alpha is below 1/255 [px]; 0 = culled.
     """
 
@@ -29,27 +60,15 @@ class Projection(NamedTuple):
     radii: Int32[Tensor, "N 2"]
 
 
-def record_projection(
-    run: Run,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    size: tuple[int, int],
-    near: float,
-    antialias: bool,
-) -> Projection:
-    """``project`` as a step of a run; ``size`` is (width, height)."""
-    N = means.shape[0]
-    width, height = size
-    splats = Projection(run.empty(N, 2), run.empty(N, 3), run.empty(N), run.empty(N), run.empty(N, 2, dtype=int32))
-    geometry = (means, quats, scales, opacities, viewmat, K, width, height)
-    run.launch(
+def record_projection(ctx: OpContext, geometry: Geometry, view: View, near: float, antialias: bool) -> Projection:
+    """``project`` as a part of a larger op, without checks."""
+    N = len(geometry.means)
+    splats = Projection(ctx.empty(N, 2), ctx.empty(N, 3), ctx.empty(N), ctx.empty(N), ctx.empty(N, 2, dtype=int32))
+    ctx.launch(
         kernels.project_fwd,
         N,
         *geometry,
+        *view,
         near,
         int(antialias),
         splats.means2d,
@@ -59,58 +78,29 @@ def record_projection(
         splats.opacities,
     )
 
-    def backward(run: Run) -> None:
-        cotangents = [run.adjoint(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
-        inputs = (means, quats, scales, opacities)
-        gradients = [run.empty(*t.shape) for t in inputs]
-        run.launch(
-            kernels.project_bwd, N, *geometry, int(antialias), splats.conics, splats.radii, *cotangents, *gradients
-        )
-        for tensor, gradient in zip(inputs, gradients, strict=True):
-            run.add_adjoint(tensor, gradient)
+    def backward(ctx: OpContext) -> None:
+        v_splats = [ctx.gradient(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
+        v_geometry = [ctx.empty(*t.shape) for t in geometry]
+        inputs = (*geometry, *view, int(antialias), splats.conics, splats.radii)
+        ctx.launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry)
+        for tensor, gradient in zip(geometry, v_geometry, strict=True):
+            ctx.add_gradient(tensor, gradient)
 
-    run.on_backward(backward, reads=(splats.conics, splats.radii))
+    ctx.on_backward(backward, reads=(splats.conics, splats.radii))
     return splats
 
 
-def check_geometry(
-    sizes: dict[str, int], means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor
-) -> None:
-    """Raises ``ValueError`` unless the tensors describe Gaussians and a camera on one device."""
-    check_tensor("means", means, ("N", 3), sizes)
-    check_tensor("quats", quats, ("N", 4), sizes)
-    check_tensor("scales", scales, ("N", 3), sizes)
-    check_tensor("opacities", opacities, ("N",), sizes)
-    check_tensor("viewmat", viewmat, (4, 4), sizes)
-    check_tensor("K", K, (3, 3), sizes)
-    check_same_device(
-        {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "viewmat": viewmat, "K": K}
-    )
-
-
 def project(
-    means: Float[Tensor, "N 3"],
-    quats: Float[Tensor, "N 4"],
-    scales: Float[Tensor, "N 3"],
-    opacities: Float[Tensor, " N"],
-    viewmat: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
-    size: tuple[int, int],
-    *,
-    near: float = RenderSettings.near,
-    antialias: bool = False,
+    geometry: Geometry, view: View, *, near: float = RenderSettings.near, antialias: bool = False
 ) -> Projection:
     """Projects Gaussians into a pinhole camera; differentiable in means, quats, scales and opacities.
 
+    The formulas are at the head of ``kernels/projection.py``.
+
     Args:
-        means: [N, 3] centres in the world.
-        quats: [N, 4] rotations (w, x, y, z) of any length but zero.
-        scales: [N, 3] standard deviations along the Gaussians' own axes.
-        opacities: [N] in [0, 1].
-        viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
-        K: [3, 3] intrinsics [px] with pixel centres at +0.5; skew is not used.
-        size: (width, height) of the image [px].
-        near: Depth at which Gaussians are cut off.
+        geometry: N Gaussians.
+        view: The camera; it gets no gradient.
+        near: Near plane: Gaussians at this depth or closer are culled [scene units].
         antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
 
     Returns:
@@ -120,12 +110,24 @@ def project(
     Raises:
         ValueError: On a wrong shape, dtype, device or size.
     """
-    check_geometry({}, means, quats, scales, opacities, viewmat, K)
-    check_image_size(*size)
+    _check_inputs(geometry, view)
+    size = view[2:]
 
-    def op(
-        run: Run, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, K: Tensor
-    ) -> tuple[Tensor, ...]:
-        return record_projection(run, means, quats, scales, opacities, viewmat, K, size, near, antialias)
+    def op(ctx: OpContext, *tensors: Tensor) -> tuple[Tensor, ...]:
+        *geometry, viewmat, K = tensors
+        return record_projection(ctx, Geometry(*geometry), View(viewmat, K, *size), near, antialias)
 
-    return Projection(*differentiable(op, means, quats, scales, opacities, viewmat, K))
+    return Projection(*differentiable(op, *geometry, view.viewmat, view.K))
+
+
+def _check_inputs(geometry: Geometry, view: View) -> None:
+    """Raises ``ValueError`` unless the tensors describe Gaussians and a camera on one device."""
+    sizes: dict[str, int] = {}
+    check_tensor("means", geometry.means, ("N", 3), sizes)
+    check_tensor("quats", geometry.quats, ("N", 4), sizes)
+    check_tensor("scales", geometry.scales, ("N", 3), sizes)
+    check_tensor("opacities", geometry.opacities, ("N",), sizes)
+    check_tensor("viewmat", view.viewmat, (4, 4), sizes)
+    check_tensor("K", view.K, (3, 3), sizes)
+    check_same_device({**geometry._asdict(), "viewmat": view.viewmat, "K": view.K})
+    check_image_size(view.width, view.height)

@@ -1,4 +1,4 @@
-"""Pictures of simple bodies (kernels/raytrace.py)."""
+"""Ray tracing of simple bodies (kernels/raytrace.py)."""
 
 from typing import NamedTuple
 
@@ -8,35 +8,35 @@ from torch import Tensor
 
 from warpgs.kernels import raytrace as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
-from warpgs.runtime.tape import Run, differentiable
+from warpgs.runtime.tape import OpContext, differentiable
 
 SPHERE, CUBE, TORUS = 0, 1, 2
-"""Unit shapes; the torus lies around z and has radii 1 and 0.3."""
+"""Unit shapes; the torus is around z and has radii 1 and 0.3."""
 
 
 class Bodies(NamedTuple):
     """Bodies, each a unit shape in its own space.
 
     Attributes:
-        kinds: [B] SPHERE, CUBE or TORUS.
-        body_from_world: [B, 3, 4]; for a torus, a rotation, one scale and a shift.
-        colors: [B, 2, 3] the two colours of its chequers.
-        frequencies: [B] of its chequers, in its own space.
+        shapes: [B] SPHERE, CUBE or TORUS.
+        body_from_world: [B, 3, 4] affine transforms; that of a torus must be a rotation, a uniform scale and a shift.
+        colors: [B, 2, 3] the two colours of the checkerboard.
+        frequencies: [B] angular frequency of the checkerboard [rad per unit of body space].
     """
 
-    kinds: Int32[Tensor, " B"]
+    shapes: Int32[Tensor, " B"]
     body_from_world: Float[Tensor, "B 3 4"]
     colors: Float[Tensor, "B 2 3"]
     frequencies: Float[Tensor, " B"]
 
 
-class Picture(NamedTuple):
-    """A ray-traced picture.
+class TracedImage(NamedTuple):
+    """A ray-traced image.
 
     Attributes:
-        image: [H, W, 3], not clamped.
-        depth: [H, W] along the camera's axis, through the centres of the pixels.
-        bodies: [H, W] the body seen there, −1 for none.
+        image: [H, W, 3] colours, not clamped.
+        depth: [H, W] z in camera space at the centres of the pixels; 1e6 where no body is hit.
+        bodies: [H, W] index of the body at the centre of each pixel, −1 for none.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -51,14 +51,14 @@ def raytrace(
     viewmat: Float[Tensor, "4 4"],
     K: Float[Tensor, "3 3"],
     size: tuple[int, int],
-) -> Picture:
-    """A picture of bodies in the light of a lamp; not differentiable.
+) -> TracedImage:
+    """Renders bodies that are lit by a lamp; not differentiable.
 
     Args:
-        bodies: What there is.
-        lamp: [3, 3] its centre and two half axes.
-        samples: [S, 4] place in the pixel and on the lamp, in [0, 1]⁴, of every sample of a pixel; the place on the
-            lamp is shifted from pixel to pixel.
+        bodies: The scene.
+        lamp: [3, 3] centre and two half axes of the light, a parallelogram.
+        samples: [S, 4] position in the pixel and on the lamp, in [0, 1]⁴, of each sample of a pixel; the position on
+            the lamp is shifted from pixel to pixel.
         viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
         K: [3, 3] intrinsics [px] with pixel centres at +0.5.
         size: (width, height) [px].
@@ -66,8 +66,24 @@ def raytrace(
     Raises:
         ValueError: On a wrong shape, dtype, device or size.
     """
+    _check_inputs(bodies, lamp, samples, viewmat, K)
+    check_image_size(*size)
+    width, height = size
+
+    def op(ctx: OpContext, *inputs: Tensor) -> tuple[Tensor, ...]:
+        image, depth = ctx.empty(height, width, 3), ctx.empty(height, width)
+        hits = ctx.empty(height, width, dtype=torch.int32)
+        outputs = (image.view(-1, 3), depth.view(-1), hits.view(-1))
+        ctx.launch(kernels.raytrace_fwd, width * height, *inputs, width, *outputs, work=len(samples))
+        return image, depth, hits
+
+    with torch.no_grad():
+        return TracedImage(*differentiable(op, *bodies, lamp, samples, viewmat, K))
+
+
+def _check_inputs(bodies: Bodies, lamp: Tensor, samples: Tensor, viewmat: Tensor, K: Tensor) -> None:
     sizes: dict[str, int] = {}
-    check_tensor("kinds", bodies.kinds, ("B",), sizes, (torch.int32,))
+    check_tensor("shapes", bodies.shapes, ("B",), sizes, (torch.int32,))
     check_tensor("body_from_world", bodies.body_from_world, ("B", 3, 4), sizes)
     check_tensor("colors", bodies.colors, ("B", 2, 3), sizes)
     check_tensor("frequencies", bodies.frequencies, ("B",), sizes)
@@ -76,15 +92,3 @@ def raytrace(
     check_tensor("viewmat", viewmat, (4, 4), sizes)
     check_tensor("K", K, (3, 3), sizes)
     check_same_device({**bodies._asdict(), "lamp": lamp, "samples": samples, "viewmat": viewmat, "K": K})
-    check_image_size(*size)
-    width, height = size
-
-    def op(run: Run, *inputs: Tensor) -> tuple[Tensor, ...]:
-        image, depth = run.empty(height, width, 3), run.empty(height, width)
-        hits = run.empty(height, width, dtype=torch.int32)
-        outputs = (image.view(-1, 3), depth.view(-1), hits.view(-1))
-        run.launch(kernels.raytrace_fwd, width * height, *inputs, width, *outputs, work=len(samples))
-        return image, depth, hits
-
-    with torch.no_grad():
-        return Picture(*differentiable(op, *bodies, lamp, samples, viewmat, K))

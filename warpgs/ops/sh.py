@@ -6,45 +6,46 @@ from torch import Tensor
 
 from warpgs.kernels import sh as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import Run, differentiable
+from warpgs.runtime.tape import OpContext, differentiable
 
 MAX_DEGREE = 3
+"""Highest degree of spherical harmonics that the kernels support."""
 
 
 def num_bases(degree: int) -> int:
-    """How many basis functions harmonics up to a degree have."""
+    """Number of basis functions of spherical harmonics up to a degree."""
     return (degree + 1) ** 2
 
 
 def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) -> int:
-    """Raises ``ValueError`` unless ``sh`` [N, bases, 3] holds harmonics of ``degree``; returns the degree to use."""
+    """Raises ``ValueError`` unless ``sh`` [N, bases, 3] has at least ``degree``; returns the degree to use."""
     check_tensor("sh", sh, ("N", "bases", 3), sizes)
-    held = round(sh.shape[1] ** 0.5) - 1
-    if num_bases(held) != sh.shape[1] or not 0 <= held <= MAX_DEGREE:
+    available = round(sh.shape[1] ** 0.5) - 1
+    if num_bases(available) != sh.shape[1] or not 0 <= available <= MAX_DEGREE:
         raise ValueError(f"sh must have shape [N, bases, 3] with 1, 4, 9 or 16 bases, got {list(sh.shape)}")
     if degree is None:
-        return held
-    if not isinstance(degree, int) or not 0 <= degree <= held:
-        raise ValueError(f"sh_degree must be an int between 0 and the {held} that sh holds, got {degree!r}")
+        return available
+    if not isinstance(degree, int) or not 0 <= degree <= available:
+        raise ValueError(f"sh_degree must be an int between 0 and {available}, the degree of sh, got {degree!r}")
     return degree
 
 
-def record_sh(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """``spherical_harmonics`` as a step of a run; Gaussians of radius 0 stay black."""
+def record_sh(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
+    """``spherical_harmonics`` as a part of a larger op, without checks; Gaussians of radius 0 are black."""
     N = means.shape[0]
-    colors = run.empty(N, 3)
-    run.launch(kernels.sh_fwd, N, means, sh, viewmat, radii, num_bases(degree), colors)
+    colors = ctx.empty(N, 3)
+    ctx.launch(kernels.sh_fwd, N, means, sh, viewmat, radii, num_bases(degree), colors)
 
-    def backward(run: Run) -> None:
-        v_colors = run.adjoint(colors)
+    def backward(ctx: OpContext) -> None:
+        v_colors = ctx.gradient(colors)
         if v_colors is None:
             return
-        v_means, v_sh = run.empty(*means.shape), run.empty(*sh.shape)
-        run.launch(kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh)
-        run.add_adjoint(means, v_means)
-        run.add_adjoint(sh, v_sh)
+        v_means, v_sh = ctx.empty(*means.shape), ctx.empty(*sh.shape)
+        ctx.launch(kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh)
+        ctx.add_gradient(means, v_means)
+        ctx.add_gradient(sh, v_sh)
 
-    run.on_backward(backward, reads=(colors,))
+    ctx.on_backward(backward, reads=(colors,))
     return colors
 
 
@@ -62,8 +63,8 @@ def spherical_harmonics(
         means: [N, 3] centres in the world.
         sh: [N, bases, 3] coefficients with 1, 4, 9 or 16 bases (degree 0 to 3).
         viewmat: [4, 4] rigid world-to-camera transform.
-        degree: Highest degree to use; all that ``sh`` holds by default.
-        radii: [N, 2] of a ``Projection``; colours of culled Gaussians (radius 0) are not computed and stay black.
+        degree: Highest degree to use; that of ``sh`` by default.
+        radii: [N, 2] of a ``Projection``; culled Gaussians (radius 0) are black.
 
     Returns:
         [N, 3] RGB, not negative.
@@ -80,7 +81,7 @@ def spherical_harmonics(
     check_tensor("radii", radii, ("N", 2), sizes, (torch.int32,))
     check_same_device({"means": means, "sh": sh, "viewmat": viewmat, "radii": radii})
 
-    def op(run: Run, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
-        return (record_sh(run, means, sh, viewmat, radii, used),)
+    def op(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
+        return (record_sh(ctx, means, sh, viewmat, radii, used),)
 
     return differentiable(op, means, sh, viewmat, radii)[0]

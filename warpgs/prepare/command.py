@@ -1,91 +1,54 @@
-"""The commands ``warpgs prepare`` and ``warpgs check``."""
+"""The command ``warpgs prepare``."""
 
-import json
-import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
 
 import tyro
 
-from warpgs.data.check import check_capture
-from warpgs.data.loaders import Dataset
-
-from .frames import Selection
-from .options import LensModel, Options
+from .options import LensModel, Options, Selection
 
 
 @dataclass(frozen=True)
 class Prepare:
-    """Makes a capture in the layout of NeRF-DS of a video or a folder of pictures in the order of time.
+    """Makes a capture in the NeRF-DS layout from a video or a folder of frames in temporal order.
 
-    Interrupted or failed, it goes on where it stopped when it is run again.
+    After an interruption or an error, the same command continues with the first unfinished step.
     """
 
     source: tyro.conf.Positional[Path]
-    """Video, or folder of PNG or JPEG pictures of one size."""
+    """Video, or folder of PNG or JPEG frames of one size."""
     capture: tyro.conf.Positional[Path]
-    """Folder to make."""
+    """Folder to write the capture to."""
     fps: float | None = None
-    """Frames to take of each second of a video; the sharpest of each interval."""
+    """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
-    """Frames to take instead; all of a folder and 150 of a video if neither is given."""
+    """Number of frames to take; by default all frames of a folder and 150 of a video."""
     longest_side: int = 960
-    """Larger pictures are scaled down to this [px]."""
+    """Larger frames are scaled down to this [px]."""
     lens: LensModel = "SIMPLE_RADIAL"
-    """COLMAP's model of the lens."""
+    """COLMAP's lens model."""
     masks: str = "motion"
-    """What moves: found by motion, that followed by a network (sam2), none, or a folder of masks, 0 = moving, named as
-    the source's pictures or as the capture's frames."""
-    depth: Literal["flow", "anything", "none"] = "flow"
-    """Depth of the static scene by optical flow between frames, of all by a network (anything), or none."""
+    """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
+    named like the source's files or like the capture's frames."""
+    depth: str = "flow"
+    """How to estimate depth: flow (static surfaces, by optical flow), anything (all pixels, by a network) or none."""
     holdout: int = 0
-    """Every so many-th frame is kept for evaluation, as val_ids; 0 keeps none."""
+    """Keep every N-th frame for evaluation (val_ids); 0 keeps none."""
     weights: Path | None = None
-    """Folder of the networks' weights; the Hugging Face cache if not given. Nothing is downloaded."""
+    """Folder with the networks' weights; by default the Hugging Face cache. Nothing is downloaded."""
     force: bool = False
-    """Replaces a capture that is there."""
+    """Replace an existing capture."""
     quiet: bool = False
-    """Says nothing but errors."""
+    """Print errors only."""
 
     def run(self) -> None:
-        from .pipeline import Preparation  # takes half a second that the other commands do without
+        from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
 
         selection = Selection(self.fps, self.count, self.longest_side)
-        options = Options(self.source, selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
-        preparation = Preparation(self.capture, options, self.force, self.quiet)
-        was_finished = preparation.attempt.is_finished
+        options = Options(selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
+        log = None if self.quiet else partial(print, flush=True)
         try:
-            report = preparation.run()
+            prepare(self.source, self.capture, options, force=self.force, log=log)
         except KeyboardInterrupt:
-            print("warpgs: stopped; the same command goes on from here", file=sys.stderr)
-            raise SystemExit(130) from None
-        if self.quiet:
-            return
-        for note in report["notes"]:
-            print(f"note: {note}")
-        if was_finished:
-            print(f"{self.capture} is finished already; --force makes it anew")
-        else:
-            sheets = "masks.png" if self.depth == "none" else "masks.png and depth.png"
-            print(f"{self.capture} is made: look at {sheets} in it, then run warpgs check {self.capture}")
-
-
-@dataclass(frozen=True)
-class Check:
-    """Says whether a capture is fit to train on; exit code 1 if training would be in vain."""
-
-    capture: tyro.conf.Positional[Path]
-    """Folder with dataset.json."""
-    dataset: Dataset | None = None
-    """Its layout; recognised from its files if not given."""
-    factor: int | None = None
-    """Downscaling of the pictures; the dataset's usual one if not given."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Prints JSON."""
-
-    def run(self) -> None:
-        report = check_capture(self.capture, self.dataset, self.factor)
-        print(json.dumps(report.plain(), indent=2) if self.as_json else report)
-        if not report.is_fit:
-            raise SystemExit(1)
+            raise KeyboardInterrupt("interrupted; run the same command again to continue") from None

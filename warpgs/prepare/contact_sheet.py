@@ -1,4 +1,4 @@
-"""Contact sheets: many frames at a glance, with their masks or depth."""
+"""Contact sheets: thumbnails of many frames with their masks or depth."""
 
 from collections.abc import Sequence
 
@@ -6,35 +6,35 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-MAX_TILES = 30
+MAX_THUMBNAILS = 30
 COLUMNS = 6
-TILE_WIDTH = 256
+THUMBNAIL_WIDTH = 256
 
 
-def sheet(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequence[str]) -> UInt8[np.ndarray, "A B 3"]:
-    """The pictures, scaled down and captioned, in rows of six."""
-    tiles = [_tile(picture, caption) for picture, caption in zip(pictures, captions, strict=True)]
-    columns = min(COLUMNS, len(tiles))
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
+def contact_sheet(images: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequence[str]) -> UInt8[np.ndarray, "A B 3"]:
+    """[A, B, 3] the images as captioned thumbnails, six in a row."""
+    thumbnails = [_thumbnail(image, caption) for image, caption in zip(images, captions, strict=True)]
+    columns = min(COLUMNS, len(thumbnails))
+    thumbnails += [np.zeros_like(thumbnails[0])] * (-len(thumbnails) % columns)
+    return np.vstack([np.hstack(thumbnails[k : k + columns]) for k in range(0, len(thumbnails), columns)])
 
 
-def spread(count: int) -> list[int]:
-    """At most 30 places, evenly spread over ``count``."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_TILES)).round().astype(int)).tolist()
+def choose_evenly(count: int) -> list[int]:
+    """At most 30 indices, evenly spaced over ``count``."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_THUMBNAILS)).round().astype(int)).tolist()
 
 
-def with_mask(image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """The picture with what moves in red under a bright outline."""
+def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """[H, W, 3] the image with the dynamic region in red under a bright outline."""
     red = np.array([255, 40, 40])
-    painted = np.where(moving[..., None], 0.55 * image + 0.45 * red, image).astype(np.uint8)
-    edges = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    painted = np.where(dynamic[..., None], 0.55 * image + 0.45 * red, image).astype(np.uint8)
+    edges = cv2.morphologyEx(dynamic.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     painted[edges > 0] = (255, 230, 80)
     return painted
 
 
-def of_depth(inverse_depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Inverse depth in colours, near is red; grey where unknown."""
+def colored_depth(inverse_depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """[H, W, 3] inverse depth as colours: near is red, unknown is grey."""
     known = np.isfinite(inverse_depth)
     low, high = np.percentile(inverse_depth[known], [2, 98]) if known.any() else (0.0, 1.0)
     level = np.clip((np.where(known, inverse_depth, low) - low) / max(high - low, 1e-12), 0, 1)
@@ -43,9 +43,9 @@ def of_depth(inverse_depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 
     return colors
 
 
-def _tile(picture: np.ndarray, caption: str) -> np.ndarray:
-    height = max(1, round(picture.shape[0] * TILE_WIDTH / picture.shape[1]))
-    tile = cv2.resize(picture, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
+def _thumbnail(image: np.ndarray, caption: str) -> np.ndarray:
+    height = max(1, round(image.shape[0] * THUMBNAIL_WIDTH / image.shape[1]))
+    thumbnail = cv2.resize(image, (THUMBNAIL_WIDTH, height), interpolation=cv2.INTER_AREA)
     for color, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(tile, caption, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
-    return tile
+        cv2.putText(thumbnail, caption, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
+    return thumbnail

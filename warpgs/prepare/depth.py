@@ -1,92 +1,104 @@
-"""Depth of the static scene from several frames, without any network.
+"""Inverse depth of every frame of a capture: the methods that estimate it, and its files."""
 
-Every frame is triangulated against its neighbours by optical flow (``dense``); what moves is left out, and so is what
-the neighbours' own depth does not confirm.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.files import write_array
+from warpgs.data.images import read_mask
+from warpgs.data.writer import write_depth
+from warpgs.files import write_png
 
-from .dense import LocalGeometry, PosedFrames, triangulate
-from .parallel import each
+from .cameras import Cameras
+from .contact_sheet import choose_evenly, colored_depth, contact_sheet
+from .flow_depth import static_depth
+from .posed_frames import PosedFrames, load_posed_frames
+from .weights import DEPTH_ANYTHING, Network, find_weights
 
-MAX_RESIDUAL = 1.5
-"""Mean error of a pixel's places above which its depth is not used [px]."""
+MAX_SIDE = 512
+"""Longest side of the images that depth is estimated on [px]; smaller images are not enlarged."""
 
-MAX_RELATIVE_SIGMA = 0.08
-"""Standard deviation of inverse depth above which it is not used, as a share of it."""
+MAX_HALF = 1e3
+"""Maximum of the stored inverse depth, relative to its median: half floats end at 65504."""
 
-AGREEMENT = 0.06
-"""Relative difference of inverse depths that confirm each other, beside twice their standard deviations."""
-
-MIN_CONFIRMATIONS = 2
+Planes = Sequence[Float[np.ndarray, "H W"]]
 
 
-def static_depth(
-    footage: PosedFrames, moving: Sequence[Bool[np.ndarray, "H W"]], quiet: bool = True
-) -> list[Float[np.ndarray, "H W"]]:
-    """[H, W] inverse depth of every frame in the units of the poses; NaN where it moves or is not known well.
+@dataclass(frozen=True)
+class DepthMethod:
+    """A method that estimates depth.
+
+    Attributes:
+        estimate: Inverse depth of the frames in any unit, [H, W] each and NaN where unknown, from the frames, their
+            dynamic masks, the folder of the network's weights (None without a network), and whether to be quiet.
+        network: The network that it needs.
+    """
+
+    estimate: Callable[[PosedFrames, Iterable[Bool[np.ndarray, "H W"]], Path | None, bool], Planes]
+    network: Network | None = None
+
+
+def _flow(frames: PosedFrames, dynamic: Iterable[Bool[np.ndarray, "H W"]], weights: Path | None, quiet: bool) -> Planes:
+    return static_depth(frames, list(dynamic), quiet)
+
+
+def _anything(
+    frames: PosedFrames, dynamic: Iterable[Bool[np.ndarray, "H W"]], weights: Path | None, quiet: bool
+) -> Planes:
+    from .depth_anything import predict  # imports torch
+
+    assert weights is not None
+    return predict(frames.images, weights, quiet)
+
+
+DEPTHS: dict[str, DepthMethod | None] = {
+    "flow": DepthMethod(_flow),
+    "anything": DepthMethod(_anything, DEPTH_ANYTHING),
+    "none": None,
+}
+"""Values of ``--depth``. A new method is a file of its own and a line here."""
+
+
+def add_depth(root: Path, cameras: Cameras, method: DepthMethod, weights: Path | None, quiet: bool) -> str:
+    """Estimates the depth of a capture's frames and writes it, with the contact sheet depth.png; returns a summary.
 
     Args:
-        footage: The frames.
-        moving: [H, W] true where each frame moves.
+        root: Folder of the capture.
+        cameras: Cameras that the capture was written with.
+        method: How to estimate depth.
+        weights: Folder with the networks' weights; None for the Hugging Face cache.
         quiet: Whether to show no progress.
-    """
-    frames = range(len(footage.poses))
-    focal = footage.lens.focal[0]
-
-    def local(frame: int) -> LocalGeometry:
-        found = triangulate(footage.observations(frame), focal)
-        with np.errstate(invalid="ignore"):
-            bad = moving[frame] | ~(found.residual < MAX_RESIDUAL)
-            bad |= ~(found.sigma < MAX_RELATIVE_SIGMA * found.inverse_depth)
-        found.inverse_depth[bad] = np.nan
-        return found
-
-    geometry = each(local, frames, "depth", quiet)
-    return each(lambda frame: _confirmed(footage, geometry, frame), frames, "depth: cross-checks", quiet)
-
-
-def _confirmed(footage: PosedFrames, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:
-    """The inverse depth that at least two neighbours confirm, or all where there are fewer."""
-    rho, sigma = geometry[frame].inverse_depth, geometry[frame].sigma
-    lens, near = footage.lens, footage.neighbours(frame)
-    votes = np.zeros(rho.shape, np.uint8)
-    for other in near:
-        rotation, shift = footage.relative(frame, other)
-        turned = footage.turned(rotation)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            depth = turned[2] + rho * shift[2]
-            column, row = lens.image((turned[0] + rho * shift[0]) / depth, (turned[1] + rho * shift[1]) / depth)
-            seen = (depth > 1e-3) & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-            x = np.where(seen, column - 0.5, -9.0).astype(np.float32)
-            y = np.where(seen, row - 0.5, -9.0).astype(np.float32)
-            theirs, theirs_sigma = (_nearest(p, x, y) for p in (geometry[other].inverse_depth, geometry[other].sigma))
-            expected, gain = rho / depth, turned[2] / depth**2
-            slack = AGREEMENT * expected + 2.0 * np.hypot(gain * sigma, theirs_sigma)
-            votes += seen & (np.abs(theirs - expected) < slack)
-    return np.where(votes >= min(MIN_CONFIRMATIONS, len(near)), rho, np.float32(np.nan))
-
-
-def _nearest(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    nothing = (np.nan,) * 4
-    return cv2.remap(plane, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nothing)
-
-
-def write_depth(path: Path, inverse_depth: Float[np.ndarray, "H W"]) -> None:
-    """Writes a plane as .npy of half floats, scaled so that they don't run out of range.
-
-    Depth of a capture counts up to scale and offset, so the scale need not be kept.
 
     Raises:
-        OSError: If it can't be written; the message names the file.
+        OSError: If a file cannot be written; the message names it.
+    """
+    frames = load_posed_frames(root / "rgb/1x", cameras.undistorted(), MAX_SIDE, max_factor=1.0)
+    folder = find_weights(method.network, weights) if method.network is not None else None
+    dynamic = _dynamic_masks(root, cameras, (frames.lens.width, frames.lens.height))
+    planes = method.estimate(frames, dynamic, folder, quiet)
+    for name, plane in zip(cameras.names, planes, strict=True):
+        write_depth(root, name, as_half(plane))
+    chosen = choose_evenly(len(planes))
+    sheet = contact_sheet([colored_depth(planes[k]) for k in chosen], [cameras.names[k] for k in chosen])
+    write_png(root / "depth.png", sheet)
+    return f"known on {np.mean([np.isfinite(plane).mean() for plane in planes]):.0%} of the pixels"
+
+
+def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:
+    """The capture's masks, resized to ``size`` (width, height)."""
+    for name in cameras.names:
+        static = read_mask(root / f"resized_mask/1x/{name}.png.png", (cameras.lens.width, cameras.lens.height))
+        yield cv2.resize((~static).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+
+
+def as_half(inverse_depth: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """[H, W] inverse depth as half floats, divided by its median to stay in their range.
+
+    Depth of a capture is defined up to scale and offset, so the divisor is not stored.
     """
     known = inverse_depth[np.isfinite(inverse_depth)]
-    scale = (float(np.median(known)) if len(known) else 0.0) or 1.0  # a network may find all of it infinitely far
-    write_array(path, np.minimum(inverse_depth / scale, 1e3).astype(np.float16))
+    scale = (float(np.median(known)) if len(known) else 0.0) or 1.0  # a network may predict infinite depth everywhere
+    return np.minimum(inverse_depth / scale, MAX_HALF).astype(np.float16)

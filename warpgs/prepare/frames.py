@@ -1,47 +1,41 @@
-"""Frames of a video or a folder of pictures: evenly spread over time, the sharpest of each interval, scaled down."""
+"""Frames taken from a video or a folder: evenly spaced over time, the sharpest of each interval, scaled down."""
 
-import json
 import math
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # damaged files are told of by us, in one line
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.images import MAX_SIDE, decode
-from warpgs.data.motion_check import FLATTEST, MIN_SIDE
-from warpgs.files import write_json, write_png
+from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
+from warpgs.files import read_json, write_json, write_png
 from warpgs.progress import progress
 
-MIN_FRAMES = 5
-MAX_FRAMES = 1000
-"""More take more memory than they are worth."""
+from .images import resize_to_side, sharpness
+from .options import MAX_FRAMES, MIN_FRAMES, Selection
+from .video import TakenImage, read_video
 
-DEFAULT_FRAMES = 150
-"""Taken from a video when neither a rate nor a count is asked for."""
+MIN_LONGEST_SIDE = 64
+"""Minimum of ``--longest-side`` [px]."""
 
-MIN_DECODED_FRACTION = 0.95
-"""Share of the frames that a video promises, under which its being cut off is told."""
+SUFFIXES = (".png", ".jpg", ".jpeg")
 
-PICTURES = (".png", ".jpg", ".jpeg")
-
-SHARPNESS_SIDE = 480
-"""Sharpness is compared on pictures of this longest side [px]: noise does not count as detail."""
+INDEX = "frames.json"
+"""File beside the frames that lists them."""
 
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One frame that was taken.
+    """A frame taken from a source.
 
     Attributes:
         name: Its id in the capture.
-        source: Where it comes from, for messages: a file's name, or a video's frame number.
-        step: Its place in the source, which is its time.
+        source: Its origin, for messages: the name of a file, or the frame number in a video.
+        step: Its index in the source, which is its time.
     """
 
     name: str
@@ -50,189 +44,136 @@ class SourceFrame:
 
 
 @dataclass(frozen=True)
-class Selection:
-    """Which frames to take, and their size.
+class Frames:
+    """The frames of a capture as recorded, in files <folder>/<name>.png.
 
     Attributes:
-        fps: Frames a second of a video; None for a count.
-        count: Number of frames; None for all of a folder, 150 of a video.
-        longest_side: Larger pictures are scaled down to it [px].
+        folder: Folder of the files.
+        taken: The frames, in temporal order.
+        width, height: Their size [px].
     """
 
-    fps: float | None = None
-    count: int | None = None
-    longest_side: int = 960
+    folder: Path
+    taken: list[SourceFrame]
+    width: int
+    height: int
 
-    def check(self) -> None:
-        """Raises ``ValueError`` if a number is out of range."""
-        if self.fps is not None and self.count is not None:
-            raise ValueError("--fps and --count exclude each other")
-        if self.fps is not None and not 0.0 < self.fps < math.inf:
-            raise ValueError(f"--fps must be positive, got {self.fps}")
-        if self.count is not None and not MIN_FRAMES <= self.count <= MAX_FRAMES:
-            raise ValueError(f"--count must be {MIN_FRAMES} to {MAX_FRAMES}, got {self.count}")
-        if not 64 <= self.longest_side <= MAX_SIDE:
-            raise ValueError(f"--longest-side must be 64 to {MAX_SIDE} pixels, got {self.longest_side}")
+    @staticmethod
+    def load(folder: Path) -> "Frames":
+        """The frames that ``take_frames`` wrote."""
+        index = read_json(folder / INDEX)
+        return Frames(folder, [SourceFrame(**frame) for frame in index["frames"]], index["width"], index["height"])
+
+    @property
+    def names(self) -> list[str]:
+        """Ids of the frames, in order."""
+        return [frame.name for frame in self.taken]
+
+    def megabytes(self, bytes_per_pixel: int) -> int:
+        """Disk space for so many bytes per pixel of all frames, rounded up."""
+        return len(self.taken) * self.width * self.height * bytes_per_pixel // 1_000_000 + 1
+
+
+def check_selection(selection: Selection) -> None:
+    """Checks the ranges of a selection.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+    if selection.fps is not None and selection.count is not None:
+        raise ValueError("--fps and --count exclude each other")
+    if selection.fps is not None and not 0.0 < selection.fps < math.inf:
+        raise ValueError(f"--fps must be positive, got {selection.fps}")
+    if selection.count is not None and not MIN_FRAMES <= selection.count <= MAX_FRAMES:
+        raise ValueError(f"--count must be {MIN_FRAMES} to {MAX_FRAMES}, got {selection.count}")
+    if not MIN_LONGEST_SIDE <= selection.longest_side <= MAX_SIDE:
+        raise ValueError(
+            f"--longest-side must be {MIN_LONGEST_SIDE} to {MAX_SIDE} pixels, got {selection.longest_side}"
+        )
 
 
 def take_frames(
     source: Path, folder: Path, selection: Selection, quiet: bool = True, notes: list[str] | None = None
-) -> list[SourceFrame]:
-    """Writes the chosen frames of a video or a folder into ``folder`` as PNG, and frames.json that lists them.
+) -> Frames:
+    """Writes the selected frames of a video or a folder as PNG, and frames.json, which lists them.
 
     Args:
-        source: Video or folder of pictures.
-        folder: Where to write.
-        selection: Which frames.
+        source: Video or folder of images.
+        folder: Folder to write to.
+        selection: Frames to take.
         quiet: Whether to show no progress.
-        notes: What to tell the user is appended to it.
+        notes: Messages for the user are appended to it.
 
     Raises:
-        ValueError: If the source is missing, no video, no folder of pictures, or has too few or different frames.
-        OSError: If a frame can't be written.
+        ValueError: If the source is missing, is not a video or folder of images, or has too few or different frames.
+        OSError: If a frame cannot be written.
     """
-    selection.check()
+    check_selection(selection)
     if not source.exists():
-        raise ValueError(f"{source} is missing: expected a video or a folder of pictures")
-    taken: list[SourceFrame] = []
-    size = None
+        raise ValueError(f"{source} is missing: expected a video or a folder of images")
     notes = [] if notes is None else notes
-    chosen = _of_folder(source, selection, quiet) if source.is_dir() else _of_video(source, selection, quiet, notes)
-    for step, origin, image in chosen:
-        if size not in (None, image.shape[1::-1]):
-            raise ValueError(
-                f"{source}: {origin} is {image.shape[1]}×{image.shape[0]}, others are {size[0]}×{size[1]}: "
-                "all pictures must be of one camera and size"
-            )
-        size = image.shape[1::-1]
-        image = _scaled(image, selection.longest_side)
-        if min(image.shape[:2]) < max(MIN_SIDE, max(image.shape[:2]) / FLATTEST):
-            raise ValueError(
-                f"{source}: {origin} of {image.shape[1]}×{image.shape[0]} pixels is too flat: the shorter side must "
-                f"have at least {MIN_SIDE} pixels and 1/{FLATTEST} of the longer one"
-            )
+    images = read_folder(source, selection, quiet) if source.is_dir() else read_video(source, selection, quiet, notes)
+    taken: list[SourceFrame] = []
+    size: tuple[int, int] | None = None
+    for step, origin, image in images:
+        size = size or image.shape[1::-1]
+        image = _checked(image, f"{source}: {origin}", size, selection.longest_side)
         taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step))
         write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < MIN_FRAMES:
         raise ValueError(
             f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {MIN_FRAMES} are needed"
         )
-    write_json(folder / "frames.json", [asdict(frame) for frame in taken])
-    return taken
-
-
-def list_frames(folder: Path) -> list[SourceFrame]:
-    """What ``take_frames`` wrote."""
-    return [SourceFrame(**facts) for facts in json.loads((folder / "frames.json").read_text())]
-
-
-def sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
-    """Variance of the Laplacian of a picture's grey levels (Pech-Pacheco et al. 2000)."""
-    grey = cv2.cvtColor(_scaled(image, SHARPNESS_SIDE), cv2.COLOR_RGB2GRAY)
-    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
-
-
-def _scaled(image: np.ndarray, longest: int) -> np.ndarray:
     height, width = image.shape[:2]
-    factor = longest / max(width, height)
-    if factor >= 1.0:
-        return image
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    frames = [asdict(frame) for frame in taken]
+    write_json(folder / INDEX, {"width": width, "height": height, "frames": frames})
+    return Frames(folder, taken, width, height)
 
 
-def _of_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[tuple[int, str, np.ndarray]]:
+def _checked(image: np.ndarray, origin: str, size: tuple[int, int], longest_side: int) -> np.ndarray:
+    """The image, scaled down, if it has the ``size`` of the first and is not too flat for optical flow."""
+    if image.shape[1::-1] != size:
+        raise ValueError(
+            f"{origin} is {image.shape[1]}×{image.shape[0]}, others are {size[0]}×{size[1]}: "
+            "all images must be of one camera and size"
+        )
+    image = resize_to_side(image, longest_side, max_factor=1.0)
+    height, width = image.shape[:2]
+    if min(height, width) < max(MIN_SIDE, max(height, width) / MAX_ASPECT):
+        raise ValueError(
+            f"{origin} of {width}×{height} pixels is too flat: the shorter side must have at least {MIN_SIDE} pixels "
+            f"and 1/{MAX_ASPECT} of the longer one"
+        )
+    return image
+
+
+def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[TakenImage]:
+    """The sharpest image of each interval of a folder.
+
+    Raises:
+        ValueError: If it has no images or too many, or one is damaged.
+    """
     if selection.fps is not None:
-        raise ValueError("--fps is for videos: a folder has no rate, use --count")
-    pictures = (p for p in source.iterdir() if p.suffix.lower() in PICTURES and not p.name.startswith("."))
-    paths = sorted(pictures, key=_natural)
+        raise ValueError("--fps is for videos: a folder has no frame rate, use --count")
+    images = (p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    paths = sorted(images, key=_natural_order)
     if not paths:
-        raise ValueError(f"{source} holds no {', '.join(PICTURES)} pictures")
+        raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images")
     count = min(selection.count or len(paths), len(paths))
     if count > MAX_FRAMES:
-        raise ValueError(f"{source} holds {count} pictures, at most {MAX_FRAMES} are taken: choose with --count")
+        raise ValueError(f"{source} holds {count} images, the maximum is {MAX_FRAMES}: choose with --count")
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
-        best = max(((k, _picture(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
+        best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
         yield int(best[0]), paths[best[0]].name, best[1]
 
 
-def _natural(path: Path) -> tuple[list[str | int], str]:
+def _natural_order(path: Path) -> tuple[list[str | int], str]:
     """Sorts shot2 before shot10."""
-    parts = re.split(r"([0-9]+)", path.name)  # text and numbers take turns
+    parts = re.split(r"([0-9]+)", path.name)  # text and numbers alternate
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
 
 
-def _picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """An RGB picture, turned as its EXIF data say; damaged and huge files are refused before they are decoded."""
+def _read(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """An RGB image, rotated according to its EXIF data; damaged and huge files are refused before decoding."""
     return cv2.cvtColor(decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-
-
-def _of_video(
-    source: Path, selection: Selection, quiet: bool, notes: list[str]
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    video = _open(source)
-    try:
-        total, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.get(cv2.CAP_PROP_FPS)
-        if total <= 0:
-            total = _counted(source)
-        if selection.fps is not None and not rate > 0:
-            raise ValueError(f"{source} does not say its rate: use --count instead of --fps")
-        wanted = selection.count or DEFAULT_FRAMES
-        interval = rate / selection.fps if selection.fps is not None else total / wanted
-        interval = max(1.0, interval)
-        if total / interval > MAX_FRAMES:
-            raise ValueError(f"{source} gives {int(total / interval)} frames, at most {MAX_FRAMES} are taken")
-        yield from _sharpest(source, video, total, interval, quiet, notes)
-    finally:
-        video.release()
-
-
-def _sharpest(
-    source: Path, video: cv2.VideoCapture, total: int, interval: float, quiet: bool, notes: list[str]
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    """The sharpest frame of each interval; one frame at a time is held besides the best."""
-    best: tuple[float, int, np.ndarray] | None = None
-    current = 0
-    for step in progress(range(total), "frames", quiet):
-        whole, image = video.read()
-        if not whole:
-            if step < MIN_DECODED_FRACTION * total:  # containers often count a few more than there are
-                notes.append(f"{source} promises {total} frames, only {step} could be decoded: is it cut off?")
-            break
-        if int(step / interval) != current and best is not None:
-            yield best[1], f"frame {best[1]}", best[2]
-            best, current = None, int(step / interval)
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        score = sharpness(image) if interval > 1.0 else 0.0
-        if best is None or score > best[0]:
-            best = (score, step, image)
-    if best is None:
-        raise ValueError(f"{source} is no video that can be decoded: it has no frames")
-    yield best[1], f"frame {best[1]}", best[2]
-
-
-def _open(source: Path) -> cv2.VideoCapture:
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        video = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(before)
-    if not video.isOpened():
-        raise ValueError(f"{source} is no video that can be decoded, and no folder of pictures")
-    size = [video.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-    if not 0 < min(size) <= max(size) <= MAX_SIDE:
-        video.release()
-        raise ValueError(f"{source} claims frames of {size[0]:.0f}×{size[1]:.0f} pixels, at most {MAX_SIDE} a side")
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # phones store upright videos lying, with a tag
-    return video
-
-
-def _counted(source: Path) -> int:
-    """The number of frames, by going through a video that does not say."""
-    video, count = _open(source), 0
-    while count < 1_000_000 and video.grab():
-        count += 1
-    video.release()
-    return count

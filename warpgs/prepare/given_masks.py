@@ -1,7 +1,7 @@
-"""Masks that the user gives: a folder of PNG files, 0 = moving.
+"""Masks given by the user: a folder of PNG files, 0 = dynamic.
 
-Named as the pictures of the source, they lie over these. Named as the capture's frames, they were drawn over the
-pictures of a capture, which are straightened.
+Masks named like the source's files belong to these. Masks named like a capture's frames were drawn over the frames of a
+capture, which are undistorted.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,12 +15,12 @@ from warpgs.data.images import decode, read_mask
 
 from .frames import SourceFrame
 
-ENDINGS = (".png", ".png.png")
-"""The second is that of captures."""
+SUFFIXES = (".png", ".png.png")
+"""Suffixes of mask files; captures use the second."""
 
 
-def find_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[Path], bool]:
-    """The mask of every frame, and whether they are named as the capture's frames: all are of one kind.
+def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[Path], bool]:
+    """The mask of every frame, and whether they are named like the capture's frames. All must be named the same way.
 
     Raises:
         ValueError: If one is missing.
@@ -36,19 +36,19 @@ def find_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[Path],
 
 
 def _file(folder: Path, stems: Iterable[str]) -> Path | None:
-    paths = (folder / (stem + ending) for stem in stems for ending in ENDINGS)
+    paths = (folder / (stem + suffix) for stem in stems for suffix in SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 
-def read_moving(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """True where a mask says that it moves, resized to ``size`` (width, height).
+def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """[H, W] true where a mask file is dynamic, resized to ``size`` (width, height).
 
     Raises:
-        ValueError: If it is damaged or of another shape than the picture.
+        ValueError: If it is damaged or its aspect ratio is not that of the frame.
     """
     width, height = decode(path).shape[1::-1]
-    slack = 0.5 * (width + height + sum(size))  # both may have been rounded to whole pixels
-    if abs(width * size[1] - height * size[0]) > slack:
+    tolerance = 0.5 * (width + height + sum(size))  # both may have been rounded to whole pixels
+    if abs(width * size[1] - height * size[0]) > tolerance:
         raise ValueError(
             f"{path}: the mask is {width}×{height}, which is not the shape of the {size[0]}×{size[1]} frame"
         )

@@ -1,61 +1,74 @@
-"""What of a capture in the making is done: kept beside it, so that the same command goes on where it stopped."""
+"""The journal of a capture's preparation: which steps are finished, kept in the capture's folder until all are."""
 
-import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from errno import ENOSPC
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from warpgs.files import write_json
+from warpgs.files import read_json, write_json
 
 REPORT = "prepare.json"
-"""Beside the capture: options, results and seconds of every step, notes."""
+"""Report in the finished capture: options, result and seconds of every step, notes."""
 
-MADE = (
+OUTPUTS = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "scene.json", "metadata.json", "dataset.json",
     "masks.png", "depth.png", REPORT,
 )  # fmt: skip
-"""All that is made in the capture's folder, beside the work folder."""
+"""Everything that prepare writes into the capture's folder, apart from the work folder."""
 
 STATE = "state.json"
-"""In the work folder: options, the steps that are done, and notes."""
+"""File in the work folder with the options, the finished steps, and the notes."""
+
+ADVICE = "free some disk space and run the same command again"
+
+Result = TypeVar("Result")
 
 
 class Journal:
-    """The steps that are done.
+    """Runs the steps of a preparation, each once, even if the preparation is interrupted and started again.
 
     Attributes:
-        root: The capture's folder.
-        work: Its folder for what is needed until it is finished.
-        notes: What to tell the user at the end.
+        root: Folder of the capture.
+        work: Folder inside it for the steps' intermediate files.
+        notes: Messages for the user, reported at the end.
+        log: Receives a line of text after each step.
+        quiet: Whether to show no progress bars.
     """
 
-    def __init__(self, root: Path, options: dict[str, Any], force: bool, quiet: bool) -> None:
-        """Starts anew, or takes up what was begun with the same options; nothing is changed yet.
+    def __init__(self, root: Path, options: dict[str, Any], force: bool, log: Callable[[str], None] | None) -> None:
+        """Starts afresh, or resumes what was started with the same options. Changes nothing on disk.
+
+        Args:
+            root: Folder of the capture.
+            options: All options, as JSON types.
+            force: Whether to replace what is in the folder.
+            log: Receives a line of text after each step; None for no output at all.
 
         Raises:
-            ValueError: If the folder holds something else, or a capture that was made with other options, and ``force``
-                is not given.
+            ValueError: If the folder holds something else, or a capture made with other options, and not ``force``.
         """
-        self.root, self.work, self.quiet = root, root / ".prepare", quiet
+        self.root, self.work = root, root / ".prepare"
+        self.quiet, self.log = log is None, log or (lambda text: None)
         self._options = options
         self._done: dict[str, Any] = {}
         self.notes: list[str] = []
         if root.exists() and not root.is_dir():
             raise ValueError(f"{root} is a file: choose another folder")
         if not force and root.exists() and any(root.iterdir()):
-            self._done, self.notes = self._begun()
+            self._done, self.notes = self._read_state()
 
-    def _begun(self) -> tuple[dict[str, Any], list[str]]:
+    def _read_state(self) -> tuple[dict[str, Any], list[str]]:
         try:
-            state = json.loads((self.work / STATE).read_text())
+            state = read_json(self.work / STATE)
             begun, done, notes = dict(state["options"]), dict(state["done"]), list(state["notes"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            if list(self.root.iterdir()) == [self.work]:  # stopped within the first step
+            if list(self.root.iterdir()) == [self.work]:  # interrupted during the first step
                 return {}, []
             raise ValueError(
-                f"{self.root} exists and was not begun by prepare: choose another folder, or replace the capture in it "
+                f"{self.root} exists and was not made by prepare: choose another folder, or replace the capture in it "
                 "with --force"
             ) from error
         changed = [key for key in self._options if begun.get(key) != self._options[key]]
@@ -64,51 +77,87 @@ class Journal:
                 f"{self.root} was made with other options ({', '.join(changed)}): choose another folder, or replace "
                 "it with --force"
             )
-        return ({}, []) if changed else (done, notes)  # what failed may be tried with other options
+        return ({}, []) if changed else (done, notes)  # an unfinished capture starts afresh with the new options
 
-    def clear(self, keep: Path) -> None:
-        """Removes what prepare makes, and nothing else; ``keep`` within the work folder stays.
+    @property
+    def is_finished(self) -> bool:
+        """Whether all steps are finished."""
+        return "finished" in self._done
+
+    def step(self, name: str, work: Callable[[], str]) -> None:
+        """Runs ``work``, which returns a summary of its result, unless the step of this name is finished."""
+        if name in self._done:
+            summary, when = self._done[name]["result"], "finished before"
+        else:
+            start = time.perf_counter()
+            summary = work()
+            seconds = round(time.perf_counter() - start, 1)
+            self._done[name] = {"seconds": seconds, "result": summary}
+            self._save()
+            when = f"{seconds:.1f} s"
+        self.log(f"{name}: {summary} ({when})")
+
+    def result(self, name: str, load: Callable[[Path], Result], make: Callable[[Path], str]) -> Result:
+        """The result of a step.
+
+        Args:
+            name: Name of the step; its path in the work folder follows from it.
+            load: Reads the result from this path.
+            make: Writes the result to this path and returns a summary; not called if the step is finished.
+        """
+        path = self.work / name.replace(", ", "-").replace(" ", "-")
+        self.step(name, lambda: make(path))
+        return load(path)
+
+    def require_space(self, megabytes: int) -> None:
+        """Checks the free disk space before something large is written: COLMAP aborts the process on a full disk.
 
         Raises:
-            OSError: If something can't be removed or written.
+            OSError: If there is too little.
         """
-        self._save()  # first: what an interruption leaves must not count as finished
+        self.work.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(self.work).free // 1_000_000
+        if free < megabytes:
+            raise OSError(f"{self.root}: {megabytes} MB of disk are needed, {free} MB are free; {ADVICE}")
+
+    @contextmanager
+    def explain_full_disk(self) -> Iterator[None]:
+        """Turns the errors of a full disk into one that tells the user how to continue."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno == ENOSPC or "No space left" in str(error):
+                raise OSError(f"{self.root}: the disk is full; {ADVICE}") from error
+            raise
+
+    def clear(self, keep: Path) -> None:
+        """Removes the outputs of prepare and nothing else; ``keep`` in the work folder stays.
+
+        Raises:
+            OSError: If something cannot be removed or written.
+        """
+        self._save()  # first: what is left after an interruption must not count as finished
         leftovers = [path for path in self.work.iterdir() if path.name not in (STATE, keep.name)]
-        for path in [*(self.root / name for name in MADE), *leftovers]:
+        for path in [*(self.root / name for name in OUTPUTS), *leftovers]:
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
 
-    @property
-    def is_finished(self) -> bool:
-        """Whether nothing is left to do."""
-        return "finished" in self._done
-
-    def step(self, name: str, work: Callable[[], str]) -> None:
-        """Does a step unless it is done; ``work`` returns its result in words."""
-        if name in self._done:
-            text, when = self._done[name]["result"], "done before"
-        else:
-            start = time.perf_counter()
-            text = work()
-            seconds = round(time.perf_counter() - start, 1)
-            self._done[name] = {"seconds": seconds, "result": text}
-            self._save()
-            when = f"{seconds:.1f} s"
-        if text and not self.quiet:
-            print(f"{name}: {text} ({when})", flush=True)
-
     def finish(self) -> None:
-        """Writes the report and removes what is not needed any more."""
-        steps = {name: facts["result"] for name, facts in self._done.items()}
-        seconds = {name: facts["seconds"] for name, facts in self._done.items()}
+        """Writes the report and removes the intermediate files."""
+        steps = {name: entry["result"] for name, entry in self._done.items()}
+        seconds = {name: entry["seconds"] for name, entry in self._done.items()}
         write_json(self.root / REPORT, {**self._options, "steps": steps, "seconds": seconds, "notes": self.notes})
         self._done["finished"] = {"seconds": 0.0, "result": ""}
         self._save()
         for path in self.work.iterdir():
             if path.name != STATE:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    def report(self) -> dict[str, Any]:
+        """The report of a finished preparation."""
+        return read_json(self.root / REPORT)
 
     def _save(self) -> None:
         write_json(self.work / STATE, {"options": self._options, "done": self._done, "notes": self.notes})

@@ -1,4 +1,4 @@
-"""Work on many frames over the cores of one machine."""
+"""Processes many frames on the cores of one machine."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -10,23 +10,23 @@ import cv2
 from warpgs.progress import progress
 
 MAX_THREADS = 8
-"""More than that are limited by memory."""
+"""Maximum number of threads; more are limited by memory bandwidth."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def each(job: Callable[[Item], Result], items: Sequence[Item], label: str, quiet: bool) -> list[Result]:
-    """The results of a job on every item, in their order.
+def map_frames(job: Callable[[Item], Result], frames: Sequence[Item], label: str, quiet: bool) -> list[Result]:
+    """The results of a job on every frame, in order.
 
     Threads suffice: OpenCV and large numpy operations release the interpreter's lock. OpenCV's own threads are turned
-    off meanwhile, frames side by side use the cores better.
+    off meanwhile, because frames in parallel use the cores better.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS))
     try:
-        futures = [pool.submit(job, item) for item in items]
+        futures = [pool.submit(job, frame) for frame in frames]
         return [future.result() for future in progress(futures, label, quiet)]
     finally:
         pool.shutdown(cancel_futures=True)

@@ -1,6 +1,6 @@
-"""Masks of what moves, followed through the video by SAM 2 (Ravi et al. 2024), prompted by the masks of motion.
+"""Dynamic masks tracked through the video by SAM 2 (Ravi et al. 2024).
 
-A few masks of motion are given to the network as they are; from them it draws those of all frames between.
+A few masks found by motion are the prompts; the network segments all frames from them.
 """
 
 from collections.abc import Sequence
@@ -16,31 +16,32 @@ from torch.nn.functional import interpolate
 
 from warpgs.progress import progress
 
-from .networks import SAM2, load, normalised
+from .networks import load, normalized
+from .weights import SAM2
 
-PROMPTS = 4
-"""Parts of the sequence that give a prompt each."""
+NUM_PROMPTS = 4
+"""Number of parts of the sequence that give a prompt each."""
 
-BODY = 1
-"""Number of the one object that is followed: all that moves."""
+OBJECT_ID = 1
+"""Id of the one object that is tracked: everything dynamic."""
 
 
-def prompted(moving: Sequence[Bool[np.ndarray, "H W"]]) -> list[int]:
-    """Frames whose masks are prompts: in each part of the sequence that of median area, neither torn nor swollen.
+def choose_prompts(dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> list[int]:
+    """The frames whose masks are prompts: in each part of the sequence the one of median area.
 
-    Parts in which nothing moves give none.
+    Parts without dynamic pixels give none.
     """
     chosen = []
-    for part in np.array_split(np.arange(len(moving)), PROMPTS):
-        by_area = sorted((int(moving[k].sum()), int(k)) for k in part if moving[k].any())
+    for part in np.array_split(np.arange(len(dynamic)), NUM_PROMPTS):
+        by_area = sorted((int(dynamic[k].sum()), int(k)) for k in part if dynamic[k].any())
         if by_area:
             chosen.append(by_area[len(by_area) // 2][1])
     return chosen
 
 
 @dataclass(frozen=True)
-class _Frames:
-    """The video as the network reads it: made when it is asked for, because it takes 12 MB a frame."""
+class _Video:
+    """The video as the network reads it, converted on access because a frame takes 12 MB."""
 
     images: Sequence[np.ndarray]
     side: int
@@ -49,39 +50,39 @@ class _Frames:
         return len(self.images)
 
     def __getitem__(self, k: int) -> Tensor:
-        return normalised(self.images[k], self.side, self.side)
+        return normalized(self.images[k], self.side, self.side)
 
 
 @torch.inference_mode()
-def follow(
+def track(
     images: Sequence[UInt8[np.ndarray, "H W 3"]],
-    moving: Sequence[Bool[np.ndarray, "H W"]],
+    dynamic: Sequence[Bool[np.ndarray, "H W"]],
     weights: Path,
     quiet: bool = True,
 ) -> list[Bool[np.ndarray, "H W"]]:
-    """[H, W] true where each picture moves, as the network sees it.
+    """[H, W] true where each image is dynamic according to the network.
 
     Args:
-        images: [H, W, 3] of one size, in the order of time.
-        moving: [H, W] masks of motion.
-        weights: Folder of the network's weights.
+        images: [H, W, 3] of one size, in temporal order.
+        dynamic: [H, W] masks found by motion.
+        weights: Folder with the network's weights.
         quiet: Whether to show no progress.
 
     Raises:
         ValueError: If the weights are damaged.
     """
-    prompts = prompted(moving)
+    prompts = choose_prompts(dynamic)
     if not prompts:
-        return list(moving)
+        return list(dynamic)
     network = load(SAM2, weights)
     session = _session(network, images)
     for k in prompts:
-        _prompt(network, session, k, moving[k])
+        _add_prompt(network, session, k, dynamic[k])
     found: dict[int, np.ndarray] = {}
-    for backwards in (False, True):
-        steps = network.propagate_in_video_iterator(session, start_frame_idx=prompts[0], reverse=backwards)
-        count = prompts[0] if backwards else len(images) - prompts[0]
-        for _, step in zip(progress(range(count + backwards), "SAM 2", quiet), steps, strict=False):
+    for reverse in (False, True):
+        steps = network.propagate_in_video_iterator(session, start_frame_idx=prompts[0], reverse=reverse)
+        count = prompts[0] if reverse else len(images) - prompts[0]
+        for _, step in zip(progress(range(count + reverse), "SAM 2", quiet), steps, strict=False):
             logits = interpolate(step.pred_masks.float(), images[0].shape[:2], mode="bilinear", align_corners=False)
             found[step.frame_idx] = (logits[0, 0] > 0.0).cpu().numpy()
     return [found[k] for k in range(len(images))]
@@ -94,13 +95,13 @@ def _session(network: Any, images: Sequence[np.ndarray]) -> Any:
     session = Sam2VideoInferenceSession(
         video_height=height, video_width=width, inference_device=network.device, dtype=torch.float32
     )
-    session.processed_frames = _Frames(images, network.config.image_size)
+    session.processed_frames = _Video(images, network.config.image_size)
     return session
 
 
-def _prompt(network: Any, session: Any, frame: int, mask: np.ndarray) -> None:
+def _add_prompt(network: Any, session: Any, frame: int, mask: np.ndarray) -> None:
     side = network.config.image_size
     resized = interpolate(torch.from_numpy(mask)[None, None].float(), (side, side), mode="bilinear", antialias=True)
-    session.add_mask_inputs(session.obj_id_to_idx(BODY), frame, (resized >= 0.5).float())
-    session.obj_with_new_inputs = [BODY]
+    session.add_mask_inputs(session.obj_id_to_idx(OBJECT_ID), frame, (resized >= 0.5).float())
+    session.obj_with_new_inputs = [OBJECT_ID]
     network(session, frame_idx=frame)

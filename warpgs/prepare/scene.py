@@ -1,138 +1,174 @@
-"""Writes what was recovered as a capture in the layout of NeRF-DS, in scene units around the static points."""
+"""Writes frames, masks and cameras as a capture in the NeRF-DS layout, in scene units around the static points."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
-from warpgs.data.images import decode
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
-from warpgs.files import write_array, write_json, write_png
+from warpgs.data import writer
+from warpgs.data.lens import undistort
+from warpgs.data.units import SceneUnits
+from warpgs.files import write_png
 
-from .frames import SourceFrame
-from .sfm import Cameras
+from .cameras import Cameras
+from .contact_sheet import choose_evenly, contact_sheet, overlay_mask
+from .frames import Frames
+from .images import brighten, read_images
+from .masks import Masks
 
-KEPT_SHARE = 0.02
-"""Share of the points at each end of each axis that does not count for the size of the scene: strays."""
+OUTLIER_FRACTION = 0.02
+"""Fraction of the points at each end of each axis that does not count for the extent of the scene."""
 
 FACTORS = (1, 2)
-"""Downscalings that pictures and masks are written in; training takes the second with ``--factor 2``."""
+"""Downscaling factors of the images and masks; training uses the second with ``--factor 2``."""
 
-MAX_MOVING = 0.5
-"""Share of the frames that see a point where something moves, above which the point is left out."""
+MAX_DYNAMIC_VIEWS = 0.5
+"""Fraction of a point's views in dynamic regions above which the point is omitted."""
 
+MIN_STATIC_POINTS = 50
 
-def pinhole_lens(lens: Lens) -> Lens:
-    """The pinhole whose pictures ``undistort`` makes of the lens's."""
-    K = pinhole_matrix(lens)
-    return Lens(lens.width, lens.height, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
-
-
-def resized_lens(lens: Lens, width: int, height: int) -> Lens:
-    """The lens for pictures scaled to another size."""
-    x, y = width / lens.width, height / lens.height
-    focal, center = (lens.focal[0] * x, lens.focal[1] * y), (lens.center[0] * x, lens.center[1] * y)
-    return dataclasses.replace(lens, width=width, height=height, focal=focal, center=center)
+DOUBTFUL_FRACTION = 0.4
+"""Fraction of dynamic pixels above which the masks are probably wrong."""
 
 
-def static_points(cameras: Cameras, moving: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, " P"]:
-    """Which points most frames see where nothing moves.
+def write_capture(root: Path, frames: Frames, cameras: Cameras, masks: Masks, *, holdout: int, notes: list[str]) -> str:
+    """Writes the capture, and the contact sheet masks.png; returns a summary.
 
     Args:
-        cameras: With lens, poses and points.
-        moving: [H, W] of every pose, in the size of the lens.
+        root: Folder of the capture.
+        frames: All frames that were taken.
+        cameras: Cameras of the registered frames.
+        masks: Masks of these frames.
+        holdout: Every N-th frame is for evaluation; 0 for none.
+        notes: Messages for the user are appended to it.
+
+    Raises:
+        ValueError: If too few static points remain, or no frame for evaluation.
+        OSError: If a file cannot be written; the message names it.
+    """
+    dynamic = masks.read_dynamic(cameras)
+    cameras = _with_static_points(cameras, dynamic)
+    held_out(cameras.names, holdout)  # fails before anything is written
+    omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
+    if omitted:
+        notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
+    shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)))
+    write_scene(root, cameras, {frame.name: frame.step for frame in frames.taken}, holdout)
+    fraction = float(np.mean([mask.mean() for mask in dynamic]))
+    if fraction > DOUBTFUL_FRACTION:
+        notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
+    painted = [overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)]
+    write_png(root / "masks.png", contact_sheet(painted, [cameras.names[k] for k in shown]))
+    return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
+
+
+def held_out(names: Sequence[str], holdout: int) -> list[str]:
+    """The frames kept for evaluation: every N-th.
+
+    Raises:
+        ValueError: If there are none, although ``holdout`` is not 0.
+    """
+    if holdout // 2 >= len(names):
+        raise ValueError(f"--holdout {holdout} keeps none of {len(names)} frames for evaluation")
+    return list(names[holdout // 2 :: holdout]) if holdout else []
+
+
+def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
+    keep = static_points(cameras.undistorted(), dynamic)
+    if keep.sum() < MIN_STATIC_POINTS:
+        raise ValueError(
+            f"only {int(keep.sum())} static points are left: nearly everything moves, or the masks are inverted "
+            "(0 = dynamic)"
+        )
+    return dataclasses.replace(cameras, points=cameras.points[keep])
+
+
+def static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, " P"]:
+    """[P] whether at least half of the frames that see a point see it in a static region.
+
+    Args:
+        cameras: Cameras with a pinhole lens.
+        dynamic: [H, W] dynamic mask of each camera, in the size of the lens.
     """
     lens, points = cameras.lens, cameras.points
-    hits, looks = np.zeros(len(points)), np.zeros(len(points))
-    for pose, mask in zip(cameras.poses, moving, strict=True):
-        seen = points @ pose[:, :3].T + pose[:, 3]
-        front = seen[:, 2] > 0
-        depth = np.where(front, seen[:, 2], 1.0)
-        column, row = np.floor(lens.image(seen[:, 0] / depth, seen[:, 1] / depth)).clip(-1, 1e6).astype(int)
-        inside = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-        looks += inside
-        hits[inside] += mask[row[inside], column[inside]]
-    return hits <= MAX_MOVING * np.maximum(looks, 1)
+    hits, views = np.zeros(len(points)), np.zeros(len(points))
+    for pose, mask in zip(cameras.poses, dynamic, strict=True):
+        in_camera = points @ pose[:, :3].T + pose[:, 3]
+        front = in_camera[:, 2] > 0
+        depth = np.where(front, in_camera[:, 2], 1.0)
+        position = lens.image(in_camera[:, 0] / depth, in_camera[:, 1] / depth)
+        column, row = np.floor(position).clip(-1, 1e6).astype(int)
+        visible = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+        views += visible
+        hits[visible] += mask[row[visible], column[visible]]
+    return hits <= MAX_DYNAMIC_VIEWS * np.maximum(views, 1)
 
 
-def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> tuple[np.ndarray, float]:
-    """Center and scale that bring static points and cameras to about [-1, 1].
+def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> SceneUnits:
+    """Scene units in which static points and cameras are in about [-1, 1].
 
     Args:
         points: [P, 3] static points.
-        centers: [F, 3] of the cameras.
+        centers: [F, 3] centres of the cameras.
     """
-    low, high = np.quantile(points, [KEPT_SHARE, 1 - KEPT_SHARE], axis=0)
+    low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
-    return (low + high) / 2.0, float(2.0 / (high - low).max())
+    return SceneUnits((low + high) / 2.0, float(2.0 / (high - low).max()))
 
 
-def write_frames(root: Path, frames_folder: Path, cameras: Cameras, moving: Sequence[Bool[np.ndarray, "H W"]]) -> None:
-    """Writes pictures, straightened, and masks in full and in half size, and the camera of every frame.
+def write_frames(
+    root: Path,
+    folder: Path,
+    cameras: Cameras,
+    dynamic: Sequence[Bool[np.ndarray, "H W"]],
+    shown: Collection[int] = (),
+) -> dict[int, UInt8[np.ndarray, "H W 3"]]:
+    """Writes undistorted images and masks in full and half size, and the camera of every frame.
 
     Args:
-        root: The capture.
-        frames_folder: Of the frames as the lens took them.
-        cameras: Of the frames.
-        moving: [H, W] true where each straightened frame moves.
+        root: Folder of the capture.
+        folder: Folder of the frames as recorded.
+        cameras: Cameras of the frames.
+        dynamic: [H, W] dynamic mask of each undistorted frame.
+        shown: Indices of the images to return.
+
+    Returns:
+        [H, W, 3] undistorted images by index.
 
     Raises:
         ValueError: If a frame was damaged since it was taken.
-        OSError: If a file can't be written; the message names it.
+        OSError: If a file cannot be written; the message names it.
     """
-    straight = pinhole_lens(cameras.lens)
-    for name, pose, mask in zip(cameras.names, cameras.poses, moving, strict=True):
-        image = cv2.cvtColor(decode(frames_folder / f"{name}.png"), cv2.COLOR_BGR2RGB)
-        image, moving_here = undistort(image, cameras.lens), mask.astype(np.uint8)
-        for factor in FACTORS:
-            size = round(straight.width / factor), round(straight.height / factor)
-            write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-            static = cv2.resize(255 * moving_here, size, interpolation=cv2.INTER_AREA) == 0  # no pixel of it moves
-            write_png(root / f"resized_mask/{factor}x/{name}.png.png", static.astype(np.uint8) * 255)
-        write_json(root / f"camera/{name}.json", _camera_facts(straight, pose))
+    lens, images = cameras.undistorted().lens, {}
+    for k, image in enumerate(read_images(folder, cameras.names)):
+        name, pose = cameras.names[k], cameras.poses[k]
+        image = undistort(image, cameras.lens)
+        writer.write_image(root, name, image, FACTORS)
+        writer.write_mask(root, name, ~dynamic[k], FACTORS)
+        writer.write_camera(root, name, lens, pose[:, :3], -pose[:, :3].T @ pose[:, 3])
+        if k in shown:
+            images[k] = image
+    return images
 
 
-def _camera_facts(lens: Lens, pose: Float[np.ndarray, "3 4"]) -> dict[str, object]:
-    return {
-        "orientation": pose[:, :3].tolist(),
-        "position": (-pose[:, :3].T @ pose[:, 3]).tolist(),
-        "focal_length": lens.focal[0],
-        "principal_point": list(lens.center),
-        "skew": 0.0,
-        "pixel_aspect_ratio": lens.focal[1] / lens.focal[0],
-        "radial_distortion": [0.0, 0.0, 0.0],
-        "tangential_distortion": [0.0, 0.0],
-        "image_size": [lens.width, lens.height],
-    }
-
-
-def write_facts(root: Path, cameras: Cameras, frames: Sequence[SourceFrame], holdout: int) -> None:
-    """Writes points.npy, scene.json, metadata.json, and at last dataset.json, which makes the folder a capture.
+def write_scene(root: Path, cameras: Cameras, steps: dict[str, int], holdout: int) -> None:
+    """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
 
     Args:
-        root: The capture.
-        cameras: With static points only.
-        frames: Those of the cameras, in order.
-        holdout: Every so many-th frame is for evaluation; 0 for none.
+        root: Folder of the capture.
+        cameras: Cameras with static points only.
+        steps: Index in the source of each frame.
+        holdout: Every N-th frame is for evaluation; 0 for none.
 
     Raises:
-        OSError: If a file can't be written; the message names it.
+        OSError: If a file cannot be written; the message names it.
     """
-    centers = -np.einsum("fji,fj->fi", cameras.poses[:, :, :3], cameras.poses[:, :, 3])
-    center, scale = scene_units(cameras.points, centers)
-    depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in cameras.poses[:: max(1, len(centers) // 20)]])
-    near, far = np.quantile(depths[depths > 0], [0.001, 0.999]) * scale
-    facts = {"center": center.tolist(), "scale": scale, "near": 0.5 * near, "far": 2.0 * far}
-    write_json(root / "scene.json", {**facts, "bbox": [[-1, -1, -1], [1, 1, 1]]})
-    write_array(root / "points.npy", cameras.points)
-    first = frames[0].step
-    ids = [{"time_id": f.step - first, "warp_id": k, "appearance_id": k, "camera_id": 0} for k, f in enumerate(frames)]
-    names = [f.name for f in frames]
-    write_json(root / "metadata.json", dict(zip(names, ids, strict=True)))
-    val = names[holdout // 2 :: holdout] if holdout else []
-    train = [name for name in names if name not in val]
-    counts = {"count": len(names), "num_exemplars": len(train)}
-    write_json(root / "dataset.json", {**counts, "ids": names, "train_ids": train, "val_ids": val})
+    units, poses = scene_units(cameras.points, cameras.centers), cameras.poses
+    depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
+    near, far = np.quantile(depths[depths > 0], [0.001, 0.999]) * units.scale
+    writer.write_scene(root, units, cameras.points, 0.5 * near, 2.0 * far)
+    first = steps[cameras.names[0]]
+    times = {name: steps[name] - first for name in cameras.names}
+    writer.write_index(root, times, held_out(cameras.names, holdout))

@@ -1,13 +1,13 @@
 """Superpixels of all frames as one graph, over which evidence of motion spreads.
 
-A superpixel is joined to those beside it, the more the alike their colour and depth are, and to those that optical
-flow carries it to in the next frame. With s, m evidence that a superpixel is static or moving, its share x of motion
-minimises
+A superpixel is connected to its neighbours in the image, more strongly the more similar their colour and depth, and to
+those that optical flow carries it to in the next frame. With s, m the evidence that a superpixel is static or dynamic,
+its dynamic probability x minimises
 
     Σ (s_i x_i² + m_i (1 − x_i)²) + Σ w_ij (x_i − x_j)²,
 
-the random walker of Grady (2006) with soft seeds: one sparse linear system. Then the colours of both sides, over the
-whole sequence, count as further evidence, and the system is solved again.
+the random walker of Grady (2006) with soft seeds: one sparse linear system. Then the colours of the static and the
+dynamic superpixels of the whole sequence serve as further evidence, and the system is solved again.
 """
 
 from collections.abc import Sequence
@@ -21,35 +21,37 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import cg
 
 SIDE = 12
-"""Of a superpixel [px]."""
+"""Side of a superpixel [px]."""
 
 COLOR_WEIGHTS = np.array([0.7, 2.0, 2.0])
-"""Of lightness and the two axes of colour in differences: shading changes lightness."""
+"""Weights of lightness and of the two colour axes in differences: shading changes lightness."""
 
 COLOR_SCALE = 10.0
-"""Difference of colour that parts superpixels, in levels of 8-bit Lab."""
+"""Colour difference that separates superpixels, in levels of 8-bit Lab."""
 
 DEPTH_SCALE = 0.12
-"""Difference of log inverse depth that parts superpixels."""
+"""Difference of log inverse depth that separates superpixels."""
 
 TIME_WEIGHT = 0.1
-"""Of an edge to the next frame, in pixels of shared border a pixel carried over."""
+"""Weight of an edge to the next frame per pixel that flow carries over it, in pixels of shared border."""
 
 TRUST = 0.5
-"""Weight of a pixel's evidence, in pixels of border."""
+"""Weight of the evidence on a pixel, in pixels of border."""
 
 PRIOR = 0.02
-"""Evidence a pixel that everything is static."""
+"""Prior evidence per pixel that it is static."""
 
 COLOR_TRUST = 0.05
-"""Evidence a pixel by colour, per unit of log odds."""
+"""Evidence of colour per pixel and unit of log odds."""
 
 MAX_LOG_ODDS = 2.5
 
-COLOR_ROUNDS = 2
+NUM_COLOR_ROUNDS = 2
 
 BINS = 20
-"""Of a colour histogram's axis; axes are ranks, so that bins are used evenly."""
+"""Bins per axis of the colour histograms; the axes are ranks, so that all bins are used."""
+
+_Edges = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,11 @@ class Segments:
     """The superpixels of one frame.
 
     Attributes:
-        labels: [H, W] number of each pixel's superpixel.
-        sizes: [S] pixels.
-        colors: [S, 3] mean Lab.
-        log_inverse_depth: [S] mean.
-        static, moving: [S] evidence, in pixels.
+        labels: [H, W] index of each pixel's superpixel.
+        sizes: [S] number of pixels.
+        colors: [S, 3] mean Lab colours.
+        log_inverse_depth: [S] means.
+        static, dynamic: [S] evidence, in pixels.
     """
 
     labels: Int[np.ndarray, "H W"]
@@ -69,23 +71,23 @@ class Segments:
     colors: Float[np.ndarray, "S 3"]
     log_inverse_depth: Float[np.ndarray, " S"]
     static: Float[np.ndarray, " S"]
-    moving: Float[np.ndarray, " S"]
+    dynamic: Float[np.ndarray, " S"]
 
 
 def segment(
     lab: UInt8[np.ndarray, "H W 3"],
     inverse_depth: Float[np.ndarray, "H W"],
     static: Float[np.ndarray, "H W"],
-    moving: Float[np.ndarray, "H W"],
+    dynamic: Float[np.ndarray, "H W"],
 ) -> Segments:
-    """Superpixels (SLIC) of a frame with what was found on their pixels, away from their borders.
+    """Superpixels (SLIC) of a frame with the evidence on their inner pixels.
 
-    A patch on a border shows both sides; only pixels inside speak for their own.
+    A patch on a border shows both sides, so its evidence is not used.
 
     Args:
-        lab: [H, W, 3] picture in 8-bit Lab.
+        lab: [H, W, 3] image in 8-bit Lab.
         inverse_depth: [H, W], positive.
-        static, moving: [H, W] evidence.
+        static, dynamic: [H, W] evidence.
     """
     slic = cv2.ximgproc.createSuperpixelSLIC(cv2.GaussianBlur(lab, (0, 0), 0.8), cv2.ximgproc.SLIC, SIDE, 15.0)
     slic.iterate(5)
@@ -104,87 +106,92 @@ def segment(
         np.stack([total(lab[..., c]) / sizes for c in range(3)], 1),
         total(np.log(np.maximum(inverse_depth, 1e-6))) / sizes,
         total(static * inner),
-        total(moving * inner),
+        total(dynamic * inner),
     )
 
 
-def _counted(a: np.ndarray, b: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The different pairs, and how often each comes."""
+def _count_pairs(a: np.ndarray, b: np.ndarray, count: int) -> _Edges:
+    """The distinct pairs, and how often each occurs."""
     key, times = np.unique(a.astype(np.int64) * count + b, return_counts=True)
     return key // count, key % count, times.astype(np.float64)
 
 
-def _alike(colors: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    apart = (colors[i] - colors[j]) * COLOR_WEIGHTS
-    return np.exp(-(apart**2).sum(1) / (2.0 * COLOR_SCALE**2))
+def _similarity(colors: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    difference = (colors[i] - colors[j]) * COLOR_WEIGHTS
+    return np.exp(-(difference**2).sum(1) / (2.0 * COLOR_SCALE**2))
 
 
 class Graph:
-    """The superpixels of all frames.
+    """The superpixels of all frames and their connections.
 
     Attributes:
-        starts: [F + 1] number of each frame's first superpixel in the graph.
+        starts: [F + 1] index of each frame's first superpixel in the graph.
     """
 
     def __init__(self, frames: Sequence[Segments], carried: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Joins the frames; ``carried`` has of each but the last pixels (flat places), and theirs in the next."""
+        """Connects the frames.
+
+        Args:
+            frames: Superpixels of each frame.
+            carried: For each frame but the last, flat indices of pixels, and their indices in the next frame.
+        """
         self.frames = frames
         self.starts = np.cumsum([0, *(len(f.sizes) for f in frames)])
-        self._sizes, self._colors, self._depths, self._static, self._moving = (
+        self._sizes, self._colors, self._depths, self._static, self._dynamic = (
             np.concatenate(parts)
             for parts in zip(
-                *((f.sizes, f.colors, f.log_inverse_depth, f.static, f.moving) for f in frames), strict=True
+                *((f.sizes, f.colors, f.log_inverse_depth, f.static, f.dynamic) for f in frames), strict=True
             )
         )
         count = int(self.starts[-1])
-        edges = [self._beside(k) for k in range(len(frames))]
-        edges += [self._carried(k, *pairs) for k, pairs in enumerate(carried)]
+        edges = [self._edges_within(k) for k in range(len(frames))]
+        edges += [self._edges_to_next(k, *pairs) for k, pairs in enumerate(carried)]
         i, j, weights = (np.concatenate(part) for part in zip(*edges, strict=True))
         half = sparse.coo_matrix((weights, (i, j)), shape=(count, count))
         self._weights = (half + half.T).tocsr()
         self._degrees = np.asarray(self._weights.sum(1)).ravel()
 
-    def _beside(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _edges_within(self, k: int) -> _Edges:
         labels = self.frames[k].labels
         a = np.concatenate([labels[:, :-1].ravel(), labels[:-1].ravel()])
         b = np.concatenate([labels[:, 1:].ravel(), labels[1:].ravel()])
         border = a != b
         low, high = np.minimum(a, b)[border], np.maximum(a, b)[border]
-        i, j, length = _counted(low, high, len(self.frames[k].sizes))
+        i, j, length = _count_pairs(low, high, len(self.frames[k].sizes))
         i, j = i + self.starts[k], j + self.starts[k]
-        apart = np.exp(-((self._depths[i] - self._depths[j]) ** 2) / (2.0 * DEPTH_SCALE**2))
-        return i, j, length * (_alike(self._colors, i, j) * apart + 1e-3)
+        depth_similarity = np.exp(-((self._depths[i] - self._depths[j]) ** 2) / (2.0 * DEPTH_SCALE**2))
+        return i, j, length * (_similarity(self._colors, i, j) * depth_similarity + 1e-3)
 
-    def _carried(self, k: int, pixels: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        a, b = self.frames[k].labels.ravel()[pixels], self.frames[k + 1].labels.ravel()[there]
-        i, j, shared = _counted(a, b, max(len(self.frames[k].sizes), len(self.frames[k + 1].sizes)))
+    def _edges_to_next(self, k: int, pixels: np.ndarray, targets: np.ndarray) -> _Edges:
+        a, b = self.frames[k].labels.ravel()[pixels], self.frames[k + 1].labels.ravel()[targets]
+        i, j, shared = _count_pairs(a, b, max(len(self.frames[k].sizes), len(self.frames[k + 1].sizes)))
         i, j = i + self.starts[k], j + self.starts[k + 1]
-        return i, j, TIME_WEIGHT * shared * _alike(self._colors, i, j)
+        return i, j, TIME_WEIGHT * shared * _similarity(self._colors, i, j)
 
-    def motion(self) -> list[Float[np.ndarray, "H W"]]:
-        """[H, W] share of motion in [0, 1] of each frame's pixels."""
+    def dynamic_probabilities(self) -> list[Float[np.ndarray, "H W"]]:
+        """[H, W] probability in [0, 1] that each frame's pixels are dynamic."""
         x = self._solve(np.zeros_like(self._sizes), np.zeros_like(self._sizes))
         cells = self._cells()
-        for _ in range(COLOR_ROUNDS):
+        for _ in range(NUM_COLOR_ROUNDS):
             odds = self._log_odds(cells, x)
             x = self._solve(*(COLOR_TRUST * self._sizes * np.maximum(o, 0.0) for o in (-odds, odds)))
         return [x[start + frame.labels] for start, frame in zip(self.starts, self.frames, strict=False)]
 
-    def _solve(self, more_static: np.ndarray, more_moving: np.ndarray) -> np.ndarray:
+    def _solve(self, more_static: np.ndarray, more_dynamic: np.ndarray) -> np.ndarray:
         static = TRUST * self._static + PRIOR * self._sizes + more_static
-        moving = TRUST * self._moving + more_moving
-        diagonal = static + moving + self._degrees + 1e-9  # a superpixel without evidence and edges is static
+        dynamic = TRUST * self._dynamic + more_dynamic
+        diagonal = static + dynamic + self._degrees + 1e-9  # a superpixel without evidence and edges is static
         matrix = (sparse.diags(diagonal) - self._weights).tocsr()
-        x, _ = cg(matrix, moving, rtol=1e-3, maxiter=300, M=sparse.diags(1.0 / diagonal))
+        x, _ = cg(matrix, dynamic, rtol=1e-3, maxiter=300, M=sparse.diags(1.0 / diagonal))
         return x
 
     def _cells(self) -> tuple[np.ndarray, ...]:
-        """The superpixels' places in the colour histogram."""
+        """The superpixels' bins in the colour histograms."""
         ranks = [np.searchsorted(np.sort(axis[::7]), axis) / len(axis[::7]) for axis in self._colors.T]
         return tuple(np.clip((BINS * rank).astype(int), 0, BINS - 1) for rank in ranks)
 
     def _log_odds(self, cells: tuple[np.ndarray, ...], x: np.ndarray) -> np.ndarray:
-        """How much oftener a superpixel's colour moves than stands."""
+        """[S] log odds that superpixels of a superpixel's colour are dynamic."""
         counts = []
         for certain in (np.clip((x - 0.45) * 4.0, 0.0, 1.0), np.clip((0.45 - x) * 4.0, 0.0, 1.0)):
             histogram = np.zeros((BINS,) * 3)

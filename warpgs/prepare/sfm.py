@@ -1,6 +1,6 @@
-"""Cameras and sparse points of a moving camera's frames, by COLMAP (pycolmap).
+"""Structure from motion with COLMAP (pycolmap): cameras and sparse points of a video's frames.
 
-SIFT features away from what moves, matching, incremental mapping with bundle adjustment, one lens for all frames.
+SIFT features in static regions, matching, incremental mapping with bundle adjustment; one lens for all frames.
 """
 
 import shutil
@@ -11,119 +11,83 @@ from typing import Any
 import cv2  # noqa: F401  pycolmap before OpenCV breaks OpenCV's PNG files: both bring a zlib (seen with 5.0 and 4.2)
 import numpy as np
 import pycolmap
-from jaxtyping import Float
 
 from warpgs.data.lens import Lens
 
+from .cameras import Cameras
 from .options import LensModel
 
 EXHAUSTIVE_FRAMES = 100
-"""Up to so many frames all pairs are matched; beyond, each with the next ones and with some further off."""
+"""Number of frames up to which all pairs are matched; in longer sequences, each with the next and some later ones."""
 
 FALLBACK_FRAMES = 250
-"""Up to so many frames all pairs are matched where matching along the sequence has lost some."""
+"""Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
 
 OVERLAP = 10
-"""Frames after each frame that it is matched with; beyond, powers of two."""
+"""Number of next frames that each frame is matched with, in addition to those at powers of two."""
 
 MAX_FEATURES = 4096
-"""Features a frame; matching takes time with their square."""
+"""Maximum number of features per frame; the time for matching grows with its square."""
 
 WEAK_PEAK = 0.002
-"""Contrast that weak features must have at least; COLMAP's default is 0.0067."""
+"""Minimum contrast of weak features; COLMAP's default is 0.0067."""
 
 MIN_FEATURES = 60
-"""Features a frame under which pictures count as without texture."""
+"""Minimum number of features per frame; with fewer, the frames lack texture."""
 
 MIN_REGISTERED = 0.5
-"""Share of the frames that must get a camera."""
+"""Minimum fraction of the frames that get a camera."""
 
 MIN_ANGLE = 1.0
-"""Median angle under which points are seen [degrees]; less leaves depth undetermined."""
+"""Minimum of the median triangulation angle [degrees]; with less, depth is undetermined."""
 
 MIN_POINTS = 100
-"""Points under which a reconstruction is chance: a camera that only turns gives some."""
+"""Minimum number of points; a camera that only rotates gives some by chance."""
 
 MAX_ERROR = 2.0
-"""Points with a larger mean reprojection error are left out [px]."""
+"""Maximum mean reprojection error of a point [px]; others are omitted."""
 
 
 class NoCamerasError(ValueError):
-    """The pictures don't tell where they were taken from."""
+    """The cameras cannot be recovered from the frames."""
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """What was recovered.
+class Settings:
+    """How to recover cameras.
 
     Attributes:
-        names: Frames that got a camera, in order.
-        lens: Of them all.
-        poses: [F, 3, 4] world to camera, OpenCV axes.
-        points: [P, 3] in the world.
-        error: Mean reprojection error [px].
-        angle: Median over the points of the largest angle between two rays to one [degrees].
+        lens: COLMAP's lens model.
+        masks: Folder of masks <name>.png.png; features are extracted where they are not 0.
+        thorough: Whether to match all pairs of up to ``EXHAUSTIVE_FRAMES`` frames, not only along the sequence.
+        weak_features: Whether to use features of low contrast too: more on plain surfaces, but less exact.
     """
 
-    names: list[str]
-    lens: Lens
-    poses: Float[np.ndarray, "F 3 4"]
-    points: Float[np.ndarray, "P 3"]
-    error: float
-    angle: float
-
-    def save(self, path: Path) -> None:
-        """Writes an .npz file."""
-        lens = self.lens
-        np.savez(
-            path,
-            names=np.array(self.names),
-            lens=np.array([lens.width, lens.height, *lens.focal, *lens.center, *lens.radial, *lens.tangential]),
-            poses=self.poses,
-            points=self.points,
-            quality=np.array([self.error, self.angle]),
-        )
-
-    @staticmethod
-    def load(path: Path) -> "Cameras":
-        """What ``save`` wrote."""
-        with np.load(path) as z:
-            v = z["lens"].tolist()
-            lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
-            error, angle = z["quality"].tolist()
-            return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle)
+    lens: LensModel = "SIMPLE_RADIAL"
+    masks: Path | None = None
+    thorough: bool = True
+    weak_features: bool = False
 
 
-def recover_cameras(
-    folder: Path,
-    names: list[str],
-    work: Path,
-    model: LensModel = "SIMPLE_RADIAL",
-    masks: Path | None = None,
-    thorough: bool = True,
-    weak: bool = False,
-) -> Cameras:
-    """Cameras of the frames folder/<name>.png.
+def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settings) -> Cameras:
+    """The cameras of the frames <folder>/<name>.png.
 
     Args:
-        folder: Where the frames are.
-        names: Which.
-        work: Empty or missing folder for COLMAP's files, removed afterwards.
-        model: COLMAP's model of the lens.
-        masks: Folder of masks <name>.png.png; features are taken where they are not 0.
-        thorough: Whether to match all pairs of few frames, not only along the sequence.
-        weak: Whether to take features of low contrast too: more on plain walls, less exact ones.
+        folder: Folder of the frames.
+        names: Names of the frames.
+        work: Folder for COLMAP's files, emptied before and removed afterwards.
+        settings: How to recover cameras.
 
     Raises:
-        NoCamerasError: If the pictures are not fit; says why and what to try.
+        NoCamerasError: If the frames are not suitable; the message says why and what to try.
         ValueError: If COLMAP itself failed.
     """
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
-    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 4  # errors come as exceptions
+    level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 4  # errors are raised as exceptions
     try:
-        _extract(folder, names, work, _readers(model, masks, weak))
-        best = _largest(folder, len(names), work, thorough)
+        _extract(folder, names, work, settings)
+        best = _largest(folder, len(names), work, settings.thorough)
     except (RuntimeError, IndexError) as error:
         raise ValueError(f"COLMAP failed on {folder}: {error}") from error
     finally:
@@ -131,38 +95,34 @@ def recover_cameras(
         shutil.rmtree(work, ignore_errors=True)
     if best is None:
         raise NoCamerasError(
-            "no two frames show enough of the same static things from different places: move the camera sideways, "
-            "slower and over textured things, or take frames closer in time (--fps, --count)"
+            "no two frames show enough of the same static surfaces from different positions: move the camera sideways, "
+            "slower and past textured objects, or take frames closer in time (--fps, --count)"
         )
-    return _result(best, names)
+    return _cameras(best, names, settings.weak_features)
 
 
-def _readers(model: str, masks: Path | None, weak: bool) -> tuple[Any, Any]:
+def _extract(folder: Path, names: list[str], work: Path, settings: Settings) -> None:
     reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-    reading.camera_model = model
-    if masks is not None:
-        reading.mask_path = masks
+    reading.camera_model = settings.lens
+    if settings.masks is not None:
+        reading.mask_path = settings.masks
     extraction.sift.max_num_features = MAX_FEATURES
-    if weak:
+    if settings.weak_features:
         extraction.sift.peak_threshold = WEAK_PEAK
-    return reading, extraction
-
-
-def _extract(folder: Path, names: list[str], work: Path, options: tuple[Any, Any]) -> None:
     files = [f"{name}.png" for name in names]
     database, one_lens = work / "database.db", pycolmap.CameraMode.SINGLE
     pycolmap.set_random_seed(0)
-    pycolmap.extract_features(database, folder, files, one_lens, *options, pycolmap.Device.cpu)
+    pycolmap.extract_features(database, folder, files, one_lens, reading, extraction, pycolmap.Device.cpu)
     _check_features(database, len(names))
 
 
 def _largest(folder: Path, count: int, work: Path, thorough: bool) -> Any:
-    """The largest reconstruction; None if there is none."""
+    """The reconstruction with the most frames; None if there is none."""
     exhaustive = thorough and count <= EXHAUSTIVE_FRAMES
-    best = _matched(folder, work, "first", exhaustive)
+    best = _reconstruct(folder, work, "first", exhaustive)
     few = best is None or best.num_reg_images() < 0.9 * count
     if few and not exhaustive and count <= FALLBACK_FRAMES:
-        again = _matched(folder, work, "again", True)
+        again = _reconstruct(folder, work, "again", True)
         if best is None or (again is not None and again.num_reg_images() > best.num_reg_images()):
             best = again
     return best
@@ -176,12 +136,12 @@ def _check_features(database: Path, count: int) -> None:
         opened.close()
     if features < MIN_FEATURES:
         raise NoCamerasError(
-            f"the pictures have hardly any texture where nothing moves: {features:.0f} features a frame, at least "
-            f"{MIN_FEATURES} are needed; film textured things, in more light, or check the masks"
+            f"the frames have hardly any texture in static regions: {features:.0f} features per frame, at least "
+            f"{MIN_FEATURES} are needed; record textured objects, in more light, or check the masks"
         )
 
 
-def _matched(folder: Path, work: Path, name: str, exhaustive: bool) -> Any:
+def _reconstruct(folder: Path, work: Path, name: str, exhaustive: bool) -> Any:
     database, out = work / "database.db", work / name
     if exhaustive:
         pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
@@ -194,13 +154,13 @@ def _matched(folder: Path, work: Path, name: str, exhaustive: bool) -> Any:
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def _result(model: Any, names: list[str]) -> Cameras:
+def _cameras(model: Any, names: list[str], weak_features: bool) -> Cameras:
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
     if len(images) < max(MIN_REGISTERED * len(names), 3):
         raise NoCamerasError(
-            f"only {len(images)} of {len(names)} frames could be placed: too much moves, the camera moves too fast, "
-            "or the pictures have too little texture; try more frames (--fps, --count), a slower part of the video, "
-            "or masks of what moves (--masks FOLDER)"
+            f"cameras were found for only {len(images)} of {len(names)} frames: too much moves, the camera moves too "
+            "fast, or the frames have too little texture; try more frames (--fps, --count), a slower part of the "
+            "video, or masks of what moves (--masks FOLDER)"
         )
     poses = np.array([i.cam_from_world().matrix() for i in images])
     points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= MAX_ERROR]
@@ -211,17 +171,19 @@ def _result(model: Any, names: list[str]) -> Cameras:
         np.array([p.xyz for p in points]).reshape(-1, 3),
         float(model.compute_mean_reprojection_error()),
         _angle(model, points),
+        weak_features,
     )
     if found.angle < MIN_ANGLE or len(points) < MIN_POINTS:
         raise NoCamerasError(
-            f"the camera hardly changes its place: {len(points)} points could be placed, seen under "
-            f"{found.angle:.1f}°; at least {MIN_POINTS} and {MIN_ANGLE}° are needed; walk around the scene "
-            "instead of turning in one place"
+            f"the camera hardly moves: {len(points)} points at a median triangulation angle of {found.angle:.1f}° were "
+            f"found; at least {MIN_POINTS} and {MIN_ANGLE}° are needed; walk around the scene instead of turning on "
+            "the spot"
         )
     return found
 
 
 def _angle(model: Any, points: list[Any]) -> float:
+    """Median triangulation angle of some points [degrees]: the largest angle between two rays to a point."""
     largest = []
     for point in points[:: max(1, len(points) // 500)]:
         centers = [model.images[e.image_id].projection_center() for e in point.track.elements]
@@ -232,13 +194,13 @@ def _angle(model: Any, points: list[Any]) -> float:
 
 
 def _lens(camera: Any) -> Lens:
-    """COLMAP's camera as ours; both measure from the corner of the picture."""
+    """COLMAP's camera as a lens; both measure from the corner of the image."""
     v: dict[str, float] = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
-    across = v.get("fx", v.get("f", 0.0))
+    focal = v.get("fx", v.get("f", 0.0))
     return Lens(
         camera.width,
         camera.height,
-        (across, v.get("fy", across)),
+        (focal, v.get("fy", focal)),
         (v["cx"], v["cy"]),
         (v.get("k1", v.get("k", 0.0)), v.get("k2", 0.0), 0.0),
         (v.get("p1", 0.0), v.get("p2", 0.0)),

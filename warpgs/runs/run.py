@@ -58,7 +58,9 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
         stem = Path("runs") / f"{capture.name}-{config.preset}"
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ValueError(f"{folder} exists and is not empty: continue it with --resume {folder}, or choose another --out")
+        raise ValueError(
+            f"{folder} exists and is not empty: continue it with --resume {folder}, or choose another --out"
+        )
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Input checks of the public functions: fail at the door, in words."""
+"""Input checks of the public functions, with readable messages."""
 
 from collections.abc import Mapping
 
@@ -16,10 +16,10 @@ def check_tensor(
     """Raises ``ValueError`` unless ``value`` is a contiguous tensor of a shape and dtype.
 
     Args:
-        name: How the user knows the tensor.
-        shape: A size for each axis: a number, or a letter that stands for the same size wherever it occurs.
-        sizes: Sizes of the letters seen so far; extended by this tensor.
-        dtypes: What is allowed.
+        name: Name of the tensor in messages.
+        shape: The size of each axis: a number, or a name that stands for the same size wherever it occurs.
+        sizes: Known sizes by name; extended by those of this tensor.
+        dtypes: The allowed types.
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a torch tensor, got {type(value).__name__}")
@@ -40,7 +40,7 @@ def check_tensor(
 
 
 def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
-    """Raises ``ValueError`` unless all tensors lie on one CPU or CUDA device."""
+    """Raises ``ValueError`` unless all tensors are on the same CPU or CUDA device."""
     devices = [(name, t.device) for name, t in tensors.items() if t is not None]
     first_name, first = devices[0]
     if first.type not in ("cpu", "cuda"):
@@ -51,7 +51,7 @@ def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
 
 
 def check_image_size(width: int, height: int) -> None:
-    """Raises ``ValueError`` unless an image has a size that can be rendered."""
+    """Raises ``ValueError`` unless an image of ``width`` × ``height`` pixels can be rendered."""
     for name, value in (("width", width), ("height", height)):
         if isinstance(value, bool) or not isinstance(value, int):
             raise ValueError(f"{name} must be an int, got {value!r}")

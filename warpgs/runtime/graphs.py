@@ -1,4 +1,4 @@
-"""CUDA graphs: work recorded once and replayed with one launch."""
+"""CUDA graphs: work that is recorded once and replayed with a single launch."""
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
@@ -11,30 +11,29 @@ from torch import Tensor
 from .streams import PRIORITY, WARP_STREAM, join_captured, side_stream
 
 WARM_UPS = 3
-"""Runs before the capture: they compile kernels, allocate scratch memory and learn how many intersections to expect."""
+"""Eager runs before a capture: they compile kernels, allocate scratch memory and learn the number of intersections."""
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass
 class _Captured:
-    """A graph and the tensors that each replay fills."""
+    """A graph and the tensors that its replays fill."""
 
     replay: Callable[[], None] | None = None
     outputs: tuple[Tensor, ...] = ()
 
 
 class GraphCache(Generic[Key]):
-    """CUDA graphs by key: work is run eagerly a few times for each key, then captured once and replayed.
+    """CUDA graphs by key: the work of a key is run eagerly ``WARM_UPS`` times, then captured once and replayed.
 
-    The key must say everything that the work branches on. Whatever else changes between runs is read from tensors
-    that stay at their addresses. On a key's first ``WARM_UPS`` runs the work runs eagerly: they compile kernels,
-    allocate scratch memory and learn how many intersections to expect.
+    The key must contain everything that the work branches on. Everything else that changes between runs must be read
+    from tensors that stay at the same addresses.
 
     Args:
-        max_graphs: Graphs to keep; the one that was captured first is dropped for another.
-        shared_memory: Device on which all graphs share one pool of memory and one stream, so that a new graph takes
-            over the memory of the one before it; for ``max_graphs`` = 1. None: each graph has memory of its own.
+        max_graphs: Maximum number of graphs; the oldest one is dropped for a new one.
+        shared_memory: Device on which all graphs share one memory pool and one stream, so that a new graph reuses the
+            memory of the one before it; for ``max_graphs`` = 1. None: each graph has its own memory.
     """
 
     def __init__(self, max_graphs: int, shared_memory: torch.device | None = None) -> None:
@@ -50,9 +49,9 @@ class GraphCache(Generic[Key]):
         return key in self._graphs and key not in self._stale
 
     def invalidate(self) -> None:
-        """Captures every key again on its next run, because tensors that the work reads were replaced.
+        """Makes the next run of every key capture again, because tensors that the work reads were replaced.
 
-        The graphs stay in memory until then: the new capture takes that memory over.
+        The old graphs stay in memory until then, and the new captures reuse that memory.
         """
         self._stale.update(self._graphs)
 
@@ -61,10 +60,10 @@ class GraphCache(Generic[Key]):
 
         Args:
             key: Everything that ``work`` branches on.
-            work: Works on the current CUDA device without reading anything back from it.
+            work: Runs on the current CUDA device without reading anything back from it.
 
         Returns:
-            What ``work`` returns; from a replay the same tensors every time, with new values.
+            The results of ``work``; replays return the same tensors every time, with new values.
         """
         if self.is_captured(key):
             captured = self._graphs[key]
@@ -84,7 +83,7 @@ class GraphCache(Generic[Key]):
             captured.outputs = work()
 
         captured.replay = record(fill_outputs, self._stream, self._pool)
-        self._graphs.pop(key, None)  # only now: its memory was taken over
+        self._graphs.pop(key, None)  # only now, because the capture reuses its memory
         self._graphs[key] = captured
         self._stale.discard(key)
         while len(self._graphs) > self._max_graphs:
@@ -98,16 +97,16 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
     """Captures ``step`` in a CUDA graph and returns a function that replays it.
 
     The replay runs on torch's current stream and returns the same tensors every time, with new values. The graph holds
-    addresses, not tensors: what ``step`` reads must stay alive and may only be changed in place. Scalars, image sizes
-    and the size of the buffers for intersections are those of the capture; a replay with more intersections than these
-    buffers hold is still drawn in full, but slowly.
+    addresses, not tensors: the inputs of ``step`` must stay alive and may only be modified in place. Scalars, image
+    sizes and the size of the buffers for intersections are those of the capture; a replay with more intersections than
+    the buffers hold is still rendered completely, but slowly.
 
-    A capture must not wait for the device, which ``render`` does on the first frame of an image size on each thread, to
-    learn the number of intersections. So ``step`` is first run a few times, on this thread and on the stream that the
-    capture uses. (The way back runs on autograd's own thread, where nothing waits.)
+    A capture must not wait for the device, but ``render`` does so on each thread for the first frame of an image size,
+    to learn the number of intersections. So ``step`` is first run ``WARM_UPS`` times, on this thread and on the stream
+    of the capture. (The backward pass runs on autograd's own thread and does not wait.)
 
     Args:
-        step: Works on the current CUDA device without reading anything back from it.
+        step: Runs on the current CUDA device without reading anything back from it.
     """
     outputs: tuple[Tensor, ...] = ()
 
@@ -132,21 +131,21 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
 def record(
     work: Callable[[], None], stream: torch.cuda.Stream | None = None, pool: Any | None = None
 ) -> Callable[[], None]:
-    """Records ``work`` in a CUDA graph without running it, and returns a function that runs it.
+    """Records ``work`` in a CUDA graph without running it, and returns a function that replays it.
 
-    As ``capture``, for work that changes tensors in place and must not be repeated for warming up: it has to have run
-    a few times before.
+    As ``capture``, for work that modifies tensors in place and must not be repeated for warming up: it must have run
+    ``WARM_UPS`` times before.
 
     Args:
-        work: Works on the current CUDA device without reading anything back from it.
-        stream: To capture on; a new one by default.
-        pool: From ``torch.cuda.graph_pool_handle()``. Graphs that share one, and the stream, share memory: only one of
-            them may be in use, and a new one takes over what the one before it had, which spares the driver's slow
-            allocation.
+        work: Runs on the current CUDA device without reading anything back from it.
+        stream: The stream to capture on; a new one by default.
+        pool: From ``torch.cuda.graph_pool_handle()``. Graphs with the same pool and stream share memory: only one of
+            them may be in use, and a new one reuses the memory of the one before it, which avoids slow allocations by
+            the driver.
     """
     stream = stream or torch.cuda.Stream(priority=PRIORITY)
     graph = torch.cuda.CUDAGraph()
-    with WARP_STREAM:  # one capture at a time: nobody may wait for the whole GPU while there is one
+    with WARP_STREAM:  # one capture at a time, because no thread may wait for the whole GPU during a capture
         torch.cuda.synchronize()
         _record(work, graph, stream, pool)
     return graph.replay
@@ -155,10 +154,10 @@ def record(
 def _record(work: Callable[[], None], graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) -> None:
     warp_stream = wp.stream_from_torch(stream)
     with torch.cuda.stream(stream):
-        side_stream(stream.device)  # to be there before the capture: nothing is made in one
+        side_stream(stream.device)  # created here, because a capture cannot create streams
     current = torch.cuda.current_stream()
     try:
-        # Autograd's thread does the way back, so a capture that forbids calls on all threads but this one would fail.
+        # Autograd's own thread runs the backward pass, so the capture must not be restricted to this thread.
         with (
             torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
             wp.ScopedStream(warp_stream, sync_enter=False),
@@ -170,4 +169,4 @@ def _record(work: Callable[[], None], graph: torch.cuda.CUDAGraph, stream: torch
                 join_captured(stream.device)
                 raise
     finally:
-        torch.cuda.set_stream(current)  # torch leaves its own behind where the end of a capture fails
+        torch.cuda.set_stream(current)  # torch does not restore it if the end of a capture fails

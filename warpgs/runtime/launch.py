@@ -1,4 +1,4 @@
-"""Recorded launches: kernels whose arguments are tensors, started at little cost to the host."""
+"""Recorded launches of kernels, which cost the host less than ``wp.launch``."""
 
 import threading
 from collections.abc import Sequence
@@ -12,16 +12,21 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PerShard:
-    """A kernel argument of which every CPU shard gets its own slice, because Warp's CPU atomics are plain adds."""
+    """A kernel argument of which each CPU shard gets its own slice, because Warp's atomics are not atomic on CPU."""
 
     tensor: Tensor
 
 
 class Command:
-    """A recorded launch of one kernel whose arguments are rewritten in place.
+    """A recorded launch of one kernel, whose arguments are overwritten in place.
 
-    ``wp.launch`` packs and checks every argument anew (22 µs on the host for a typical kernel, more than many kernels
-    take); here an argument that has the shape of last time costs one pointer.
+    ``wp.launch`` packs and checks all arguments every time (22 µs on the host for a typical kernel, more than many
+    kernels take). Here, an argument with the same shape as last time only updates a pointer.
+
+    Args:
+        kernel: Its first parameter is ``first``, the index of the first thread.
+        device: To launch it on.
+        block_dim: Threads per CUDA block.
     """
 
     def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
@@ -35,6 +40,7 @@ class Command:
     def __call__(
         self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None, shard: int = 0
     ) -> None:
+        """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers or None (an empty array)."""
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
@@ -59,7 +65,7 @@ class Command:
 
 
 def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
-    """Writes a tensor's shape and strides into a kernel argument, after checking that the kernel may read it so."""
+    """Writes the shape and strides of a tensor to a kernel argument, after checking that they fit the kernel."""
     dtype, ndim = argument.type.dtype, argument.type.ndim
     inner = getattr(dtype, "_shape_", ())
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
@@ -82,13 +88,13 @@ _load_lock = threading.Lock()
 
 
 def command_for(kernel: wp.Kernel, device: torch.device, block_dim: int) -> Command:
-    """This thread's command for a kernel; threads share none, so a viewer may render while a trainer trains."""
+    """This thread's command for a kernel. Each thread has its own, so that a viewer can render while a scene trains."""
     try:
         return _commands.cache[kernel, device, block_dim]
     except AttributeError:
         _commands.cache = {}
     except KeyError:
         pass
-    with _load_lock:  # two threads that compile and load one module at once unload each other's code
+    with _load_lock:  # two threads that load the same module at once would unload each other's code
         made = _commands.cache[kernel, device, block_dim] = Command(kernel, wp.device_from_torch(device), block_dim)
     return made

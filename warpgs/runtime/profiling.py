@@ -1,4 +1,4 @@
-"""Times of kernels: CUDA events on a GPU, wall time on CPU."""
+"""Kernel times: CUDA events on a GPU, wall time on CPU."""
 
 import contextlib
 import time
@@ -11,7 +11,7 @@ import torch
 
 @dataclass
 class KernelTime:
-    """One launch seen by ``profile``: start and duration in milliseconds."""
+    """One launch: start since the begin of the profile and duration [ms]."""
 
     name: str
     start_ms: float
@@ -20,13 +20,14 @@ class KernelTime:
 
 @dataclass
 class Profile:
-    """What ``profile`` gathers; ``times`` waits for the device."""
+    """The launches inside ``profile``."""
 
     _origin: float = field(default_factory=time.perf_counter)
     _first_event: Any = None
     _entries: list[tuple[str, Any, Any]] = field(default_factory=list)
 
     def times(self) -> list[KernelTime]:
+        """One entry per launch, in order; waits for the device."""
         if self._first_event is not None:
             torch.cuda.synchronize()
         result = []
@@ -39,6 +40,7 @@ class Profile:
 
     @contextlib.contextmanager
     def span(self, name: str, device: torch.device) -> Iterator[None]:
+        """Times the body of a ``with`` statement as one entry."""
         if device.type == "cuda":
             begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
             begin.record()
@@ -58,10 +60,14 @@ _NOTHING = contextlib.nullcontext()
 
 @contextlib.contextmanager
 def profile() -> Iterator[Profile]:
-    """Times every kernel launched inside: CUDA events on a GPU, wall time on CPU."""
+    """Times every kernel that is launched inside: CUDA events on a GPU, wall time on CPU.
+
+    Raises:
+        RuntimeError: If another profile is active.
+    """
     global _active_profile
     if _active_profile is not None:
-        raise RuntimeError("a profile is already being taken")
+        raise RuntimeError("another profile is active")
     _active_profile = Profile()
     try:
         yield _active_profile
@@ -70,10 +76,10 @@ def profile() -> Iterator[Profile]:
 
 
 def is_on() -> bool:
-    """Whether a profile is being taken."""
+    """Whether a profile is active."""
     return _active_profile is not None
 
 
 def span(name: str, device: torch.device) -> contextlib.AbstractContextManager[None]:
-    """Times what runs inside, if a profile is being taken."""
+    """Times the body of a ``with`` statement if a profile is active."""
     return _NOTHING if _active_profile is None else _active_profile.span(name, device)

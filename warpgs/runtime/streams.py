@@ -1,4 +1,4 @@
-"""Streams: what the GPU does at the same time, and what goes first."""
+"""CUDA streams: concurrent work and its priorities."""
 
 import contextlib
 import threading
@@ -9,20 +9,20 @@ import torch
 from . import profiling
 
 PRIORITY = -1
-"""Of work that others wait for; 0, the lowest, is that of what runs beside it. Else large matrix products would let
-none of many small kernels in."""
+"""Priority of the main work; concurrent work has 0, the lowest. With equal priorities, large matrix products of the
+concurrent work would delay many small kernels."""
 
 WARP_STREAM = threading.RLock()
-"""Held by who changes Warp's current stream, which is one for all threads, unlike torch's."""
+"""Lock for changing Warp's current stream, which all threads share, unlike torch's."""
 
 _streams = threading.local()
 
 
 def side_stream(device: torch.device) -> torch.cuda.Stream:
-    """A second stream of this thread beside the current one.
+    """This thread's stream for work that is concurrent to the current stream.
 
-    Threads share none, because one may be capturing a graph, and neither do two current streams: memory that is freed
-    is handed out again to what waits for one of them alone.
+    Each thread has its own, because another thread may be capturing a graph, and so has each current stream, because
+    freed memory is reused by work that waits for only one of them.
     """
     key = f"{torch.cuda.current_stream(device).cuda_stream} on {device}"
     streams = _streams.__dict__
@@ -33,10 +33,13 @@ def side_stream(device: torch.device) -> torch.cuda.Stream:
 
 @contextlib.contextmanager
 def on_side_stream(device: torch.device) -> Iterator[torch.cuda.Stream | None]:
-    """What is done inside runs beside what comes after it; autograd goes the ways back at the same time, too.
+    """Runs the body concurrently to the code after it; autograd runs their backward passes concurrently, too.
 
-    Gives the stream that the current one has to ``join`` before it uses what was made inside; None where it need not:
-    on CPU, or while a profile is taken. What was read inside must stay alive until then, and unchanged.
+    Tensors that the body reads must stay alive and unmodified until the streams are joined.
+
+    Yields:
+        The stream that the current stream must ``join`` before using the results; None if that is not necessary: on
+        CPU, or while a profile is active.
     """
     if device.type != "cuda" or profiling.is_on():
         yield None
@@ -48,13 +51,13 @@ def on_side_stream(device: torch.device) -> Iterator[torch.cuda.Stream | None]:
 
 
 def join(stream: torch.cuda.Stream | None) -> None:
-    """Makes the current stream wait for what ``on_side_stream`` gave."""
+    """Makes the current stream wait for a stream of ``on_side_stream``; does nothing for None."""
     if stream is not None:
         torch.cuda.current_stream(stream.device).wait_stream(stream)
 
 
 def join_captured(device: torch.device) -> None:
-    """Joins what a failed capture left beside it: else its end complains of that, not of what is wrong."""
+    """Joins the side stream of a failed capture, which would otherwise hide the error that made it fail."""
     stream = side_stream(device)
     with torch.cuda.stream(stream):
         is_captured = torch.cuda.is_current_stream_capturing()

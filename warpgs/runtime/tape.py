@@ -1,8 +1,8 @@
-"""The only bridge between torch and Warp: memory, streams, launches (``commands``) and adjoints.
+"""The bridge between torch and Warp: memory, streams, launches and gradients.
 
-An op is a function ``op(run, *tensors, ...) -> tensors``. Through its ``Run`` it allocates (from torch), launches
-kernels on torch's current stream, and records how to go back; ``differentiable`` wraps it into autograd. All ops of one
-``differentiable`` call share one ``wp.Tape``, so a whole render crosses between torch and Warp once each way.
+An op is a function ``op(ctx, *tensors) -> tensors``. Through its ``OpContext`` it allocates memory (from torch),
+launches kernels on torch's current stream and records its backward pass; ``differentiable`` makes it an autograd node.
+All parts of one ``differentiable`` call share one ``wp.Tape``, so that a whole render is a single node.
 """
 
 import contextlib
@@ -26,16 +26,16 @@ wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 CHUNKS_PER_SHARD = 16
-"""Pieces a core that a CPU launch is cut into and that are dealt out in turn, so that cores get like shares."""
+"""Chunks per core that a CPU launch is split into; cores take them in turn, so that their work is balanced."""
 
 MIN_SHARD = 16384
-"""Threads below which a CPU launch is not worth another core."""
+"""A CPU launch with less work than this, in plain threads, uses a single core."""
 
 LITTLE_WORK = 1 / 16
-"""What a thread that only moves a few numbers does of a plain thread's work."""
+"""Work of a thread that only copies a few numbers, relative to a plain thread."""
 
 Op = Callable[..., tuple[Tensor, ...]]
-"""``op(run, *tensors) -> tensors``."""
+"""``op(ctx, *tensors) -> tensors`` with an ``OpContext``."""
 
 _CORES = os.cpu_count() or 1
 _pool: ThreadPoolExecutor | None = None
@@ -50,88 +50,99 @@ def _workers() -> ThreadPoolExecutor:
         return _pool
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Runs
+class OpContext:
+    """One call of an op: its forward pass, and its backward pass if there is one.
 
-
-class Run:
-    """One forward pass of an op, and the way back.
+    Args:
+        device: Device of all tensors.
+        inputs_with_gradient: Those inputs of the op that need a gradient.
 
     Attributes:
-        device: Where the tensors live.
-        needs_grad: Whether anything will ask for gradients; if not, ops keep nothing for the way back.
-        num_shards: Cores that a CPU launch is spread over (``torch.get_num_threads()``); 1 on CUDA.
-        filled: Outputs of the op that the way back writes to.
-        read: What the way back reads and nobody may change meanwhile, if it is an output of the op.
-        conditions: What has to hold for the launches to do the same job again, for other values of the tensors.
+        device: Device of all tensors.
+        needs_backward: Whether there may be a backward pass; if not, ops save nothing for it.
+        is_cuda: Whether the device is a GPU.
+        num_shards: Number of cores that a CPU launch uses (``torch.get_num_threads()``); 1 on CUDA.
+        outputs_written_in_backward: Outputs of the op that the backward pass fills.
+        read_in_backward: Tensors that the backward pass reads; those that are outputs of the op must not be modified
+            before.
+        replay_conditions: Must all be true for the recorded launches to be valid for other values of the inputs.
     """
 
-    def __init__(self, device: torch.device, wanted: Sequence[Tensor]):
+    def __init__(self, device: torch.device, inputs_with_gradient: Sequence[Tensor]):
         self.device = device
-        self.needs_grad = bool(wanted)
-        self._wanted = {id(t) for t in wanted}
+        self.needs_backward = bool(inputs_with_gradient)
+        self._inputs_with_gradient = {id(t) for t in inputs_with_gradient}
         self.is_cuda = device.type == "cuda"
         self.num_shards = 1 if self.is_cuda else max(1, min(torch.get_num_threads(), _CORES))
         self._warp_device = wp.device_from_torch(device)
         self.stream = self._current_stream()
-        self.filled: list[Tensor] = []
-        self.read: list[Tensor] = []
-        self.conditions: list[Callable[[], bool]] = []
+        self.outputs_written_in_backward: list[Tensor] = []
+        self.read_in_backward: list[Tensor] = []
+        self.replay_conditions: list[Callable[[], bool]] = []
         self._tape = wp.Tape()
-        self._adjoints: dict[int, Tensor | None] = {}
-        self._kept: list[Tensor] = []
+        self._gradients: dict[int, Tensor | None] = {}
+        self._gradient_owners: list[Tensor] = []
 
     def empty(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """An uninitialised tensor on the device."""
         return torch.empty(shape, dtype=dtype, device=self.device)
 
     def zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """A tensor of zeros on the device."""
         return torch.zeros(shape, dtype=dtype, device=self.device)
 
-    def wants(self, tensor: Tensor) -> bool:
-        """Whether a gradient of this input of the op is asked for."""
-        return id(tensor) in self._wanted
+    def needs_gradient(self, tensor: Tensor) -> bool:
+        """Whether this input of the op needs a gradient."""
+        return id(tensor) in self._inputs_with_gradient
 
-    # Going back -------------------------------------------------------------------------------------------------------
+    # Backward pass ----------------------------------------------------------------------------------------------------
 
-    def on_backward(self, function: Callable[["Run"], None], reads: Sequence[Tensor] = ()) -> None:
-        """Records how to go back over what was just launched; called with the run, in reverse order.
+    def on_backward(self, function: Callable[["OpContext"], None], reads: Sequence[Tensor] = ()) -> None:
+        """Records the backward pass of the last launches; recorded functions are called in reverse order.
 
-        The function takes the run as its argument and must not hold it: the run holds the function, and in a cycle
-        the memory of a whole render would wait for Python's garbage collector. ``reads`` are those tensors it reads
-        that may be outputs of the op.
+        Args:
+            function: Called with this context. It must not hold the context itself: the context holds the function,
+                and a reference cycle would keep the memory of a whole render until garbage collection.
+            reads: Tensors that it reads and that may be outputs of the op.
         """
-        if self.needs_grad:
-            self.read += reads
+        if self.needs_backward:
+            self.read_in_backward += reads
             this = weakref.proxy(self)
             self._tape.record_func(lambda: function(this), [])
 
-    def adjoint(self, tensor: Tensor) -> Tensor | None:
-        """What has arrived at a tensor on the way back, contiguous; None where nothing has."""
-        value = self._adjoints.get(id(tensor))
+    def gradient(self, tensor: Tensor) -> Tensor | None:
+        """The gradient of a tensor so far in the backward pass, contiguous; None if there is none."""
+        value = self._gradients.get(id(tensor))
         return None if value is None else value.contiguous()
 
-    def add_adjoint(self, tensor: Tensor, value: Tensor) -> None:
-        """Passes a gradient on to a tensor that an op read."""
-        known = self._adjoints.get(id(tensor))
-        self._adjoints[id(tensor)] = value if known is None else known + value
-        self._kept.append(tensor)  # so that its id stays its own
+    def add_gradient(self, tensor: Tensor, value: Tensor) -> None:
+        """Adds to the gradient of a tensor."""
+        known = self._gradients.get(id(tensor))
+        self._gradients[id(tensor)] = value if known is None else known + value
+        self._gradient_owners.append(tensor)  # so that its id is not reused
 
     def backward(self, outputs: Sequence[Tensor], gradients: Sequence[Tensor | None]) -> None:
+        """Runs the recorded backward pass from the gradients of the op's outputs."""
         self.stream = self._current_stream()
-        self._adjoints = {id(o): g for o, g in zip(outputs, gradients, strict=True)}
+        self._gradients = {id(o): g for o, g in zip(outputs, gradients, strict=True)}
         self._tape.backward()
 
-    def forget_adjoints(self) -> None:
-        """Frees what a way back has gathered; the way itself may be gone again (``retain_graph``)."""
-        self._adjoints = {}
-        self._kept = []
+    def clear_gradients(self) -> None:
+        """Frees the gradients of a backward pass, which may be repeated (``retain_graph``)."""
+        self._gradients = {}
+        self._gradient_owners = []
 
     # Launching --------------------------------------------------------------------------------------------------------
 
     def launch(self, kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int | float = 1) -> None:
-        """Runs ``dim`` threads of a kernel; ``arguments`` follow its first parameter, ``first``.
+        """Launches ``dim`` threads of a kernel.
 
-        ``work`` says how many times a plain thread's work one of these does, for sharing out CPU launches.
+        Args:
+            kernel: Its first parameter is ``first``.
+            dim: Number of threads.
+            arguments: Of the parameters after ``first``.
+            block_dim: Threads per CUDA block.
+            work: Work of one of its threads relative to a plain thread, to decide how many cores a CPU launch uses.
         """
         if dim == 0:
             return
@@ -139,11 +150,11 @@ class Run:
             self._launch(kernel, dim, arguments, block_dim, work)
 
     def launch_adjoint(
-        self, kernel: wp.Kernel, dim: int, tensors: Sequence[Tensor], adjoints: Sequence[Tensor]
+        self, kernel: wp.Kernel, dim: int, tensors: Sequence[Tensor], gradients: Sequence[Tensor]
     ) -> None:
-        """Runs the adjoint that Warp generated for a kernel: adds to the adjoints of what the kernel read.
+        """Launches the adjoint kernel that Warp generated for a kernel: adds to the gradients of the kernel's inputs.
 
-        ``tensors`` and ``adjoints`` follow the kernel's first parameter, ``first``.
+        ``tensors`` and ``gradients`` are those of the kernel's parameters after ``first``.
         """
 
         def arrays(values: Sequence[Tensor]) -> list[wp.array]:
@@ -154,7 +165,7 @@ class Run:
             kernel,
             dim=dim,
             inputs=[0, *arrays(tensors)],
-            adj_inputs=[0, *arrays(adjoints)],
+            adj_inputs=[0, *arrays(gradients)],
             adjoint=True,
             device=self._warp_device,
             stream=self.stream,
@@ -178,7 +189,7 @@ class Run:
             list(_workers().map(run_shard, range(shards)))
 
     def _current_stream(self) -> wp.Stream | None:
-        """torch's current stream, as Warp knows it; None on CPU."""
+        """torch's current stream as a Warp stream; None on CPU."""
         if not self.is_cuda:
             return None
         handle = torch.cuda.current_stream(self.device).cuda_stream
@@ -188,15 +199,15 @@ class Run:
         return stream
 
     def sort_pairs(self, keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
-        """Stable radix sort of the first ``count`` int32 pairs by the low bits of the keys; buffers hold twice that."""
+        """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
         device = self._warp_device
         pairs = (_int_array(t.data_ptr(), t.numel(), device.alias) for t in (keys, values))
         with profiling.span("sort_pairs", self.device):
             if not self.is_cuda:
                 wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
                 return
-            # Warp sorts on its own stream. No event is waited for, which a CUDA graph capture would not allow.
-            # In a capture the lock is held already, by a thread that may be waiting for this one.
+            # Warp sorts on its current stream. No event is waited for, because a CUDA graph capture forbids that.
+            # During a capture the lock is already held, possibly by a thread that waits for this one.
             with contextlib.nullcontext() if torch.cuda.is_current_stream_capturing() else WARP_STREAM:
                 previous = device.stream
                 device.set_stream(self.stream, sync=False)
@@ -211,27 +222,27 @@ _streams: dict[tuple[int, int], wp.Stream] = {}
 
 @functools.lru_cache(maxsize=256)
 def _int_array(pointer: int, size: int, device: str) -> wp.array:
-    """Memory that torch owns, as Warp's sort wants it; torch's allocator hands out the same blocks again and again."""
+    """A Warp array over memory of torch; cached, because torch's allocator reuses the same blocks."""
     return wp.array(ptr=pointer, dtype=wp.int32, shape=(size,), device=device)
 
 
-def indices(some: Sequence[Tensor], tensors: Sequence[Tensor]) -> list[int]:
-    """Where those that are among some are in a sequence of tensors."""
-    return [k for k, tensor in enumerate(tensors) if any(tensor is s for s in some)]
+def indices(subset: Sequence[Tensor], tensors: Sequence[Tensor]) -> list[int]:
+    """Indices of those ``tensors`` that are in ``subset``."""
+    return [k for k, tensor in enumerate(tensors) if any(tensor is s for s in subset)]
 
 
 class _Differentiable(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
         device = next(t.device for t in tensors if t is not None)
-        ctx.run = Run(device, [t for t in tensors if t is not None and t.requires_grad])
+        ctx.context = OpContext(device, [t for t in tensors if t is not None and t.requires_grad])
         ctx.set_materialize_grads(False)
         ctx.raw_inputs = tensors
-        ctx.raw_outputs = op(ctx.run, *tensors)
-        # The outputs are handed out as aliases, because the run keeps the originals and would otherwise keep its own
-        # graph alive. Saving what the way back reads makes torch notice when that is changed in place before.
+        ctx.raw_outputs = op(ctx.context, *tensors)
+        # Aliases of the outputs are returned, because the context holds the originals and would otherwise keep its own
+        # graph alive. Saving what the backward pass reads lets torch detect that it was modified in place.
         outputs = tuple(o.detach() for o in ctx.raw_outputs)
-        ctx.save_for_backward(*tensors, *(outputs[k] for k in indices(ctx.run.read, ctx.raw_outputs)))
+        ctx.save_for_backward(*tensors, *(outputs[k] for k in indices(ctx.context.read_in_backward, ctx.raw_outputs)))
         ctx.mark_non_differentiable(*(o for o in outputs if not o.is_floating_point()))
         return outputs
 
@@ -239,45 +250,47 @@ class _Differentiable(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         with torch.no_grad():
-            ctx.run.backward(ctx.raw_outputs, gradients)
-            adjoints = [None if t is None else ctx.run.adjoint(t) for t in ctx.raw_inputs]
-            ctx.run.forget_adjoints()
-            return None, *(a if n else None for a, n in zip(adjoints, ctx.needs_input_grad[1:], strict=True))
+            ctx.context.backward(ctx.raw_outputs, gradients)
+            v_inputs = [None if t is None else ctx.context.gradient(t) for t in ctx.raw_inputs]
+            ctx.context.clear_gradients()
+            return None, *(v if n else None for v, n in zip(v_inputs, ctx.needs_input_grad[1:], strict=True))
 
 
 def differentiable(op: Op, *tensors: Tensor | None) -> tuple[Tensor, ...]:
-    """Runs ``op(run, *tensors)`` and, where a tensor wants gradients, lets autograd go back through it.
+    """Calls ``op(ctx, *tensors)``, as a node of autograd if an input requires a gradient.
 
     Args:
-        op: Returns a tuple of tensors; those of integer type carry no gradient.
-        tensors: Its inputs, all on one device, contiguous; None is passed through.
+        op: Returns a tuple of tensors; those of integer type have no gradient.
+        tensors: Its inputs, contiguous and all on one device; None is passed on.
     """
     if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
         return _Differentiable.apply(op, *tensors)
     device = next(t.device for t in tensors if t is not None)
     with torch.no_grad():
-        return op(Run(device, []), *tensors)
+        return op(OpContext(device, []), *tensors)
 
 
-def adjoint_launch(run: Run, kernel: wp.Kernel, dim: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-    """Launches a kernel forward and records the adjoint that Warp generated for it.
+def launch_with_generated_adjoint(
+    ctx: OpContext, kernel: wp.Kernel, dim: int, inputs: Sequence[Tensor], outputs: Sequence[Tensor]
+) -> None:
+    """Launches a kernel and records the adjoint kernel that Warp generated for it.
 
     ``inputs`` and ``outputs`` are float tensors, in the order of the kernel's parameters after ``first``.
     """
-    run.launch(kernel, dim, *inputs, *outputs)
+    ctx.launch(kernel, dim, *inputs, *outputs)
 
-    def backward(run: Run) -> None:
+    def backward(ctx: OpContext) -> None:
         v_inputs = [torch.zeros_like(t) for t in inputs]
-        v_outputs = [torch.zeros_like(t) if (v := run.adjoint(t)) is None else v for t in outputs]
+        v_outputs = [torch.zeros_like(t) if (v := ctx.gradient(t)) is None else v for t in outputs]
         if dim > 0:
-            run.launch_adjoint(kernel, dim, [*inputs, *outputs], [*v_inputs, *v_outputs])
+            ctx.launch_adjoint(kernel, dim, [*inputs, *outputs], [*v_inputs, *v_outputs])
         for tensor, value in zip(inputs, v_inputs, strict=True):
-            run.add_adjoint(tensor, value)
+            ctx.add_gradient(tensor, value)
 
-    run.on_backward(backward)
+    ctx.on_backward(backward)
 
 
 def pinned_counter(device: torch.device) -> Tensor:
-    """One int64 in host memory that a kernel on ``device`` can write to, zero at first."""
+    """One int64 in host memory that a kernel on ``device`` can write to, initially zero."""
     counter = torch.zeros(1, dtype=torch.int64)
     return counter.pin_memory() if device.type == "cuda" else counter

@@ -7,17 +7,20 @@ from collections.abc import Sequence
 import tyro
 
 from warpgs.config import PRESETS, TrainConfig
-from warpgs.errors import is_out_of_memory, one_line, out_of_memory
+from warpgs.errors import run_command
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
 )
 
+UNFIT = 1
+"""Exit code if training on the capture would be useless."""
+
 
 def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
-    """The config of a command line: a preset's defaults, changed by options.
+    """The config of a command line: the defaults of a preset, changed by options.
 
-    The built-in scene has ``quick`` as its default preset, captures have ``paper``.
+    The default preset is ``quick`` for the built-in scene and ``paper`` for captures.
 
     Raises:
         ValueError: If a run is resumed with other options.
@@ -36,21 +39,19 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
 def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Trains, then evaluates; returns the exit code.
 
-    Ctrl-C saves a checkpoint and ends with 130; wrong options and other errors of the user end with one line and 2.
+    Ctrl-C saves a checkpoint and ends with 130. Errors that the user can fix end with one line and 2, captures on which
+    training would be useless with one line per error and 1.
     """
-    try:
-        config = parse(sys.argv[1:] if arguments is None else arguments, prog)
-        from .train import train  # after --help, which needs no torch
+    return run_command(lambda: run(parse(sys.argv[1:] if arguments is None else arguments, prog)), prog, ADVICE)
 
-        return train(config)
-    except (RuntimeError, MemoryError) as error:
-        if not is_out_of_memory(error):
-            raise
-        print(f"error: {out_of_memory(error)}; {ADVICE}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
+
+def run(config: TrainConfig) -> int:
+    """Trains, then evaluates, and prints what happens; returns the exit code."""
+    from .train import UnfitCaptureError, train  # imports torch, which --help does not need
+
+    try:
+        train(config, log=print)
+    except UnfitCaptureError as error:
+        print("\n".join(map(str, error.findings)), file=sys.stderr)
+        return UNFIT
+    return 0

@@ -1,4 +1,4 @@
-"""Where training begins: the first Gaussians of both branches, and monocular depth in scene units."""
+"""The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
 from collections.abc import Iterable
 
@@ -7,67 +7,73 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.config import RenderSettings, TrainConfig
-from warpgs.data import depth_alignment as depth
+from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 
-from . import point_cloud as init
+from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample, unproject
 from .views import View, Views
 
-COLOR_VIEWS = 12
-"""Training views from which points without colours take theirs, at most."""
+MAX_COLOR_VIEWS = 12
+"""Maximum number of training views from which points without colours are coloured."""
 
-LIFTED_SHARE = 8
-"""Moving pixels that are lifted, for each dynamic Gaussian to begin with, at most."""
+MAX_PIXELS_PER_GAUSSIAN = 8
+"""Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
 
 MIN_KNOWN_FRACTION = 0.1
-"""Share of the moving pixels that depth must be known of; depth from motion knows that of what stands still only."""
+"""Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
+known only where nothing moves."""
 
-NEAREST_POINTS = 8
-"""Points around a moving pixel that it is put before where depth is not known."""
+NUM_NEAREST_POINTS = 8
+"""Number of points around a dynamic pixel that its depth is estimated from where it is unknown."""
 
-BEFORE = 0.9
-"""Its depth over that of the nearest of them."""
+DEPTH_FACTOR = 0.9
+"""Estimated depth of a dynamic pixel, relative to the nearest of these points."""
 
-MAX_POINTS = 2_000
-"""Points of a picture that are looked at for it."""
+MAX_POINTS_PER_IMAGE = 2_000
+"""Maximum number of points per image among which they are searched."""
 
-PIXELS_AT_ONCE = 8_192
-"""Keeps the table of their distances from the points under 100 MB."""
+PIXELS_PER_CHUNK = 8_192
+"""Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
 
-MAX_FRACTION = 0.5
-"""Largest first Gaussian of unknown place, as a share of the size at which densification removes it."""
+MAX_SCALE_FRACTION = 0.5
+"""Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
 
 
-def first_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
-    """Static Gaussians at the sparse points (anywhere in the scene's box if there are none) and no dynamic ones yet."""
-    center, half_size = init.scene_box(capture.points)
+def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
+    """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
+
+    If everything is assumed to be dynamic, there are no static Gaussians either.
+    """
+    center, half_size = scene_box(capture.points)
     degree = config.model.sh_degree
     static = Gaussians.empty(0, degree)
-    if config.assume != "dynamic":
-        static = init.from_points(*_colored_points(config, capture, generator), degree)
+    if capture.assumption != "dynamic":
+        static = gaussians_at(*_colored_points(config, capture, generator), degree)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    points, colors, most = capture.points, capture.point_colors, config.model.max_static_points
+    """A random subset of the capture's points with colours in [0, 1], from the static region where they have none."""
+    points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
     if len(points) == 0:
-        points, colors = _anywhere(*init.scene_box(points), most, generator), None
-    chosen = init.subsample(points, most, generator)
+        points, colors = random_points(points, max_count, generator), None
+    chosen = subsample(points, max_count, generator)
     points = points[chosen]
     if colors is not None:
         return points, colors[chosen].float() / 255.0
-    seen = []
-    for name in capture.train[:: -(-len(capture.train) // COLOR_VIEWS)]:
+    views = []
+    for name in capture.train[:: -(-len(capture.train) // MAX_COLOR_VIEWS)]:
         frame = capture.frame(name)
-        mask = frame.static_mask if config.assume == "masks" else None
-        everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
-        seen.append((frame.camera, frame.image, everywhere if mask is None else mask))
-    return points, init.color_points(points, seen)
+        mask = frame.static_mask
+        if mask is None or capture.assumption == "dynamic":
+            mask = torch.ones(frame.image.shape[:2], dtype=torch.bool)
+        views.append((frame.camera, frame.image, mask))
+    return points, color_points(points, views)
 
 
 def dynamic_gaussians(
@@ -75,93 +81,88 @@ def dynamic_gaussians(
     capture: Capture,
     views: Views,
     alignments: Float[Tensor, "T 2"],
-    scene: SplitScene,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Dynamic Gaussians at moving pixels lifted by aligned depth.
+    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth.
 
-    Without depth they begin before the points around them, without points anywhere in the scene's box; where nothing
-    moves there are none.
+    Without depth they start in front of the points around them, without visible points at random positions in the
+    scene's box. If everything is assumed to be dynamic, they start at the sparse points. If nothing is dynamic, there
+    are none.
     """
-    most, degree = config.model.dynamic_points, config.model.sh_degree
-    if config.assume == "static":
+    max_count, degree = config.model.dynamic_points, config.model.sh_degree
+    if capture.assumption == "dynamic" and len(capture.points):
+        return gaussians_at(*_colored_points(config, capture, generator), degree)
+    num_dynamic = sum(int((~views[index].static_mask).sum()) for index in range(len(views)))
+    if num_dynamic == 0:
         return Gaussians.empty(0, degree)
-    if config.assume == "dynamic" and len(capture.points):
-        return init.from_points(*_colored_points(config, capture, generator), degree)
-    num_moving = sum(int((~views[index].static_mask).sum()) for index in range(len(views)))
-    if num_moving == 0:
-        return Gaussians.empty(0, degree)
-    share = min(1.0, LIFTED_SHARE * most / num_moving)
-    planes = (depth.metric_depth(views[k].inverse_depth, alignments[k]) for k in range(len(views)))
-    positions, colors = _lift(views, planes, share, generator)
-    if len(positions) >= MIN_KNOWN_FRACTION * share * num_moving:
-        chosen = init.subsample(positions, most, generator)
-        return init.from_points(positions[chosen], colors[chosen], degree)
+    fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num_dynamic)
+    depths = (depth_alignment.metric_depth(views[k].inverse_depth, alignments[k]) for k in range(len(views)))
+    positions, colors = _unproject_dynamic(views, depths, fraction, generator)
+    if len(positions) >= MIN_KNOWN_FRACTION * fraction * num_dynamic:
+        chosen = subsample(positions, max_count, generator)
+        return gaussians_at(positions[chosen], colors[chosen], degree)
     points = capture.points.to(views.device)
-    planes = (_before_points(views[k], points, generator) for k in range(len(views)))
-    positions, colors = _lift(views, planes, share, generator)
+    depths = (_depth_before_points(views[k], points, generator) for k in range(len(views)))
+    positions, colors = _unproject_dynamic(views, depths, fraction, generator)
     if len(positions) == 0:
-        trunk = scene.deformation.trunk
-        positions = _anywhere(trunk.center.cpu(), trunk.half_size.cpu(), most, generator)
+        positions = random_points(capture.points, max_count, generator)
         colors = torch.full_like(positions, 0.5)
-    chosen = init.subsample(positions, most, generator)
-    largest = MAX_FRACTION * config.densify.max_size * capture.extent
-    return init.from_points(positions[chosen], colors[chosen], degree, largest)
+    chosen = subsample(positions, max_count, generator)
+    max_scale = MAX_SCALE_FRACTION * config.densify.max_size * capture.extent
+    return gaussians_at(positions[chosen], colors[chosen], degree, max_scale)
 
 
-def _anywhere(center: Tensor, half_size: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    return center + half_size * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
-
-
-def _lift(
-    views: Views, planes: Iterable[Float[Tensor, "H W"]], share: float, generator: torch.Generator
+def _unproject_dynamic(
+    views: Views, depths: Iterable[Float[Tensor, "H W"]], fraction: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Positions and colours of a random share of all views' moving pixels, on the CPU.
+    """Positions and colours of a random fraction of all views' dynamic pixels, on the CPU.
 
     Args:
         views: The views.
-        planes: [H, W] depth of each.
-        share: At most 1.
-        generator: Of the choice.
+        depths: [H, W] depth of each.
+        fraction: At most 1.
+        generator: CPU generator that chooses them.
     """
-    lifted = []
-    for index, plane in enumerate(planes):
+    parts = []
+    for index, depth in enumerate(depths):
         view = views[index]
-        wanted = ~view.static_mask
-        if share < 1.0:
-            wanted = wanted & (torch.rand(wanted.shape, generator=generator) < share).to(wanted.device)
-        points, colors = init.lift(plane, wanted, view.image, view.camera)
-        lifted.append((points.cpu(), colors.cpu()))
-    positions, colors = (torch.cat(values) for values in zip(*lifted, strict=True))
+        mask = ~view.static_mask
+        if fraction < 1.0:
+            mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
+        points, colors = unproject(depth, mask, view.image, view.camera)
+        parts.append((points.cpu(), colors.cpu()))
+    positions, colors = (torch.cat(values) for values in zip(*parts, strict=True))
     return positions, colors
 
 
-def _before_points(view: View, points: Float[Tensor, "P 3"], generator: torch.Generator) -> Float[Tensor, "H W"]:
-    """Depth before the nearest of the points around each moving pixel, because what moves hides what stands; else NaN.
+def _depth_before_points(view: View, points: Float[Tensor, "P 3"], generator: torch.Generator) -> Float[Tensor, "H W"]:
+    """Depth of each dynamic pixel just before the nearest of the points around it; NaN elsewhere.
 
-    Where it truly is one camera does not tell; there it looks right from where it was filmed, and hides nothing else.
+    Dynamic objects occlude the static points around them. One camera does not determine their depth; with this one they
+    look right from the training view and occlude little else.
     """
-    plane = torch.full(view.static_mask.shape, torch.nan, device=points.device)
+    depth = torch.full(view.static_mask.shape, torch.nan, device=points.device)
     row, column, z, inside = view.camera.project(points)
-    seen = inside.nonzero()[:, 0]
-    seen = seen[init.subsample(seen, MAX_POINTS, generator).to(seen.device)]
-    moving = (~view.static_mask).nonzero()
-    if len(seen) == 0:
-        return plane
-    places = torch.stack([row[seen], column[seen]], 1).float()
-    for part in moving.split(PIXELS_AT_ONCE):
-        around = torch.cdist(part.float(), places).topk(min(NEAREST_POINTS, len(seen)), largest=False).indices
-        plane[part[:, 0], part[:, 1]] = BEFORE * z[seen][around].amin(1)
-    return plane
+    visible = inside.nonzero()[:, 0]
+    visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]
+    pixels = (~view.static_mask).nonzero()
+    if len(visible) == 0:
+        return depth
+    positions = torch.stack([row[visible], column[visible]], 1).float()
+    for part in pixels.split(PIXELS_PER_CHUNK):
+        distances = torch.cdist(part.float(), positions)
+        around = distances.topk(min(NUM_NEAREST_POINTS, len(visible)), largest=False).indices
+        depth[part[:, 0], part[:, 1]] = DEPTH_FACTOR * z[visible][around].amin(1)
+    return depth
 
 
 def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:
-    """Scale and offset of each view's inverse depth against the sparse points; NaN where that can't be told."""
+    """Scale and offset of each view's inverse depth against the sparse points; NaN where they cannot be determined."""
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
     points = capture.points.to(views.device)
     for index in range(len(views)):
         view = views[index]
-        alignments[index] = depth.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
+        alignments[index] = depth_alignment.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
     return alignments
 
 
@@ -169,7 +170,7 @@ def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:
 def align_to_rendering(
     alignments: Float[Tensor, "T 2"], views: Views, scene: SplitScene, sh_degree: int, antialias: bool = False
 ) -> Float[Tensor, "T 2"]:
-    """The same against the depth rendered so far; views where that can't be told keep their alignment."""
+    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
     splats = scene.static_splats(sh_degree)
     settings = RenderSettings(depth=True, antialias=antialias)
     found = alignments.clone()
@@ -177,5 +178,7 @@ def align_to_rendering(
         view = views[index]
         layer = render(splats, view.camera, settings=settings).joint
         assert layer.depth is not None
-        found[index] = depth.align_to_rendering(view.inverse_depth, view.static_mask, layer.depth, layer.alpha)
+        found[index] = depth_alignment.align_to_rendering(
+            view.inverse_depth, view.static_mask, layer.depth, layer.alpha
+        )
     return torch.where(found.isfinite(), found, alignments)

@@ -1,4 +1,4 @@
-"""What a run says while it trains: a progress bar, or plain lines; TensorBoard events."""
+"""Progress of a training run: a bar or plain lines on the console, and TensorBoard events."""
 
 import sys
 import time
@@ -11,19 +11,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from torch.utils.tensorboard.writer import SummaryWriter
 
 LINE_EVERY = 10.0
-"""Seconds between lines where there is no terminal to draw a bar on."""
+"""Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
 
 
 class Status(NamedTuple):
-    """A look at the training, taken now and then.
+    """Progress of a run at one of the regular checks.
 
     Attributes:
         iteration: Iterations done.
         stage: Name of the stage.
-        loss: Mean since the last look.
-        psnr: Of the joint image against the truth, mean since the last look [dB].
-        terms: Each loss term, weighted, mean since the last look.
-        num_static, num_dynamic: Gaussians.
+        loss: Mean since the last check.
+        psnr: PSNR of the joint training image, mean since the last check [dB].
+        terms: Each loss term, weighted, mean since the last check.
+        num_static, num_dynamic: Numbers of Gaussians.
     """
 
     iteration: int
@@ -36,10 +36,17 @@ class Status(NamedTuple):
 
 
 class TrainingLogger:
-    """A context that shows progress and writes TensorBoard events into ``folder``."""
+    """A context that shows progress and writes TensorBoard events.
 
-    def __init__(self, folder: Path, num_iterations: int, first_iteration: int) -> None:
-        self._console = Console()
+    Args:
+        folder: Folder of the events.
+        num_iterations: Length of the run.
+        first_iteration: Iterations done before this session.
+        quiet: Whether to write events only.
+    """
+
+    def __init__(self, folder: Path, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
+        self._console = Console(quiet=quiet)
         self._events = SummaryWriter(str(folder), purge_step=first_iteration)
         self._total = num_iterations
         self._bar: Progress | None = None
@@ -47,16 +54,16 @@ class TrainingLogger:
         self._first = first_iteration
         self._last = (first_iteration, time.monotonic())
         self._last_line = 0.0
-        if sys.stdout.isatty():
+        if sys.stdout.isatty() and not quiet:
             self._bar = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
                 MofNCompleteColumn(),
-                TextColumn("{task.fields[facts]}"),
+                TextColumn("{task.fields[status]}"),
                 TimeRemainingColumn(),
                 console=self._console,
             )
-            self._task = self._bar.add_task("starting", total=num_iterations, completed=first_iteration, facts="")
+            self._task = self._bar.add_task("starting", total=num_iterations, completed=first_iteration, status="")
 
     def __enter__(self) -> "TrainingLogger":
         if self._bar is not None:
@@ -70,27 +77,28 @@ class TrainingLogger:
             self._bar.stop()
         self._events.close()
 
-    def say(self, text: str) -> None:
-        """One line for the reader, above the bar."""
+    def log(self, text: str) -> None:
+        """Prints a line above the bar."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def show(self, status: Status) -> None:
-        before, then = self._last
+    def report(self, status: Status) -> None:
+        """Shows the status and adds it to the events."""
+        last_iteration, last_time = self._last
         now = time.monotonic()
-        rate = (status.iteration - before) / max(now - then, 1e-9)
+        rate = (status.iteration - last_iteration) / max(now - last_time, 1e-9)
         self._last = (status.iteration, now)
-        facts = (
+        text = (
             f"loss {status.loss:.4f}  PSNR {status.psnr:.2f}  "
             f"static {status.num_static:,}  dynamic {status.num_dynamic:,}  {rate:.1f} it/s"
         )
         if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=status.iteration, description=status.stage, facts=facts)
+            self._bar.update(self._task, completed=status.iteration, description=status.stage, status=text)
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
-            left = ""
-            if before > self._first:  # else kernels were compiled until now, which does not go on
-                left = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
-            self.say(f"{status.iteration}/{self._total} {status.stage}  {facts}{left}")
+            remaining = ""
+            if last_iteration > self._first:  # the first interval includes the compilation of kernels
+                remaining = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
+            self.log(f"{status.iteration}/{self._total} {status.stage}  {text}{remaining}")
         self._write(status, rate)
 
     def _write(self, status: Status, rate: float) -> None:

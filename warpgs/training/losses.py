@@ -1,10 +1,54 @@
-"""The image terms of the training loss (paper Eq. 9, 12 and 15); that of depth (Eq. 14) is ``ops.depth_error``."""
+"""What a term of the training loss is, and the image losses of the paper (Eq. 9 and 12)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from warpgs.config import LossConfig
+from warpgs.model.splats import Splats
 from warpgs.ops.ssim import l1_and_ssim
+from warpgs.rendering import Rendering
+
+from .schedule import IterationPlan, Phase
+from .views import View
+
+
+class LossInputs(NamedTuple):
+    """What a term of the loss is computed from.
+
+    Attributes:
+        config: Settings of the loss.
+        view: The training view, with the ground truth.
+        splats: The activated Gaussians at the view's time, static ones first.
+        rendering: Joint, static and dynamic image; with depth where ``Phase.with_depth``.
+        backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
+        alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
+    """
+
+    config: LossConfig
+    view: View
+    splats: Splats
+    rendering: Rendering
+    backgrounds: Float[Tensor, "3 3"]
+    alignment: Float[Tensor, "2"] | None
+
+
+class LossTerm(NamedTuple):
+    """A term of the training loss.
+
+    Attributes:
+        compute: The term without its weight. It may branch on ``LossInputs.config`` and on nothing that changes during
+            a run, and must not read values back from the device: on CUDA it is captured in a graph.
+        is_active: Whether the term is computed in a phase.
+        weight: The weight in an iteration.
+    """
+
+    compute: Callable[[LossInputs], Float[Tensor, ""]]
+    is_active: Callable[[Phase, LossConfig], bool]
+    weight: Callable[[IterationPlan, LossConfig], float]
 
 
 def image_loss(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], ssim_weight: float) -> Float[Tensor, ""]:
@@ -17,7 +61,7 @@ def image_loss(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], ssi
 def static_loss(
     image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], static: Bool[Tensor, "H W"], ssim_weight: float
 ) -> Float[Tensor, ""]:
-    """Paper Eq. 9: the static image against the truth, both masked by M, so that what is hidden stays free."""
+    """Paper Eq. 9: the static image against the ground truth, both masked by M, so that hidden parts stay free."""
     if ssim_weight:
         return l1_and_ssim(image.contiguous(), truth, ssim_weight, static)
     return ((image - truth) * static[..., None]).abs().mean()
@@ -30,8 +74,8 @@ def dynamic_loss(
     ssim_weight: float,
     background: Float[Tensor, "3"],
 ) -> Float[Tensor, ""]:
-    """Paper Eq. 12: the dynamic image, rendered over ``background``, against the truth masked by 1 − M.
+    """Paper Eq. 12: the dynamic image, rendered over ``background``, against the ground truth masked by 1 − M.
 
-    Only the truth is masked: where M = 1 the dynamic image has to show its background.
+    Only the ground truth is masked: where M = 1 the dynamic image has to show its background.
     """
     return image_loss(image, torch.where(static[..., None], background, truth), ssim_weight)

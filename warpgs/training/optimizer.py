@@ -1,7 +1,9 @@
-"""The one Adam over Gaussians and networks, and its learning rates."""
+"""Adam over Gaussians and networks, and its learning rates."""
+
+from collections.abc import Mapping
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from torch import Tensor, nn
 
 from warpgs.config import OptimConfig
@@ -11,79 +13,90 @@ from warpgs.ops.adam import Adam
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15
-"""Of 3DGS: gradients of Gaussians that are hardly seen are tiny and should count all the same."""
+"""As in 3DGS: Gaussians that are hardly visible have tiny gradients, which should count all the same."""
+
+MOMENTS = ("exp_avg", "exp_avg_sq")
+"""Names of Adam's moments in the state of a parameter."""
 
 MEANS_DECAY = 0.01
-"""Rate of positions at the end of a run, relative to its start (3DGS)."""
+"""Final learning rate of positions, relative to the initial one (3DGS)."""
 
-
-GROUPS = (
-    *(f"{branch}.{name}" for branch in ("static", "dynamic") for name in PARAMETERS),
-    "deformation",
-    "appearance",
-)
+BRANCHES = ("static", "dynamic")
+NETWORKS = ("deformation", "appearance")
+GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS)
 """Names of the parameter groups: each Gaussian parameter of each branch, and each network."""
 
 
-def make_optimizer(scene: SplitScene, rates: Float[Tensor, " groups"]) -> Adam:
+def make_optimizer(scene: SplitScene, rates: Mapping[str, Tensor]) -> Adam:
     """Adam with the groups of ``GROUPS``.
 
     Args:
         scene: What is trained.
-        rates: Learning rate of each group, on the scene's device; the optimizer reads it anew in every step.
+        rates: Learning rate of each group, a scalar on the scene's device that the optimizer reads in every step.
     """
     parameters = dict(scene.named_parameters())
     groups = [
         {
             "name": name,
             "params": [p for n, p in parameters.items() if n == name or n.startswith(f"{name}.")],
-            "lr": rate,
+            "lr": rates[name],
         }
-        for name, rate in zip(GROUPS, rates.unbind(), strict=True)
+        for name in GROUPS
     ]
     return Adam(groups, BETAS, EPSILON)
 
 
 def learning_rates(
-    config: OptimConfig, extent: float, progress: float, network_progress: dict[str, float], warmth: dict[str, float]
-) -> list[float]:
+    config: OptimConfig,
+    extent: float,
+    progress: float,
+    network_progress: Mapping[str, float],
+    warmup_factors: Mapping[str, float],
+) -> dict[str, float]:
     """Learning rate of each group of ``GROUPS``.
 
     Args:
         config: Rates.
-        extent: Of the capture [scene units]; scales the rate of positions.
-        progress: Share of the run done, in [0, 1].
-        network_progress: The same for each network, over the iterations in which it is trained.
-        warmth: Share of its rate that each network has.
+        extent: Extent of the capture [scene units]; the rate of positions is proportional to it.
+        progress: Fraction of the run done, in [0, 1].
+        network_progress: By network, fraction done of the iterations in which it is trained.
+        warmup_factors: By network, factor of its rate.
     """
-    gaussians = [
-        exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
-        config.quats,
-        config.scales,
-        config.opacities,
-        config.sh_dc,
-        config.sh_rest,
-    ]
-    networks = [
-        warmth[name] * exponential(config.networks, config.networks_end, network_progress[name])
-        for name in ("deformation", "appearance")
-    ]
-    return [*gaussians, *gaussians, *networks]
+    gaussians = {
+        "means": exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
+        "quats": config.quats,
+        "log_scales": config.scales,
+        "logit_opacities": config.opacities,
+        "sh_dc": config.sh_dc,
+        "sh_rest": config.sh_rest,
+    }
+    rates = {f"{branch}.{name}": rate for branch in BRANCHES for name, rate in gaussians.items()}
+    for name in NETWORKS:
+        rate = exponential(config.networks, config.networks_end, network_progress[name])
+        rates[name] = warmup_factors[name] * rate
+    return rates
 
 
 def exponential(start: float, end: float, progress: float) -> float:
-    """From ``start`` at progress 0 to ``end`` at 1, log-linearly; constant outside."""
+    """Log-linear interpolation from ``start`` at progress 0 to ``end`` at 1; constant outside."""
     progress = min(max(progress, 0.0), 1.0)
     return float(start ** (1.0 - progress) * end**progress)
 
 
 @torch.no_grad()
 def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
-    """Resizes Gaussians and their moments: the first ``num_kept`` keep their parents', the others start at 0."""
+    """Replaces Gaussians by copies of ``parents``, together with Adam's moments.
+
+    Args:
+        optimizer: From ``make_optimizer``.
+        gaussians: Changed in place.
+        parents: [M] indices of Gaussians.
+        num_kept: Number of Gaussians, from the first, that keep their parents' moments; the others' start at 0.
+    """
     gaussians.gather(parents)
     for parameter in gaussians.parameters():
         state = optimizer.state.get(parameter, {})
-        for name in ("exp_avg", "exp_avg_sq"):
+        for name in MOMENTS:
             if name in state:
                 moments = state[name][parents]
                 moments[num_kept:] = 0.0
@@ -91,9 +104,9 @@ def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], 
 
 
 @torch.no_grad()
-def forget(optimizer: Adam, parameter: nn.Parameter) -> None:
-    """Sets the moments of a parameter that was overwritten to 0."""
+def reset_moments(optimizer: Adam, parameter: nn.Parameter) -> None:
+    """Sets Adam's moments of a parameter to 0, because its values were replaced."""
     state = optimizer.state.get(parameter, {})
-    for name in ("exp_avg", "exp_avg_sq"):
+    for name in MOMENTS:
         if name in state:
             state[name].zero_()

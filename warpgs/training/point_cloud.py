@@ -1,4 +1,4 @@
-"""The first Gaussians."""
+"""Gaussians from point clouds, and point clouds from depth."""
 
 import math
 
@@ -11,74 +11,94 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.model.gaussians import MAX_SH_DEGREE, Gaussians
 
-FIRST_OPACITY = 0.1
-NEIGHBOURS = 3
+INITIAL_OPACITY = 0.1
+NUM_NEIGHBOURS = 3
 BOX_MARGIN = 1.2
+"""Size of the scene's box relative to that of its points."""
 
 
-def from_points(
+def gaussians_at(
     points: Float[Tensor, "N 3"],
     colors: Float[Tensor, "N 3"],
     sh_degree: int = MAX_SH_DEGREE,
-    largest: float = math.inf,
+    max_scale: float = math.inf,
 ) -> Gaussians:
-    """Round Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
+    """Isotropic Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
 
-    None is larger than ``largest`` [scene units].
+    Args:
+        points: [N, 3] positions on the CPU.
+        colors: [N, 3] in [0, 1].
+        sh_degree: Maximum degree of spherical harmonics.
+        max_scale: Maximum standard deviation [scene units].
     """
     N = points.shape[0]
-    if N <= NEIGHBOURS:
-        return Gaussians.from_points(points, colors, torch.full((N,), min(0.01, largest)), FIRST_OPACITY, sh_degree)
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NEIGHBOURS + 1, workers=-1)
+    if N <= NUM_NEIGHBOURS:
+        scales = torch.full((N,), min(0.01, max_scale))
+        return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, sh_degree)
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NUM_NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
-    # Points at one place would get no size at all, a few far ones the size of the scene.
+    # Coincident points would get scale 0, a few distant ones the size of the scene.
     typical = scales.median().clamp_min(1e-7)
-    scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(largest)
-    return Gaussians.from_points(points, colors, scales, FIRST_OPACITY, sh_degree)
+    scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(max_scale)
+    return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, sh_degree)
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """(center, half size) of the box that holds all but the outermost 1 % of the points, with a margin.
+    """(center, half size) of the cube that holds the points, except the outermost 1 % along each axis, with a margin.
 
-    Without points, the box from -1 to 1 that captures are normalised to.
+    Without points, the cube from -1 to 1 that captures are normalized to.
     """
     if points.shape[0] < 2:
         return torch.zeros(3), torch.ones(3)
     ordered = points.sort(0).values
     last = points.shape[0] - 1
     low, high = ordered[round(0.005 * last)], ordered[round(0.995 * last)]
-    # One length for all axes keeps the frequencies of the encoding alike along them.
+    # With one length for all axes, the encoding has the same frequencies along each of them.
     half_size = (0.5 * BOX_MARGIN * (high - low).max()).clamp_min(1e-3)
     return 0.5 * (low + high), half_size.expand(3).contiguous()
 
 
-def subsample(points: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    """Indices of at most ``most`` of the points, chosen at random, in order."""
-    if points.shape[0] <= most:
+def random_points(points: Float[Tensor, "P 3"], count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
+    """``count`` points, uniformly distributed in the box of other points."""
+    center, half_size = scene_box(points)
+    return center + half_size * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
+
+
+def subsample(points: Tensor, max_count: int, generator: torch.Generator) -> Tensor:
+    """Sorted indices of at most ``max_count`` random points."""
+    if points.shape[0] <= max_count:
         return torch.arange(points.shape[0])
-    return torch.randperm(points.shape[0], generator=generator)[:most].sort().values
+    return torch.randperm(points.shape[0], generator=generator)[:max_count].sort().values
 
 
 def color_points(
     points: Float[Tensor, "P 3"], views: list[tuple[Camera, UInt8[Tensor, "H W 3"], Bool[Tensor, "H W"]]]
 ) -> Float[Tensor, "P 3"]:
-    """Mean colour in [0, 1] of the static pixels that each point falls on in some views; grey where no view sees it."""
+    """Mean colour in [0, 1] of the pixels onto which each point projects in some views.
+
+    Args:
+        points: [P, 3] positions.
+        views: Camera, [H, W, 3] image and [H, W] mask of the pixels that count.
+
+    Returns:
+        [P, 3]; grey for points that no view sees.
+    """
     total, count = torch.zeros(points.shape[0], 3), torch.zeros(points.shape[0], 1)
-    for camera, image, static in views:
+    for camera, image, mask in views:
         row, column, _, inside = camera.project(points)
-        seen = (inside & static[row, column])[:, None]
-        total += torch.where(seen, image[row, column].float() / 255.0, 0.0)
-        count += seen
+        counts = (inside & mask[row, column])[:, None]
+        total += torch.where(counts, image[row, column].float() / 255.0, 0.0)
+        count += counts
     return torch.where(count > 0, total / count.clamp_min(1), 0.5)
 
 
-def lift(
+def unproject(
     depth: Float[Tensor, "H W"],
-    wanted: Bool[Tensor, "H W"],
+    mask: Bool[Tensor, "H W"],
     image: Float[Tensor, "H W 3"],
     camera: Camera,
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
-    """Positions and colours of the pixels that are wanted and have a depth."""
-    row, column = (wanted & depth.isfinite()).nonzero(as_tuple=True)
+    """Positions and colours of the pixels in the mask that have a finite depth."""
+    row, column = (mask & depth.isfinite()).nonzero(as_tuple=True)
     z = depth[row, column]
     return camera.unproject(row, column, z), image[row, column]

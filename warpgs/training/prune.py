@@ -15,28 +15,34 @@ from warpgs.rendering import render
 from . import optimizer as optim
 
 MAX_ALPHA = 0.99
-"""α of Eq. 15 is clamped, so that an opaque Gaussian that is always seen keeps a score of 0.01."""
+"""Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
 
 
 @torch.no_grad()
 def visibility(
     scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, antialias: bool = False
 ) -> Float[Tensor, " N"]:
-    """V̄ of every static Gaussian: 1/T Σ_t 1[rendered at t] (1 − α(t)), over all cameras.
+    """V̄ of paper Eq. 15 for every static Gaussian: 1/T Σ_t 1[rendered at t] (1 − α(t)), over T cameras.
 
-    "Rendered" means that it changed a pixel of the static image. α is that of w⁰: the appearance network leaves
-    opacities alone unless ``model.appearance_opacity`` says otherwise.
+    "Rendered" means that it changes a pixel of the static image. α is that of w⁰, without residuals of the appearance
+    network.
+
+    Args:
+        scene: The scene.
+        cameras: Cameras on the scene's device.
+        sh_degree: Maximum degree of spherical harmonics in use.
+        antialias: As in ``RenderSettings``.
     """
     static = scene.static
     splats = scene.static_splats(sh_degree)
-    seen = torch.zeros(len(static), device=static.means.device)
+    num_rendered = torch.zeros(len(static), device=static.means.device)
     num = 0
     for camera in cameras:
         rendering = render(splats, camera, settings=RenderSettings(statistics=True, antialias=antialias))
         assert rendering.contributed is not None
-        seen += rendering.contributed
+        num_rendered += rendering.contributed
         num += 1
-    return seen / max(num, 1) * (1.0 - static.opacities.clamp(max=MAX_ALPHA))
+    return num_rendered / max(num, 1) * (1.0 - static.opacities.clamp(max=MAX_ALPHA))
 
 
 @torch.no_grad()
@@ -48,7 +54,7 @@ def prune_invisible(
     threshold: float,
     antialias: bool = False,
 ) -> int:
-    """Removes static Gaussians of V̄ < ``threshold``; returns how many."""
+    """Removes the static Gaussians with V̄ < ``threshold``; returns their number. Arguments as for ``visibility``."""
     kept = (visibility(scene, cameras, sh_degree, antialias) >= threshold).nonzero()[:, 0]
     removed = len(scene.static) - len(kept)
     optim.gather(optimizer, scene.static, kept, num_kept=len(kept))

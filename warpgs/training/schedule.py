@@ -1,4 +1,4 @@
-"""What happens when: the stages of the paper's protocol and everything that depends on the iteration."""
+"""What every iteration does: the stages of the paper's protocol and everything that depends on the iteration."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,7 +8,7 @@ from warpgs.config import TrainConfig
 from .optimizer import exponential
 
 NOISE = 0.1
-"""Amplitude of the noise on time, in frame intervals (Deformable-3DGS)."""
+"""Initial standard deviation of the noise on time, in frame intervals (Deformable-3DGS)."""
 
 StageName = Literal["pretrain", "stage1", "stage2"]
 
@@ -18,7 +18,8 @@ class Stage:
     """A stage of training.
 
     Attributes:
-        start, end: First iteration, and the first one after it.
+        name: Its name.
+        start, end: First iteration, and the first one after the stage.
     """
 
     name: StageName
@@ -27,33 +28,48 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Moment:
-    """All that an iteration does depending on its place in the schedule.
+class Phase:
+    """Everything that a training step branches on; the key of its CUDA graph.
+
+    Whatever else changes between iterations reaches the step as tensors. To branch on something new, add it here.
 
     Attributes:
-        stage: The stage it belongs to.
-        progress: Share of the run done.
-        network_progress: Share done of the iterations in which each network is trained.
-        network_warmth: Share of its rate that each network has; rises from 0 when it begins.
-        moving, relit: Whether the deformation and the appearance network are in use.
-        joint: Whether the joint image is compared with the whole truth.
-        sh_degree: Highest degree of spherical harmonics in use.
-        depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth.
-        noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, realign: What to do after this iteration.
+        stage: Name of the stage.
+        use_deformation: Whether the deformation network is in use.
+        use_appearance: Whether the appearance network is in use.
+        sh_degree: Maximum degree of spherical harmonics in use.
+        with_depth: Whether depth is rendered and compared.
+    """
+
+    stage: StageName
+    use_deformation: bool
+    use_appearance: bool
+    sh_degree: int
+    with_depth: bool
+
+
+@dataclass(frozen=True)
+class IterationPlan:
+    """What the schedule says of one iteration.
+
+    Attributes:
+        phase: Everything that the training step branches on.
+        progress: Fraction of the run done.
+        network_progress: By network, fraction done of the iterations in which it is trained.
+        warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
+        depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
+        time_noise: Standard deviation of the noise on time, in frame intervals.
+        densify, reset, prune, realign: What to do after the iteration: densify, reset opacities, prune by visibility,
+            align depth again.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
-    stage: Stage
+    phase: Phase
     progress: float
     network_progress: dict[str, float]
-    network_warmth: dict[str, float]
-    moving: bool
-    relit: bool
-    joint: bool
-    sh_degree: int
+    warmup_factors: dict[str, float]
     depth_weight: float
-    noise: float
+    time_noise: float
     densify: bool
     reset: bool
     prune: bool
@@ -65,17 +81,16 @@ class Protocol:
     """Depth-aware pretraining → stage I, branches apart → stage II, jointly (paper, training protocol).
 
     Args:
-        config: With its schedule already scaled.
-        has_depth: Whether the capture has depth; without it there is no pretraining.
+        config: Config whose schedule is rescaled already (``config.scaled``).
+        has_depth: Whether any view has aligned depth; without it there is no pretraining.
     """
 
     def __init__(self, config: TrainConfig, has_depth: bool) -> None:
         self.config = config
         self.has_depth = has_depth
         schedule = config.schedule
-        # Pretraining is of the static branch.
-        pretrain = schedule.pretrain if config.dap and has_depth and config.assume != "dynamic" else 0
-        # A component that is off gives its iterations to stage I, so that runs compare at one budget.
+        pretrain = schedule.pretrain if config.dap and has_depth else 0
+        # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.
         stage2 = schedule.stage2 if config.stage2 else 0
         stage1 = schedule.pretrain + schedule.stage1 + schedule.stage2 - pretrain - stage2
         self.pretrain = Stage("pretrain", 0, pretrain)
@@ -84,49 +99,61 @@ class Protocol:
         self.num_iterations = self.stage2.end
         # Iterations of stage I from which the networks are in use; in stage II they always are.
         starts = {"deformation": schedule.deform_from, "appearance": schedule.appearance_from}
-        self._begin = {name: min(start, stage1) for name, start in starts.items()}
+        self._network_starts = {name: min(start, stage1) for name, start in starts.items()}
 
     def stage_at(self, iteration: int) -> Stage:
+        """The stage that an iteration belongs to."""
         return next(stage for stage in (self.pretrain, self.stage1, self.stage2) if iteration < stage.end)
 
-    def at(self, iteration: int) -> Moment:
-        config, schedule = self.config, self.config.schedule
-        stage = self.stage_at(iteration)
+    def phase_at(self, iteration: int) -> Phase:
+        """Everything that the training step of an iteration branches on."""
+        config, in_stage1 = self.config, iteration - self.stage1.start
+        return Phase(
+            stage=self.stage_at(iteration).name,
+            use_deformation=in_stage1 >= self._network_starts["deformation"],
+            use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
+            sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
+            with_depth=self.has_depth and config.dap and config.loss.depth > 0.0,
+        )
+
+    def at(self, iteration: int) -> IterationPlan:
+        """The plan of an iteration."""
+        schedule = self.config.schedule
+        stage, phase = self.stage_at(iteration), self.phase_at(iteration)
         in_stage1 = iteration - self.stage1.start
         done = in_stage1 + 1
-        growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
+        is_growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
         progress = iteration / self.num_iterations
-        return Moment(
-            stage=stage,
+        decay = max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until))
+        return IterationPlan(
+            phase=phase,
             progress=progress,
-            network_progress={name: self._share_since(start, in_stage1) for name, start in self._begin.items()},
-            network_warmth={name: self._warmth(in_stage1 - start) for name, start in self._begin.items()},
-            moving=in_stage1 >= self._begin["deformation"],
-            relit=config.app and in_stage1 >= self._begin["appearance"],
-            joint=stage.name == "stage2",
-            sh_degree=min(config.model.sh_degree, max(0, in_stage1) // schedule.sh_degree_every),
-            depth_weight=self._depth_weight(progress),
-            noise=NOISE * max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until)) if in_stage1 >= 0 else 0.0,
-            densify=growing and done % config.densify.every == 0,
-            reset=growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
-            prune=stage.name == "stage1"
-            and config.vdp
-            and (done % schedule.prune_every == 0 or iteration + 1 == self.stage2.start)
-            and iteration + 1 < self.num_iterations,
+            network_progress={name: self._progress_from(k, in_stage1) for name, k in self._network_starts.items()},
+            warmup_factors={name: self._warmup_factor(in_stage1 - k) for name, k in self._network_starts.items()},
+            depth_weight=self._depth_weight(progress) if phase.with_depth else 0.0,
+            time_noise=NOISE * decay if in_stage1 >= 0 else 0.0,
+            densify=is_growing and done % self.config.densify.every == 0,
+            reset=is_growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
+            prune=self._prunes(iteration),
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
 
-    def _share_since(self, start: int, in_stage1: int) -> float:
-        """Share done of the iterations from one of stage I to the end of the run."""
+    def _progress_from(self, start: int, in_stage1: int) -> float:
+        """Fraction done of the iterations from one of stage I to the end of the run."""
         return max(0.0, (in_stage1 - start) / max(1, self.num_iterations - self.stage1.start - start))
 
-    def _warmth(self, iterations: int) -> float:
+    def _warmup_factor(self, iterations: int) -> float:
         warmup = self.config.schedule.warmup
         return min(1.0, max(0.0, (iterations + 1) / warmup)) if warmup else 1.0
 
     def _depth_weight(self, progress: float) -> float:
         loss = self.config.loss
-        if not (self.has_depth and self.config.dap) or loss.depth <= 0.0:
-            return 0.0
         return exponential(loss.depth, max(loss.depth_end, 1e-12), progress)
+
+    def _prunes(self, iteration: int) -> bool:
+        """Whether to prune: at intervals in stage I and at its end, but not at the end of the run."""
+        if not self.config.vdp or self.stage_at(iteration).name != "stage1" or iteration + 1 == self.num_iterations:
+            return False
+        done = iteration + 1 - self.stage1.start
+        return done % self.config.schedule.prune_every == 0 or iteration + 1 == self.stage2.start

@@ -1,11 +1,12 @@
 """A training run from start to end: run folder, training, evaluation."""
 
 import dataclasses
-import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
-from warpgs.data.check import quick_findings
+from warpgs.data.check import Finding, quick_findings
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.runs.run import Run, choose_device, new_folder, open_capture
@@ -14,60 +15,124 @@ from .interrupt import Interrupt
 from .logger import TrainingLogger
 from .trainer import Trainer
 
+Log = Callable[[str], None]
+"""Receives lines for the user, such as ``print``."""
+
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 
 
-def checked(capture: Capture, config: TrainConfig) -> Capture:
-    """The capture, after printing its warnings; a capture that is not fit to train on exits with code 1."""
-    findings = quick_findings(capture, all_static=config.assume == "static")
-    for finding in findings:
-        print(finding, file=sys.stderr if finding.level == "error" else sys.stdout)
-    if any(finding.level == "error" for finding in findings):
-        raise SystemExit(1)
-    return capture
+class UnfitCaptureError(ValueError):
+    """The capture has errors that would make training useless.
+
+    Attributes:
+        findings: The errors.
+    """
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        super().__init__("; ".join(finding.text for finding in findings))
+        self.findings = tuple(findings)
 
 
-def start(config: TrainConfig) -> Trainer:
-    """A trainer for a new run, or one that continues ``config.resume`` from its newest checkpoint.
+class TrainingInterrupted(KeyboardInterrupt):
+    """Ctrl-C stopped the training after an iteration, and a checkpoint of it was saved.
+
+    Attributes:
+        folder: Run folder; ``TrainConfig(resume=folder)`` continues it.
+        iteration, num_iterations: Iterations done, and those of the whole run.
+    """
+
+    def __init__(self, folder: Path, iteration: int, num_iterations: int) -> None:
+        super().__init__(f"stopped after iteration {iteration} of {num_iterations}; continue with --resume {folder}")
+        self.folder, self.iteration, self.num_iterations = folder, iteration, num_iterations
+
+
+def train(config: TrainConfig, log: Log | None = None) -> Run:
+    """Trains and evaluates a run.
+
+        run = warpgs.train(TrainConfig(data=Path("nerfds/as")), log=print)
+        image = run.trained_scene().render(camera).joint.image
+
+    The first Ctrl-C lets the current iteration finish and saves a checkpoint, the second one stops at once.
+
+    Args:
+        config: The config; ``PRESETS`` has complete ones. ``resume`` continues a run with its own config.
+        log: Receives lines for the user; if None, nothing is printed.
+
+    Returns:
+        The finished run; its folder holds checkpoints, metrics.json, views.csv, images/ and time.mp4.
 
     Raises:
-        ValueError: If the run, its capture or an option cannot be used.
-        OSError: If the run folder cannot be written.
+        TrainingInterrupted: After the first Ctrl-C.
+        UnfitCaptureError: If the capture has errors that would make training useless.
+        ValueError: If the run, its capture or an option cannot be used, or the loss is repeatedly not finite.
+        OSError: If a file cannot be written.
     """
-    if config.resume is None:
-        config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
-        locate(config.lpips)  # a wrong folder is reported now, not after training
-        capture = checked(open_capture(config), config)
-        trainer = Trainer(config, capture, new_folder(config, capture))
-        Run.create(trainer.run, config)  # now that nothing was refused
-        return trainer
-    run = Run.open(config.resume, config.device)
-    locate(run.config.lpips)
-    trainer = Trainer(run.config, checked(run.open_capture(), run.config), run.folder)
-    trainer.restore_newest()
-    return trainer
-
-
-def train(config: TrainConfig) -> int:
-    """Trains and evaluates; returns the exit code, 130 after Ctrl-C."""
-    trainer = start(config)
+    quiet, log = log is None, log or _ignore
+    trainer = make_trainer(config, log)
     run = Run(trainer.run, trainer.config)
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
-    print(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {run.folder}")
+    log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {run.folder}")
     if num_aligned < num_views:
         reason = "" if num_aligned else NO_DEPTH
-        print(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
-    steps = trainer.protocol.num_iterations
+        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+    num_iterations = trainer.protocol.num_iterations
     with (
         run.lock(),
         Interrupt() as interrupt,
-        TrainingLogger(run.folder / "events", steps, trainer.iteration) as logger,
+        TrainingLogger(run.folder / "events", num_iterations, trainer.iteration, quiet) as logger,
     ):
         finished = trainer.train(logger, interrupt)
     if not finished:
-        stopped = f"stopped after iteration {trainer.iteration} of {steps}"
-        print(f"{stopped}; continue with --resume {run.folder}", file=sys.stderr)
-        return 130
-    print(evaluate_run(run.folder, trainer.capture, device=trainer.config.device))
-    print(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
-    return 0
+        raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
+    capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
+    log(evaluate_run(run.folder, capture, device=trainer.config.device, quiet=quiet))
+    log(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
+    return run
+
+
+def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
+    """A trainer for a new run, or one that continues ``config.resume`` from its newest checkpoint.
+
+    Args:
+        config: The config.
+        log: Receives warnings about the capture; if None, nothing is printed.
+
+    Raises:
+        UnfitCaptureError: If the capture has errors that would make training useless.
+        ValueError: If the run, its capture or an option cannot be used.
+        OSError: If the run folder cannot be written.
+    """
+    quiet, log = log is None, log or _ignore
+    if config.resume is not None:
+        run = Run.open(config.resume, config.device)
+        locate(run.config.lpips)
+        capture = check_capture(run.open_capture(quiet), run.config, log)
+        trainer = Trainer(run.config, capture, run.folder)
+        trainer.restore_newest()
+        return trainer
+    config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
+    locate(config.lpips)  # reports a wrong folder now, not after training
+    capture = check_capture(open_capture(config, quiet), config, log)
+    trainer = Trainer(config, capture, new_folder(config, capture))
+    Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
+    return trainer
+
+
+def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
+    """The capture, after logging its warnings.
+
+    Raises:
+        UnfitCaptureError: If it has errors that would make training useless.
+    """
+    findings = quick_findings(capture.assuming(config.assume))
+    errors = [finding for finding in findings if finding.level == "error"]
+    for finding in findings:
+        if finding not in errors:
+            log(str(finding))
+    if errors:
+        raise UnfitCaptureError(errors)
+    return capture
+
+
+def _ignore(text: str) -> None:
+    """A log that discards its lines."""

@@ -14,11 +14,11 @@ class View(NamedTuple):
     """One training view on the device.
 
     Attributes:
-        camera: Its ``time`` is not to be used; the one here is on the device.
-        time: [1] moment in [0, 1].
-        image: [H, W, 3] in [0, 1].
+        camera: The camera. Use ``time`` instead of ``camera.time``, which is not on the device.
+        time: [1] time in [0, 1].
+        image: [H, W, 3] ground truth in [0, 1].
         static_mask: [H, W] M of the paper, true where static.
-        inverse_depth: [H, W] up to a scale and an offset, NaN where unknown.
+        inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
     """
 
     camera: Camera
@@ -29,7 +29,7 @@ class View(NamedTuple):
 
 
 class _Stored(NamedTuple):
-    """Views as they are kept: bytes for images, half precision for depth. Tensors may have a first axis for views."""
+    """Views as they are stored: bytes for images, half precision for depth. Tensors may have a leading view axis."""
 
     viewmat: Tensor
     K: Tensor
@@ -42,26 +42,25 @@ class _Stored(NamedTuple):
 class Views:
     """The training frames of a capture.
 
-    Frames of one size that fit into ``resident_bytes`` are all kept on the device, as bytes; a view is then picked by
-    an index that is on the device, too, so that picking can be part of a CUDA graph. Otherwise each is read from the
-    capture when it is wanted.
+    Frames of one size that fit into ``resident_bytes`` are kept on the device. A view is then chosen by an index that
+    is on the device, too, so that choosing can be part of a CUDA graph. Other frames are read from the capture on
+    demand.
 
     Args:
-        capture: Where the frames come from.
-        device: Where views are wanted.
-        resident_bytes: Memory for kept views.
-        assume: "masks" as the capture has them, or that all is "static" or "dynamic".
+        capture: Source of the frames.
+        device: Device of the views.
+        resident_bytes: Maximum memory for views on the device [bytes].
 
     Attributes:
         resident: Whether all views are on the device.
 
     Raises:
-        ValueError: If a frame has no mask where masks are wanted; the message names it.
+        ValueError: If a frame has no mask; the message names it.
     """
 
-    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int, assume: str = "masks") -> None:
+    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int) -> None:
         self.device = device
-        self._capture, self._assume = capture, assume
+        self._capture = capture
         first = self._store(capture.frame(capture.train[0]))
         sizes = {capture.cameras[name].size for name in capture.train}
         self.resident = len(sizes) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
@@ -79,7 +78,7 @@ class Views:
         return self._view(_Stored(*(tensor.to(self.device) for tensor in stored)))
 
     def pick(self, index: Int64[Tensor, "1"]) -> View:
-        """The view of an index on the device; all must be resident."""
+        """The view of an index on the device; all views must be resident."""
         return self._view(_Stored(*(tensors.index_select(0, index)[0] for tensors in self._all)))
 
     def _view(self, stored: _Stored) -> View:
@@ -94,13 +93,11 @@ class Views:
 
     def _store(self, frame: Frame) -> _Stored:
         camera, size = frame.camera, frame.image.shape[:2]
-        mask = frame.static_mask
-        if self._assume != "masks":
-            mask = torch.full(size, self._assume == "static")
-        elif mask is None:
+        if frame.static_mask is None:
             raise ValueError(
-                f"{self._capture.name}: frame {frame.name} has no mask of what moves, which training needs; "
+                f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
                 "give the capture masks, or train with --assume static or --assume dynamic"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
-        return _Stored(camera.viewmat, camera.K, torch.tensor([camera.time]), frame.image, mask, depth.half())
+        time = torch.tensor([camera.time])
+        return _Stored(camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())

@@ -1,4 +1,4 @@
-"""Camera paths: through a capture's own cameras, around what moves, or along keyframes."""
+"""Camera paths: along the training cameras, around the dynamic part of the scene, or along keyframes."""
 
 import dataclasses
 import math
@@ -17,98 +17,114 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 
 SMOOTHING = 0.02
-"""Standard deviation by which a filming camera's path is smoothed, as a share of the film."""
+"""Standard deviation of the Gaussian filter over the training camera's path, as a fraction of the path's length."""
 
 MAX_FRAMES = 100_000
-"""Of a path."""
+"""Maximum number of frames of a path."""
 
 UP = (0.0, -1.0, 0.0)
-"""Upward direction where nothing tells another: cameras of captures have y down."""
+"""Default upward direction: the cameras of captures have y pointing down."""
 
-GUESSED_FOCAL = 1.2
-"""Focal length of a guessed camera, in heights of its picture."""
+DEFAULT_FOCAL = 1.2
+"""Focal length of the default camera, in image heights."""
 
-GUESSED_SIZE = (960, 540)
-GUESSED_DISTANCE = 2.0
-"""Distance of a guessed camera from the middle of the scene, in radii of the scene."""
+DEFAULT_SIZE = (960, 540)
+"""Width and height of the default camera's image [px]."""
 
-FARTHEST = 4.0
-"""A camera further from the middle of the scene than this many of its radii has left it."""
+DEFAULT_DISTANCE = 2.0
+"""Distance of the default camera from the center of the scene, in radii of the scene."""
+
+MAX_DISTANCE = 4.0
+"""Maximum distance of a camera from the center of the scene, in radii of the scene."""
 
 RADIUS_QUANTILE = 0.98
-"""Share of a scene's Gaussians within its radius: a few always lie far away."""
+"""Fraction of the Gaussians within the radius of the scene: a few outliers are always far away."""
 
 MAX_MEANS = 100_000
+"""Maximum number of points that a bounding sphere is computed from (up to a factor of two)."""
+
 SPIRAL_TURNS = 2
+"""Full circles of a spiral."""
+
 BULLET_ARC = math.radians(15.0)
-"""How far bullet time goes to either side: one camera has not seen what lies further around."""
+"""Maximum angle of bullet time to either side [rad]: a single camera has not seen the scene from further around."""
 
 
 @dataclass(frozen=True)
-class Ball:
-    """Where most of a scene is.
+class BoundingSphere:
+    """A sphere around most of a scene, robust to outliers.
 
     Attributes:
-        center: [3] median of what it holds.
-        radius: Within which almost all of it lies [scene units].
+        center: [3] median of the points.
+        radius: Distance from the center within which almost all points lie [scene units].
     """
 
     center: Float[Tensor, "3"]
     radius: float
 
     @staticmethod
-    def around(points: Float[Tensor, "P 3"], also: Float[Tensor, "Q 3"] | None = None) -> "Ball":
-        """The ball of points, large enough for all of ``also``, too.
+    def around(points: Float[Tensor, "P 3"], including: Float[Tensor, "Q 3"] | None = None) -> "BoundingSphere":
+        """The bounding sphere of points, large enough to contain all of ``including`` as well.
 
         Raises:
-            ValueError: If there is no point that is finite.
+            ValueError: If no point is finite.
         """
         points = points[torch.isfinite(points).all(1)]
         if not len(points):
             raise ValueError("the scene has no Gaussians")
-        some = points[:: max(1, len(points) // MAX_MEANS)]
-        center = some.median(0).values
-        radius = float((some - center).norm(dim=1).quantile(RADIUS_QUANTILE))
-        if also is not None and len(also):
-            radius = max(radius, float((also - center).norm(dim=1).max()))
-        return Ball(center, max(radius, 1e-6))
+        subset = points[:: max(1, len(points) // MAX_MEANS)]
+        center = subset.median(0).values
+        radius = float((subset - center).norm(dim=1).quantile(RADIUS_QUANTILE))
+        if including is not None and len(including):
+            radius = max(radius, float((including - center).norm(dim=1).max()))
+        return BoundingSphere(center, max(radius, 1e-6))
 
     def check(self, cameras: Sequence[Camera], name: str) -> None:
-        """Refuses a path that leaves the scene.
+        """Checks that a path stays near the scene.
+
+        Args:
+            cameras: The path.
+            name: Name of the path for the message.
 
         Raises:
-            ValueError: If a camera is far outside; the message tells which.
+            ValueError: If a camera is further from the center than ``MAX_DISTANCE`` radii; the message names it.
         """
         for k, camera in enumerate(cameras):
             distance = float((camera.position.cpu() - self.center).norm())
-            if not distance <= FARTHEST * self.radius:
-                place = ", ".join(f"{v:.3g}" for v in camera.position.tolist())
+            if not distance <= MAX_DISTANCE * self.radius:
+                position = ", ".join(f"{v:.3g}" for v in camera.position.tolist())
                 raise ValueError(
-                    f"{name} leaves the scene: camera {k} at ({place}) is {distance:.3g} from its middle, "
-                    f"and may be {FARTHEST * self.radius:.3g}"
+                    f"{name} leaves the scene: camera {k} at ({position}) is {distance:.3g} from its center, "
+                    f"the maximum is {MAX_DISTANCE * self.radius:.3g}"
                 )
 
 
 def upward(capture: Capture) -> Float[Tensor, "3"]:
-    """The direction that is up in the pictures of a capture, on average."""
+    """The mean upward direction of the training images of a capture, in world coordinates."""
     up = -torch.stack([capture.cameras[name].viewmat[1, :3] for name in capture.train]).mean(0)
     return up if float(up.norm()) > 1e-3 else torch.tensor(UP)
 
 
-def default_camera(ball: Ball, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
-    """A camera that sees most of a scene from one side, a direction of x and z, with y pointing down."""
-    position = ball.center + GUESSED_DISTANCE * ball.radius * torch.tensor([side[0], 0.0, side[1]])
-    focal = GUESSED_FOCAL * GUESSED_SIZE[1]
-    return Camera.looking_at(position, ball.center, torch.tensor(UP), focal, GUESSED_SIZE, time)
+def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
+    """A camera that sees most of a scene, with y pointing down.
+
+    Args:
+        sphere: Bounding sphere of the scene.
+        side: Direction from the center of the scene to the camera, in x and z.
+        time: Time in [0, 1].
+    """
+    position = sphere.center + DEFAULT_DISTANCE * sphere.radius * torch.tensor([side[0], 0.0, side[1]])
+    focal = DEFAULT_FOCAL * DEFAULT_SIZE[1]
+    return Camera.looking_at(position, sphere.center, torch.tensor(UP), focal, DEFAULT_SIZE, time)
 
 
 def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:
-    """One camera while time goes by."""
+    """A fixed camera at several times."""
     return [dataclasses.replace(camera, time=time) for time in times]
 
 
 def evenly_spaced(frames: int) -> list[float]:
-    """So many times over [0, 1]."""
+    """Evenly spaced times from 0 to 1, one per frame."""
     return [k / max(1, frames - 1) for k in range(frames)]
 
 
@@ -120,60 +136,58 @@ def evenly_spaced_indices(count: int, max_count: int) -> list[int]:
 def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list[Camera]:
     """The training cameras in the order of their times, smoothed, with time running over [0, 1].
 
-    Where several were filmed at one time, the first of them counts.
+    If several cameras have the same time, the first one is used.
     """
     by_time: dict[float, Camera] = {}
     for name in capture.train:
         by_time.setdefault(capture.cameras[name].time, capture.cameras[name])
-    times = sorted(by_time)
-    moments = evenly_spaced(frames)
-    inside = np.clip(moments, times[0], times[-1]).tolist()
-    path = interpolated([by_time[time] for time in times], times, inside)
+    knots, times = sorted(by_time), evenly_spaced(frames)
+    path = interpolated([by_time[time] for time in knots], knots, times)
     path = _smoothed(path, smoothing * max(1, frames - 1)) if smoothing > 0 and frames > 2 else path
-    return [dataclasses.replace(camera, time=moment) for camera, moment in zip(path, moments, strict=True)]
+    return [dataclasses.replace(camera, time=time) for camera, time in zip(path, times, strict=True)]
 
 
 def interpolated(
-    cameras: Sequence[Camera], places: Sequence[float], at: Sequence[float], smooth: bool = False
+    cameras: Sequence[Camera], knots: Sequence[float], at: Sequence[float], smooth: bool = False
 ) -> list[Camera]:
-    """Cameras between others: rotations on great arcs, focal lengths in proportion.
+    """Interpolates between cameras: rotations by slerp, focal lengths geometrically, the rest linearly.
 
     Args:
-        cameras: At least one, all of the first one's size.
-        places: Where each is on an axis of time, strictly increasing.
-        at: Where cameras are wanted, between the first and the last.
-        smooth: Whether positions are on curves that never overshoot (monotone cubics), else on straight lines.
+        cameras: At least one, all of the same size.
+        knots: Parameter of each camera on the path, strictly increasing.
+        at: Parameters of the wanted cameras, clamped to the first and the last knot.
+        smooth: Whether to interpolate positions by monotone cubics, which never overshoot, instead of linearly.
     """
     first = cameras[0]
     if len(cameras) == 1:
         return [first for _ in at]
-    where = np.asarray(places, np.float64)
-    wanted = np.clip(np.asarray(at, np.float64), where[0], where[-1])
-    rotations = Slerp(where, Rotation.from_matrix(np.stack([_rotation(c) for c in cameras])))(wanted).as_matrix()
-    along = [
+    x = np.asarray(knots, np.float64)
+    wanted = np.clip(np.asarray(at, np.float64), x[0], x[-1])
+    rotations = Slerp(x, Rotation.from_matrix(np.stack([_rotation(c) for c in cameras])))(wanted).as_matrix()
+    values = [
         np.stack([c.position.double().cpu().numpy() for c in cameras]),
         np.log([[float(c.K[0, 0]), float(c.K[1, 1])] for c in cameras]),
         np.array([[float(c.K[0, 2]), float(c.K[1, 2]), c.time] for c in cameras]),
     ]
-    positions, focals, others = (_along(where, values, wanted) for values in along)
+    positions, focals, others = (_linear(x, columns, wanted) for columns in values)
     if smooth:
-        positions = PchipInterpolator(where, along[0])(wanted)
+        positions = PchipInterpolator(x, values[0])(wanted)
     return [
         _camera(first, r, p, (*np.exp(f), *o[:2]), o[2])
         for r, p, f, o in zip(rotations, positions, focals, others, strict=True)
     ]
 
 
-def _along(places: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Each column of values, linearly between places."""
-    return np.stack([np.interp(at, places, column) for column in values.T], 1)
+def _linear(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Interpolates each column of ``values`` linearly."""
+    return np.stack([np.interp(at, knots, column) for column in values.T], 1)
 
 
 def _smoothed(path: list[Camera], sigma: float) -> list[Camera]:
-    """A path whose positions and viewing directions are averaged over neighbours."""
+    """Applies a Gaussian filter of ``sigma`` frames to the positions and rotations of a path."""
     positions = gaussian_filter1d(np.stack([c.position.double().numpy() for c in path]), sigma, axis=0, mode="nearest")
     mixed = gaussian_filter1d(np.stack([_rotation(c) for c in path]), sigma, axis=0, mode="nearest")
-    U, _, Vt = np.linalg.svd(mixed)  # the nearest rotation of each mean
+    U, _, Vt = np.linalg.svd(mixed)  # the rotation nearest to each mean
     rotations = U @ Vt
     return [
         _camera(c, r, p, (float(c.K[0, 0]), float(c.K[1, 1]), float(c.K[0, 2]), float(c.K[1, 2])), c.time)
@@ -188,7 +202,7 @@ def _rotation(camera: Camera) -> np.ndarray:
 def _camera(
     like: Camera, rotation: np.ndarray, position: np.ndarray, intrinsics: tuple[float, ...], time: float
 ) -> Camera:
-    """A camera of another's size, from its world-to-camera rotation and its centre."""
+    """A camera of the size of ``like`` with this world-to-camera rotation, position and (fx, fy, cx, cy)."""
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     fx, fy, cx, cy = (float(v) for v in intrinsics)
@@ -197,7 +211,7 @@ def _camera(
 
 
 def focus(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Distance along a camera's axis of the middle of those points that it sees; 1 if it sees none."""
+    """Median depth of the points that a camera sees [scene units]; 1 if it sees none."""
     points = points[torch.isfinite(points).all(1)]
     if not len(points):
         return 1.0
@@ -206,13 +220,13 @@ def focus(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
 
 
 def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]) -> list[Camera]:
-    """A camera that circles before a point which it keeps in view, ``SPIRAL_TURNS`` times, coming closer and going.
+    """A camera that looks at a point while it circles ``SPIRAL_TURNS`` times, moving closer and back.
 
     Args:
-        camera: In the middle of the circle.
-        distance: Of the point, along the camera's axis [scene units].
-        reach: Radius of the circle [scene units].
-        times: One a frame.
+        camera: Camera at the center of the circles.
+        distance: Depth of the point [scene units].
+        reach: Radius of the circles [scene units].
+        times: Time of each frame.
     """
     path = []
     for k, time in enumerate(times):
@@ -222,28 +236,28 @@ def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]
     return path
 
 
-def bullet(camera: Camera, distance: float, moment: float, frames: int) -> list[Camera]:
-    """Time runs up to a moment, stands still while the camera swings around what it sees, and runs on.
+def bullet(camera: Camera, distance: float, stop: float, frames: int) -> list[Camera]:
+    """Bullet time: time runs up to ``stop``, stops while the camera swings around a point, and continues.
 
     Args:
-        camera: Where the camera is while time runs.
-        distance: Of the point to swing around, along the camera's axis [scene units].
-        moment: At which time stands still.
-        frames: In all; half of them are the swing.
+        camera: Camera while time runs.
+        distance: Depth of the point to swing around [scene units].
+        stop: Time in [0, 1] at which time stops.
+        frames: Total number of frames; half of them belong to the swing.
     """
     swing = (frames + 1) // 2
-    before = round((frames - swing) * moment)
-    path = at_times(camera, [moment * k / max(1, before) for k in range(before)])
+    before = round((frames - swing) * stop)
+    path = at_times(camera, [stop * k / max(1, before) for k in range(before)])
     for k in range(swing):
         angle = BULLET_ARC * math.sin(2.0 * math.pi * (k + 1) / (swing + 1))
         offset = [distance * math.sin(angle), 0.0, distance * (1.0 - math.cos(angle))]
-        path.append(_aimed(camera, torch.tensor(offset), distance, moment))
+        path.append(_aimed(camera, torch.tensor(offset), distance, stop))
     after = frames - swing - before
-    return path + at_times(camera, [moment + (1.0 - moment) * (k + 1) / after for k in range(after)])
+    return path + at_times(camera, [stop + (1.0 - stop) * (k + 1) / after for k in range(after)])
 
 
 def _aimed(camera: Camera, offset: Float[Tensor, "3"], distance: float, time: float) -> Camera:
-    """The camera moved by an offset in its own axes, turned back to the point ahead of it."""
+    """A camera moved by an offset in its own axes and turned back to the point at ``distance`` on its old axis."""
     axes, position = camera.viewmat[:3, :3], camera.position
     target = position + distance * axes[2]
     moved = Camera.looking_at(position + offset @ axes, target, -axes[1], 1.0, camera.size)
@@ -251,13 +265,13 @@ def _aimed(camera: Camera, offset: Float[Tensor, "3"], distance: float, time: fl
 
 
 def resized(camera: Camera, factor: float) -> Camera:
-    """The same view in ``factor`` times as many pixels a side.
+    """The same view with width and height multiplied by ``factor``.
 
     Raises:
-        ValueError: If less than one pixel is left.
+        ValueError: If the image would have less than one pixel.
     """
     width, height = round(camera.width * factor), round(camera.height * factor)
     if min(width, height) < 1:
-        raise ValueError(f"a picture of {camera.width} × {camera.height} times {factor:g} has no pixels")
+        raise ValueError(f"an image of {camera.width} × {camera.height} times {factor:g} has no pixels")
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0], device=camera.K.device)
     return Camera(camera.viewmat, camera.K * scale[:, None], width, height, camera.time)

@@ -23,9 +23,9 @@ class Render:
     out: Path | None = None
     """Output folder; RUN/render/PATH by default."""
     view: str | None = None
-    """Id of the view from which fixed, spiral and bullet start; the middle evaluation view by default."""
+    """Id of the start view of fixed, spiral and bullet; the middle evaluation view by default."""
     time: float | None = None
-    """Time in [0, 1] at which frozen and bullet stop (default ½); without it, spiral runs through all times."""
+    """Time in [0, 1] of frozen and spiral, and at which bullet stops; default 0.5, but all times for spiral."""
     frames: int | None = None
     """Frames along a path; 120 by default."""
     rate: float | None = None
@@ -33,17 +33,17 @@ class Render:
     write: Literal["both", "png", "mp4"] = "both"
     """Numbered PNG files, a video, or both."""
     layers: Literal["joint", "static", "dynamic", "all"] = "joint"
-    """Which image; all shows them side by side."""
+    """Layer to show; all shows the three side by side."""
     truth: bool = False
-    """For views: show the ground truth beside the image."""
+    """For views: show the ground truth beside the rendered image."""
     scale: float = 1.0
-    """Image size relative to the capture's."""
+    """Image size as a factor of the capture's."""
     supersample: int = 1
     """Render at this multiple of the size, then average down."""
     data: Path | None = None
     """Current folder of the capture, if it was moved."""
     device: Literal["cuda", "cpu"] | None = None
-    """Device to render on; by default CUDA if there is a GPU."""
+    """Device to render on; CUDA by default if there is a GPU."""
     quiet: bool = False
     """Hide progress."""
 

@@ -5,16 +5,15 @@
         {"position": [0.1, 0, -1], "target": [0, 0, 0], "time": 0.5, "focal": 600, "at": 2.5},
         {"view": "000040", "time": 1.0, "at": 4}]}
 
-Every keyframe has a ``time`` of the scene in [0, 1], and is a ``view`` of the capture, or a ``position`` with a
-``target`` [scene units], or what the viewer saves: a ``viewmat`` with ``K``, ``width`` and ``height``. Pictures have
-the size of the first keyframe, which is the capture's unless it says its own. ``focal`` [px of that size] replaces the
-focal length. ``at`` says where on the path a keyframe comes, in any unit that grows; left out everywhere, keyframes are
-evenly spread. ``up`` is the capture's own where it is left out.
+Every keyframe has a ``time`` of the scene in [0, 1] and a camera: a ``view`` of the capture, or a ``position`` with a
+``target`` [scene units], or a ``viewmat`` with ``K``, ``width`` and ``height``, as the viewer saves it. All images have
+the size of the first keyframe, which is the capture's unless given. ``focal`` [px at that size] replaces the focal
+length. ``at`` is the position of a keyframe on the path, in any increasing unit; if no keyframe has it, they are evenly
+spaced. ``up`` defaults to the upward direction of the capture.
 """
 
 import dataclasses
 import itertools
-import json
 import re
 import reprlib
 from collections.abc import Sequence
@@ -26,22 +25,26 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
-from warpgs.files import read_bounded, write_text
+from warpgs.files import read_json, write_json
 
-from . import camera_paths as paths
+from . import camera_paths
 
 POSES = ("view", "position", "viewmat")
 KEYS = {*POSES, "target", "K", "width", "height", "time", "focal", "at"}
-RIGID = 1e-3
-"""How far a rotation times its transpose may be from the identity."""
+MAX_DEVIATION = 1e-3
+"""Maximum deviation of a rotation times its transpose from the identity."""
 
-MAX_FILE = 1 << 20
+MAX_BYTES = 1 << 20
+"""Maximum size of a file of keyframes."""
+
 MAX_SIDE = 32768
-MAX_VALUE = 1e9
-"""Of all numbers."""
+"""Maximum width and height [px]."""
 
-SHORTEST = 1e-3
-"""Focal length [px]."""
+MAX_VALUE = 1e9
+"""Maximum absolute value of every number."""
+
+MIN_FOCAL = 1e-3
+"""Minimum focal length [px]."""
 
 FOLDER = "paths"
 """Subfolder of a run folder for the paths that the viewer saves."""
@@ -83,52 +86,41 @@ def write_path(path: Path, cameras: Sequence[Camera]) -> None:
         }
         for camera in cameras
     ]
-    write_text(path, json.dumps({"keyframes": keyframes}, indent=2) + "\n")
+    write_json(path, {"keyframes": keyframes})
 
 
 def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
-    """So many cameras along the keyframes of a file.
+    """Reads the keyframes of a file and interpolates ``frames`` cameras.
 
     Raises:
-        ValueError: If the file is missing, damaged, or says something that is no path; the message names it.
+        ValueError: If the file is missing, damaged or not a valid path; the message names it.
     """
-    values = _load(path)
+    values = read_json(path, max_bytes=MAX_BYTES)
     if unknown := sorted(set(values) - {"up", "keyframes"}):
         raise ValueError(f"{path} has an unknown field {unknown[0]!r}, expected up and keyframes")
     keyframes = values.get("keyframes")
     if not isinstance(keyframes, list) or not keyframes:
         raise ValueError(f"{path} has no list of keyframes")
-    up = _vector(f"{path}: up", values["up"]) if "up" in values else paths.upward(capture)
+    up = _vector(f"{path}: up", values["up"]) if "up" in values else camera_paths.upward(capture)
     cameras: list[Camera] = []
     for k, value in enumerate(keyframes):
         size = cameras[0].size if cameras else None
         cameras.append(_keyframe(f"{path}: keyframe {k}", value, capture, up, size))
-    places = _places(path, keyframes)
-    at = [places[0] + (places[-1] - places[0]) * share for share in paths.evenly_spaced(frames)]
-    return paths.interpolated(cameras, places, at, smooth=True)
-
-
-def _load(path: Path) -> dict[str, Any]:
-    data = read_bounded(path, MAX_FILE)
-    try:
-        values = json.loads(data.decode())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON: {error}") from error
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected an object with keyframes, got {type(values).__name__}")
-    return values
+    knots = _knots(path, keyframes)
+    at = [knots[0] + (knots[-1] - knots[0]) * fraction for fraction in camera_paths.evenly_spaced(frames)]
+    return camera_paths.interpolated(cameras, knots, at, smooth=True)
 
 
 def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[int, int] | None) -> Camera:
-    """The camera of a keyframe, in the size of the first one."""
+    """The camera of a keyframe, with the image size of the first one."""
     if not isinstance(value, dict):
-        raise ValueError(f"{name} is no object")
+        raise ValueError(f"{name} must be a JSON object, got {type(value).__name__}")
     if unknown := sorted(set(value) - KEYS):
         raise ValueError(f"{name} has an unknown field {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
     if sum(pose in value for pose in POSES) != 1 or ("target" in value) != ("position" in value):
         raise ValueError(f"{name} must have either a view, or a position and a target, or a viewmat")
-    camera = _placed(name, value, capture, up)
-    camera = camera if size is None else _in_size(camera, size)
+    camera = _posed(name, value, capture, up)
+    camera = camera if size is None else _with_size(camera, size)
     if "focal" in value:
         focal = _focal(f"{name}: focal", value["focal"])
         K = camera.K.clone()
@@ -141,7 +133,8 @@ def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[i
     return dataclasses.replace(camera, time=time)
 
 
-def _placed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Camera:
+def _posed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Camera:
+    """The camera of a keyframe with its own image size, at time 0."""
     first = capture.cameras[capture.train[0]]
     if "view" in value:
         view = value["view"]
@@ -149,22 +142,22 @@ def _placed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> C
             raise ValueError(f"{name}: {capture.name} has no view {reprlib.repr(view)}")
         return capture.cameras[view]
     if "viewmat" in value:
-        return _saved(name, value, first)
+        return _from_matrices(name, value, first)
     position, target = (_vector(f"{name}: {end}", value[end]) for end in ("position", "target"))
     forward = target - position
     if float(torch.linalg.cross(forward, up).norm()) <= 1e-4 * float(forward.norm() * up.norm()):
-        raise ValueError(f"{name}: from its position, its target is nowhere, or straight up or down")
+        raise ValueError(f"{name}: position and target coincide, or the view direction is parallel to up")
     turned = Camera.looking_at(position, target, up, 1.0, first.size)
     return Camera(turned.viewmat, first.K, first.width, first.height)
 
 
-def _saved(name: str, value: dict[str, Any], first: Camera) -> Camera:
-    """A camera as the viewer saves it; without intrinsics, it has those of the capture's first."""
+def _from_matrices(name: str, value: dict[str, Any], first: Camera) -> Camera:
+    """A camera as the viewer saves it; without intrinsics, those of the capture's first camera."""
     viewmat = _matrix(f"{name}: viewmat", value["viewmat"], 4)
     R = viewmat[:3, :3]
-    off = float((R @ R.T - torch.eye(3)).abs().max())
-    if off > RIGID or float(torch.linalg.det(R)) < 0 or viewmat[3].tolist() != [0, 0, 0, 1]:
-        raise ValueError(f"{name}: viewmat is no rotation and translation from the world to a camera")
+    deviation = float((R @ R.T - torch.eye(3)).abs().max())
+    if deviation > MAX_DEVIATION or float(torch.linalg.det(R)) < 0 or viewmat[3].tolist() != [0, 0, 0, 1]:
+        raise ValueError(f"{name}: viewmat must be a rotation and a translation from world to camera")
     if not {"K", "width", "height"} & value.keys():
         return Camera(viewmat, first.K, first.width, first.height)
     if not {"K", "width", "height"} <= value.keys():
@@ -180,8 +173,8 @@ def _saved(name: str, value: dict[str, Any], first: Camera) -> Camera:
     return Camera(viewmat, K, width, height)
 
 
-def _in_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view in a picture of another size, which shows as much from top to bottom."""
+def _with_size(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view in an image of another size, with the same vertical field of view."""
     width, height = size
     zoom = height / camera.height
     K = camera.K.clone()
@@ -190,16 +183,17 @@ def _in_size(camera: Camera, size: tuple[int, int]) -> Camera:
     return Camera(camera.viewmat, K, width, height, camera.time)
 
 
-def _places(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
+def _knots(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
+    """The position of each keyframe on the path."""
     given = [value["at"] for value in keyframes if "at" in value]
     if not given:
         return [float(k) for k in range(len(keyframes))]
     if len(given) < len(keyframes):
-        raise ValueError(f"{path}: either every keyframe has a field at, or none")
-    places = [_number(f"{path}: at", place) for place in given]
-    if any(b <= a for a, b in itertools.pairwise(places)):
-        raise ValueError(f"{path}: at must grow from keyframe to keyframe, got {places}")
-    return places
+        raise ValueError(f"{path}: either every keyframe has a field at, or none has")
+    knots = [_number(f"{path}: at", value) for value in given]
+    if any(b <= a for a, b in itertools.pairwise(knots)):
+        raise ValueError(f"{path}: at must increase from keyframe to keyframe, got {knots}")
+    return knots
 
 
 def _number(name: str, value: Any) -> float:
@@ -209,10 +203,10 @@ def _number(name: str, value: Any) -> float:
 
 
 def _focal(name: str, value: Any) -> float:
-    """A focal length that is one in single precision, too, and in a picture of any size."""
+    """A focal length that is also valid in single precision and at every image size."""
     focal = _number(name, value)
-    if focal < SHORTEST:
-        raise ValueError(f"{name} must have a focal length of at least {SHORTEST} px, got {focal}")
+    if focal < MIN_FOCAL:
+        raise ValueError(f"{name} must have a focal length of at least {MIN_FOCAL} px, got {focal}")
     return focal
 
 

@@ -20,15 +20,17 @@ FRAME_RATES = (0.01, 1000.0)
 """Lowest and highest frame rate [1/s]."""
 
 CODEC = "libx264"
+"""FFmpeg's H.264 encoder."""
+
 QUALITY = 18
-"""Constant rate factor of H.264: 0 is lossless, at 18 the loss is hardly visible."""
+"""Constant rate factor of H.264: 0 is lossless; at 18 the loss is hardly visible."""
 
 
 class Video:
-    """An MP4 file in H.264, written frame by frame; a context manager that leaves no file after an error.
+    """An MP4 file in H.264, written frame by frame; a context manager that leaves no file behind after an error.
 
     Args:
-        path: The file, which appears when it is complete.
+        path: The file; it appears when it is complete.
         rate: Frames per second, within ``FRAME_RATES``.
     """
 
@@ -41,28 +43,30 @@ class Video:
         return self
 
     def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
-        """Adds an RGB frame of the size of the first.
+        """Adds an RGB frame; all frames have the size of the first, and an odd last row or column is dropped.
 
         Raises:
-            ValueError: If a side of the frame has less than two pixels.
+            ValueError: If the width or height of the frame is less than two pixels.
             OSError: If the file cannot be written, or FFmpeg has no H.264 encoder.
         """
-        height, width = image.shape[0] & ~1, image.shape[1] & ~1  # H.264 with a colour for 2 × 2 pixels: even sizes
+        height, width = image.shape[0] & ~1, image.shape[1] & ~1  # yuv420p has one colour per 2 × 2 pixels
         if not width or not height:
-            raise ValueError(f"{self.path}: a video needs two pixels a side, got {image.shape[1]} × {image.shape[0]}")
-        with self._named():
+            raise ValueError(
+                f"{self.path}: a video needs at least 2 × 2 pixels, got {image.shape[1]} × {image.shape[0]}"
+            )
+        with self._named_errors():
             if self._file is None:
                 self._open(width, height)
             frame = _ffmpeg().VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), "rgb24")
             self._file.mux(self._stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._file is None:
             return
         if error is None:
-            with self._named(), atomic_path(self.path):
+            with self._named_errors(), atomic_path(self.path):
                 self._file.mux(self._stream.encode(None))
                 self._file.close()
         else:
@@ -77,15 +81,15 @@ class Video:
         if self.path.is_dir():
             raise OSError(f"{self.path} could not be written: Is a directory")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        # The index comes first, so that a browser can play the file while it is loading.
+        # With the index in front, a browser can play the file while it is still loading.
         self._file = av.open(str(partial_path(self.path)), "w", format="mp4", options={"movflags": "faststart"})
         self._stream = self._file.add_stream(CODEC, Fraction(self.rate).limit_denominator(1000))
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         self._stream.options = {"crf": str(QUALITY)}
 
     @contextmanager
-    def _named(self) -> Iterator[None]:
-        """Converts errors of FFmpeg to errors that name the file."""
+    def _named_errors(self) -> Iterator[None]:
+        """Converts errors of FFmpeg to OSErrors that name the file."""
         try:
             yield
         except _ffmpeg().FFmpegError as error:
@@ -93,7 +97,7 @@ class Video:
 
 
 def _ffmpeg() -> ModuleType:
-    """PyAV, which includes FFmpeg; imported on first use, because that takes a third of a second.
+    """PyAV, which includes FFmpeg; imported on first use because the import takes a third of a second.
 
     Raises:
         OSError: If PyAV is not installed.

@@ -1,4 +1,4 @@
-"""``warpgs render``: images and videos of a trained run, at its evaluation views or along a camera path."""
+"""Images and videos of a trained scene, at the evaluation views or along a camera path (``warpgs render``)."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ from . import camera_paths, keyframes, mp4
 from .command import Render
 
 FRAMES = 120
-"""Frames along a path by default."""
+"""Default number of frames along a path."""
 
 PATHS_OF_OPTION = {
     "truth": ("views",),
@@ -32,19 +32,20 @@ PATHS_OF_OPTION = {
     "time": ("frozen", "spiral", "bullet"),
     "frames": ("fixed", "frozen", "moving", "spiral", "bullet", "keyframes"),
 }
-"""Options that only some paths have."""
+"""Camera paths that an option applies to; the other options apply to all."""
 
 MAX_SUPERSAMPLING = 8
+
 REACH = 0.3
 """Radius of the spiral, relative to the radius of the training camera's path."""
 
 
 def render_run(options: Render) -> str:
-    """Renders what the options ask for; returns a summary to print.
+    """Renders the newest checkpoint of a run to images and a video; returns a summary to print.
 
     Raises:
-        ValueError: If the run, its capture, the path or an option cannot be used.
-        OSError: If something cannot be written.
+        ValueError: If the run, its capture, the camera path or an option is not valid.
+        OSError: If a file cannot be written.
     """
     _check(options)
     run = Run.open(options.run_folder, options.device, options.data)
@@ -54,7 +55,7 @@ def render_run(options: Render) -> str:
     means = torch.cat([dynamic, static])
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
     cameras, names = _cameras(options, capture, dynamic, means)
-    camera_paths.Ball.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
+    camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
     name = options.keyframes.stem if options.keyframes else options.path_name
     folder = options.out or options.run_folder / "render" / name
     return _write(options, folder, names, _frames(options, capture, scene, cameras, names))
@@ -81,7 +82,7 @@ def _check(options: Render) -> None:
 
 
 def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) -> tuple[list[Camera], list[str]]:
-    """The cameras of the path, and a name for the image of each."""
+    """The cameras of the path and the name of each image."""
     frames, time = options.frames or FRAMES, 0.5 if options.time is None else options.time
     if options.keyframes is not None:
         return _numbered(keyframes.read_path(options.keyframes, capture, frames))
@@ -93,7 +94,7 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         path = camera_paths.training_path(capture, frames)
         frozen = [dataclasses.replace(camera, time=time) for camera in path]
         return _numbered(path if options.path == "moving" else frozen)
-    camera = _view(options, capture)
+    camera = _start_view(options, capture)
     if options.path == "fixed":
         return _numbered(camera_paths.at_times(camera, camera_paths.evenly_spaced(frames)))
     distance = camera_paths.focus(camera, dynamic if len(dynamic) else means)
@@ -111,7 +112,8 @@ def _number(k: int) -> str:
     return f"{k:05d}"
 
 
-def _view(options: Render, capture: Capture) -> Camera:
+def _start_view(options: Render, capture: Capture) -> Camera:
+    """The camera from which the fixed, spiral and bullet paths start."""
     names = capture.val or capture.train
     name = options.view or names[len(names) // 2]
     if name not in capture.cameras:
@@ -122,7 +124,7 @@ def _view(options: Render, capture: Capture) -> Camera:
 def _frames(
     options: Render, capture: Capture, scene: TrainedScene, cameras: list[Camera], names: list[str]
 ) -> Iterator[np.ndarray]:
-    """The image of each camera, in 8 bits, as they are asked for."""
+    """Renders the 8-bit RGB image of each camera, one at a time."""
     for camera, name in progress(list(zip(cameras, names, strict=True)), "rendering", options.quiet):
         camera = camera_paths.resized(camera, options.scale).to(scene.device)
         larger = camera_paths.resized(camera, float(options.supersample))
@@ -156,8 +158,9 @@ def _resized(truth: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h 
 
 
 def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:
-    """Writes images as they are rendered."""
-    if options.path_name != "views" and options.write != "mp4":  # of an earlier, longer path
+    """Writes images while they are rendered; returns a summary."""
+    if options.path_name != "views" and options.write != "mp4":
+        # an earlier, longer path may have left more images
         remove_numbered(folder, lambda k: f"{_number(k)}.png")
     with ExitStack() as stack:
         video = mp4.Video(folder / "video.mp4", options.rate or mp4.FRAME_RATE)

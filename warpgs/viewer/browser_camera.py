@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import viser
 
-from warpgs.video.camera_paths import UP, Ball, default_camera
+from warpgs.video.camera_paths import UP, BoundingSphere, default_camera
 
 from .pose import pose_of
 from .source import Source
@@ -50,12 +50,12 @@ def start_camera(source: Source, training: TrainingCameras | None) -> BrowserCam
     if training is not None:
         return through_training_camera(training, len(training.views) // 2)
     trained = None if source.follow else source.current()
-    ball = Ball(torch.zeros(3), 1.0)
+    sphere = BoundingSphere(torch.zeros(3), 1.0)
     if trained is not None:
         means = torch.cat([trained.scene.static.means, trained.scene.dynamic.means]).detach().cpu()
-        ball = Ball.around(means) if len(means) else ball
-    camera = default_camera(ball)
-    position, target = camera.position.double().numpy(), ball.center.double().numpy()
+        sphere = BoundingSphere.around(means) if len(means) else sphere
+    camera = default_camera(sphere)
+    position, target = camera.position.double().numpy(), sphere.center.double().numpy()
     return BrowserCamera(position, target, np.array(UP), pose_of(camera).fov)
 
 

@@ -1,5 +1,76 @@
-"""Dataset loaders, one file for each layout."""
+"""Dataset loaders, one file per dataset.
 
-from .nerfies import Dataset, load_capture, recognise
+To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` and a test. Datasets in the layout of
+Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
+"""
 
-__all__ = ["Dataset", "load_capture", "recognise"]
+from pathlib import Path
+from typing import Protocol
+
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Capture
+from warpgs.data.masks import check_perturbation
+
+from .hypernerf import HyperNerfLoader
+from .iphone import IPhoneLoader
+from .nerfds import NerfDsLoader
+
+__all__ = ["LOADERS", "Loader", "load_capture", "recognize"]
+
+
+class Loader(Protocol):
+    """Reads the captures of one dataset."""
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether the files in ``root`` look like a capture of this dataset."""
+        ...
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``, which has checked the arguments."""
+        ...
+
+
+LOADERS: dict[str, Loader] = {
+    "iphone": IPhoneLoader(),
+    "nerfds": NerfDsLoader(),
+    "hypernerf": HyperNerfLoader(),
+}
+"""Loader of each dataset; a folder is read by the first one that recognizes it."""
+
+FALLBACK = "hypernerf"
+"""Dataset of a folder that no loader recognizes; the errors of its loader name what is missing."""
+
+
+def load_capture(
+    root: Path,
+    dataset: str | None = None,
+    *,
+    factor: int | None = None,
+    perturbation: MaskPerturbation | None = None,
+    cache_frames: int = 256,
+) -> Capture:
+    """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
+
+    Args:
+        root: Folder of the capture.
+        dataset: Key of ``LOADERS``; recognized from the files if None.
+        factor: Downscaling factor of the images; the dataset's default if None.
+        perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
+        cache_frames: Number of frames to keep in memory.
+
+    Raises:
+        ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
+    """
+    if dataset is not None and dataset not in LOADERS:
+        raise ValueError(f"unknown dataset {dataset!r}, expected one of {', '.join(LOADERS)}")
+    if factor is not None and factor < 1:
+        raise ValueError(f"factor must be at least 1, got {factor}")
+    perturbation = perturbation or MaskPerturbation()
+    check_perturbation(perturbation)
+    loader = LOADERS[dataset or recognize(root)]
+    return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
+
+
+def recognize(root: Path) -> str:
+    """The dataset whose files ``root`` has, as a key of ``LOADERS``."""
+    return next((name for name, loader in LOADERS.items() if loader.recognizes(root)), FALLBACK)

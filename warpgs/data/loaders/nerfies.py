@@ -1,18 +1,20 @@
-"""Captures in the layout of Nerfies: NeRF-DS, HyperNeRF, and iPhone (DyCheck).
+"""The layout of Nerfies, which NeRF-DS, HyperNeRF and iPhone (DyCheck) share.
 
-dataset.json, metadata.json, scene.json, camera/<id>.json, rgb/<factor>x/<id>.png, points.npy; and where there are:
-resized_mask/<factor>x/<id>.png.png (0 = moving), depth/<factor>x/<id>.png or .npy, covisible/<factor>x/val/<id>.png,
-splits/train.json and val.json, sparse/0.
+Required: dataset.json, metadata.json, scene.json, camera/<id>.json, rgb/<factor>x/<id>.png. Optional: points.npy or
+sparse/0, resized_mask/<factor>x/<id>.png.png (0 = dynamic), depth/<factor>x/<id>.png or .npy,
+covisible/<factor>x/val/<id>.png.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
@@ -20,134 +22,116 @@ from warpgs.data import images
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.masks import check_perturbation, perturb
+from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
-from warpgs.data.units import read_units
+from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import read_json
-
-Dataset = Literal["nerfds", "hypernerf", "iphone"]
-
-FACTORS: dict[Dataset, int] = {"nerfds": 1, "hypernerf": 2, "iphone": 2}
-"""Downscaling of the pictures that each dataset is usually evaluated at."""
-
-CLAMPED_DEPTH = 3.0
-"""Metres that DyCheck's processing writes for everything from there on: exactly this value is no measurement."""
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
 
 
-def load_capture(
-    root: Path,
-    dataset: Dataset | None = None,
-    *,
-    factor: int | None = None,
-    perturbation: MaskPerturbation | None = None,
-    cache_frames: int = 256,
-) -> Capture:
-    """Opens a capture: reads cameras and points and finds that every file is there; pictures are read as they are used.
+class Split(NamedTuple):
+    """Ids of the frames to train on and to evaluate on, and the file that lists them, for messages."""
+
+    source: Path
+    train: list[str]
+    val: list[str]
+
+
+class NerfiesLoader(ABC):
+    """A loader of the layout of Nerfies; a dataset derives from it and overrides what it does differently."""
+
+    default_factor: int
+    """Downscaling factor at which the dataset is usually evaluated."""
+
+    @abstractmethod
+    def recognizes(self, root: Path) -> bool: ...
+
+    def split(self, root: Path, dataset: dict[str, Any], metadata: dict[str, Any]) -> Split:
+        """train_ids and val_ids of dataset.json.
+
+        Args:
+            root: Folder of the capture.
+            dataset: Content of dataset.json.
+            metadata: Content of metadata.json.
+        """
+        path = root / "dataset.json"
+        return Split(path, read_ids(path, dataset, "train_ids"), read_ids(path, dataset, "val_ids"))
+
+    def inverse_depth(self, path: Path, size: tuple[int, int], units: SceneUnits) -> Float[np.ndarray, "H W"]:
+        """Inverse depth of a file, resized to ``size`` (width, height); here the files hold inverse depth already."""
+        return images.read_depth(path, size)
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``."""
+        dataset = read_json(root / "dataset.json", LAYOUT)
+        metadata, units = read_json(root / "metadata.json", LAYOUT), read_units(root / "scene.json")
+        split = self.split(root, dataset, metadata)
+        _check_split(split)
+        times = _times(root / "metadata.json", metadata, [*split.train, *split.val])
+        factor = factor or self.default_factor
+        files = _find_files(root, factor, split)
+        cameras, lenses = {}, {}
+        for name, time in times.items():
+            cameras[name], lenses[name] = read_camera(root / f"camera/{name}.json", units, factor, time)
+        points, colors = read_points(root, units)
+
+        def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
+            return self.inverse_depth(path, size, units)
+
+        reader = _FrameReader(cameras, lenses, files, frozenset(split.train), perturbation, read_depth)
+        return Capture(root.resolve().name, cameras, split.train, split.val, points, colors, reader.read, cache_frames)
+
+
+def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
+    """The list of frame ids under ``key``; empty if there is none.
 
     Args:
-        root: Folder with dataset.json.
-        dataset: Layout; recognised from the files if None.
-        factor: Downscaling of the pictures, the folder rgb/<factor>x; the dataset's usual one if None.
-        perturbation: Damage to the masks of training frames; evaluation frames keep the true ones.
-        cache_frames: Frames to keep in memory.
+        path: The file that ``values`` come from, for messages.
+        values: Content of the file.
+        key: Key of the list.
 
     Raises:
-        ValueError: On anything missing, damaged or inconsistent; one line that names the file.
+        ValueError: If it is not a list of distinct names without slashes.
     """
-    perturbation = perturbation or MaskPerturbation()
-    check_perturbation(perturbation)
-    facts = read_json(root / "dataset.json", LAYOUT)
-    kind, factor = _layout(root, dataset, factor)
-    metadata, units = read_json(root / "metadata.json", LAYOUT), read_units(root / "scene.json")
-    train, val = _split(root, kind, facts, metadata)
-    times = _times(root / "metadata.json", metadata, [*train, *val])
-    files = _find_files(root, factor, train, val)
-    cameras, lenses = {}, {}
-    for name, time in times.items():
-        cameras[name], lenses[name] = read_camera(root / f"camera/{name}.json", units, factor, time)
-    points, colors = read_points(root, units)
-    reader = _Reader(cameras, lenses, files, frozenset(train), perturbation, units.scale if kind == "iphone" else None)
-    return Capture(root.resolve().name, cameras, train, val, points, colors, reader.read, cache_frames)
-
-
-def _layout(root: Path, dataset: Dataset | None, factor: int | None) -> tuple[Dataset, int]:
-    if dataset is not None and dataset not in FACTORS:
-        raise ValueError(f"unknown dataset {dataset!r}, expected one of {', '.join(FACTORS)}")
-    if factor is not None and factor < 1:
-        raise ValueError(f"factor must be at least 1, got {factor}")
-    kind = dataset or recognise(root)
-    return kind, factor or FACTORS[kind]
-
-
-def recognise(root: Path) -> Dataset:
-    """Which dataset's layout the files have.
-
-    iPhone: splits/train.json, covisible/<factor>x/val, or depth of camera 0 as .npy. (DyCheck adds splits,
-    co-visibility and extra.json to HyperNeRF's captures too, but names those splits train_mono, train_intl, …)
-    NeRF-DS: masks in full size, or pictures in no other. Else HyperNeRF.
-    """
-    signs = (root.glob("covisible/*x/val"), root.glob("depth/*x/0_*.npy"))
-    if (root / "splits/train.json").is_file() or any(next(sign, None) for sign in signs):
-        return "iphone"
-    full_size = (root / "resized_mask/1x").is_dir() or not (root / "rgb/2x").is_dir()
-    return "nerfds" if full_size and (root / "rgb/1x").is_dir() else "hypernerf"
-
-
-def _split(root: Path, kind: Dataset, facts: dict[str, Any], metadata: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Ids to train on and to evaluate on."""
-    path = root / "dataset.json"
-    train, val = _ids(path, facts, "train_ids"), _ids(path, facts, "val_ids")
-    if kind == "iphone" and (root / "splits/train.json").is_file():
-        path = root / "splits/train.json"
-        train = _ids(path, read_json(path), "frame_names")
-        val = _ids(root / "splits/val.json", read_json(root / "splits/val.json"), "frame_names")
-    elif kind == "iphone" and not train:
-        ids = _ids(path, facts, "ids")
-        train, val = ([i for i in ids if (_fact(metadata, i, "camera_id") == 0) == first] for first in (True, False))
-    elif kind == "hypernerf" and (not val or set(train) & set(val)):
-        # The interpolation captures have one camera: every fourth frame trains, those half-way evaluate.
-        ids = _ids(path, facts, "ids") or train
-        train, val = ids[::4], ids[2::4]
-    if not train:
-        raise ValueError(f"{path} has no frames to train on")
-    if shared := set(train) & set(val):
-        raise ValueError(f"{path}: frame {min(shared)} is both trained on and evaluated on")
-    return train, val
-
-
-def _ids(path: Path, facts: dict[str, Any], key: str) -> list[str]:
-    ids = facts.get(key, [])
+    ids = values.get(key, [])
     if not isinstance(ids, list) or not all(isinstance(i, str) for i in ids) or len(set(ids)) < len(ids):
-        raise ValueError(f"{path}: {key} must be a list of different ids")
+        raise ValueError(f"{path}: {key} must be a list of distinct ids")
     for i in ids:
         if not i or "/" in i or "\\" in i or "\0" in i or i.startswith("."):
             raise ValueError(f"{path}: {key} must hold plain names, got {i!r}")
     return ids
 
 
-def _fact(metadata: dict[str, Any], name: str, key: str) -> Any:
+def metadata_field(metadata: dict[str, Any], name: str, key: str) -> Any:
+    """A field of a frame in metadata.json; None if it is missing."""
     entry = metadata.get(name)
     return entry.get(key) if isinstance(entry, dict) else None
 
 
+def _check_split(split: Split) -> None:
+    if not split.train:
+        raise ValueError(f"{split.source} has no frames to train on")
+    if both := set(split.train) & set(split.val):
+        raise ValueError(f"{split.source}: frame {min(both)} is listed for both training and evaluation")
+
+
 def _times(path: Path, metadata: dict[str, Any], names: list[str]) -> dict[str, float]:
-    """Time of each frame: time_id (else warp_id, in older captures) over the largest of all frames."""
+    """Time of each frame: its time_id (warp_id in older captures) over the maximum of all frames."""
     steps = {}
     for name in names:
-        step = _fact(metadata, name, "time_id")
-        step = _fact(metadata, name, "warp_id") if step is None else step
+        step = metadata_field(metadata, name, "time_id")
+        step = metadata_field(metadata, name, "warp_id") if step is None else step
         if isinstance(step, bool) or not isinstance(step, int | float) or not 0 <= step < math.inf:
             raise ValueError(f"{path} has no time_id or warp_id for frame {name}: {step!r}")
         steps[name] = step
-    last = max(steps.values()) or 1  # a single moment is time 0
+    last = max(steps.values()) or 1  # if all frames have step 0, their time is 0
     return {name: step / last for name, step in steps.items()}
 
 
 @dataclass(frozen=True)
-class _Files:
-    """Where a frame's parts lie; None for what the capture does not have of it."""
+class _FrameFiles:
+    """Files of a frame; None for those that the capture does not have."""
 
     image: Path
     mask: Path | None
@@ -155,30 +139,27 @@ class _Files:
     covisible: Path | None
 
 
-def _find_files(root: Path, factor: int, train: Sequence[str], val: Sequence[str]) -> dict[str, _Files]:
-    """Files of every frame: pictures all there, and masks of all training frames if there are masks at all."""
+def _find_files(root: Path, factor: int, split: Split) -> dict[str, _FrameFiles]:
+    """Files of every frame: every frame has an image, and every training frame a mask if there are any masks."""
     rgb, size = root / "rgb", f"{factor}x"
     if not (rgb / size).is_dir():
         found = ", ".join(sorted(p.name for p in rgb.glob("*x"))) or "no size"
         raise ValueError(f"{rgb / size} is missing: {LAYOUT}; {rgb} has {found}")
     masks = next((p for p in (root / "resized_mask", root / "mask") if p.is_dir()), None)
     if masks is not None and not (masks / size).is_dir():
-        raise ValueError(f"{masks / size} is missing: the pictures are {rgb / size}, masks must have their size")
-    # Depth is resized to the picture, so the full size serves every factor.
+        raise ValueError(f"{masks / size} is missing: images are read from {rgb / size}, masks must have the same size")
+    # Depth is resized to the image, so the full size serves every factor.
     depths = [root / "depth" / s for s in (size, "1x")]
     files = {}
-    for name in [*train, *val]:
+    for name in [*split.train, *split.val]:
         image = _first(rgb / size / f"{name}{ending}" for ending in (".png", ".jpg"))
         if image is None:
             raise ValueError(f"{rgb / size / name}.png is missing: dataset.json lists the frame")
         mask = None if masks is None else _first(masks / size / f"{name}{e}" for e in (".png.png", ".png"))
-        files[name] = _Files(
-            image,
-            mask,
-            _first(folder / f"{name}{ending}" for folder in depths for ending in (".npy", ".png")),
-            _first([root / "covisible" / size / "val" / f"{name}.png"]),
-        )
-    for name in train:
+        depth = _first(folder / f"{name}{ending}" for folder in depths for ending in (".npy", ".png"))
+        covisible = _first([root / "covisible" / size / "val" / f"{name}.png"])
+        files[name] = _FrameFiles(image, mask, depth, covisible)
+    for name in split.train:
         if masks is not None and files[name].mask is None:
             raise ValueError(f"{masks / size / name}.png.png is missing: every training frame needs its mask")
     return files
@@ -189,31 +170,33 @@ def _first(paths: Iterable[Path]) -> Path | None:
 
 
 @dataclass(frozen=True)
-class _Reader:
+class _FrameReader:
     """Reads frames.
 
     Attributes:
         cameras, lenses, files: Of each frame.
         train: Frames whose masks are perturbed.
-        perturbation: What is done to them.
-        metric_scale: Scene units in a metre where .npy depth is distance along the axis (iPhone); None where it is
-            inverse depth already.
+        perturbation: Perturbation of their masks.
+        read_depth: Reads inverse depth of a size (width, height).
     """
 
     cameras: dict[str, Camera]
     lenses: dict[str, Lens]
-    files: dict[str, _Files]
+    files: dict[str, _FrameFiles]
     train: frozenset[str]
     perturbation: MaskPerturbation
-    metric_scale: float | None
+    read_depth: Callable[[Path, tuple[int, int]], np.ndarray]
 
     def read(self, name: str) -> Frame:
         files, lens, size = self.files[name], self.lenses[name], self.cameras[name].size
-        mask = None if files.mask is None else undistort(images.read_mask(files.mask, size), lens)
+
+        def optional(read: Callable[[Path, tuple[int, int]], np.ndarray], path: Path | None) -> np.ndarray | None:
+            return None if path is None else undistort(read(path, size), lens)
+
+        mask = optional(images.read_mask, files.mask)
         if mask is not None and name in self.train:
             mask = perturb(mask, self.perturbation, name)
-        depth = None if files.depth is None else undistort(self._inverse_depth(files.depth, size), lens)
-        covisible = None if files.covisible is None else undistort(images.read_mask(files.covisible, size), lens)
+        depth, covisible = optional(self.read_depth, files.depth), optional(images.read_mask, files.covisible)
         return Frame(
             name,
             self.cameras[name],
@@ -222,11 +205,3 @@ class _Reader:
             None if depth is None else torch.from_numpy(depth),
             None if covisible is None else torch.from_numpy(covisible),
         )
-
-    def _inverse_depth(self, path: Path, size: tuple[int, int]) -> np.ndarray:
-        values = images.read_depth(path, size)
-        if self.metric_scale is None or path.suffix != ".npy":
-            return values
-        known = (values > 0) & (values != CLAMPED_DEPTH)
-        metres = np.where(known, values, np.float32(np.nan))
-        return 1.0 / (metres * np.float32(self.metric_scale))

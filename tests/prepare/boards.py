@@ -1,4 +1,4 @@
-"""A tiny filmed scene: textured planes at several depths, a camera that travels past, and a board that moves."""
+"""A tiny synthetic video: textured boards at several depths, a camera that moves past them, and a moving board."""
 
 from pathlib import Path
 
@@ -6,27 +6,25 @@ import cv2
 import numpy as np
 
 from warpgs.data.lens import Lens
-from warpgs.prepare.frames import SourceFrame
-from warpgs.prepare.scene import write_facts, write_frames
-from warpgs.prepare.sfm import Cameras
+from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.scene import write_frames, write_scene
 
 SIZE = (256, 192)
-"""(width, height) of the pictures [px]."""
+"""(width, height) of the images [px]."""
 
 FOCAL = 230.0
 
-PLANES = (  # center, half sizes: boards facing the camera, the first one is the wall behind
+PLANES = (  # centre, half sizes: static boards facing the camera, the first one is the wall behind them
     ((0.0, 0.0, 6.0), (7.0, 5.0)),
     ((-1.6, 0.6, 4.0), (0.9, 0.8)),
     ((1.5, 0.9, 3.4), (0.7, 0.6)),
     ((0.2, -0.9, 4.6), (0.8, 0.5)),
 )
 
-MOVER_HALF = (0.45, 0.4)
-
+BOARD_HALF = (0.45, 0.4)
 
 COLORS = ((150, 150, 130), (90, 130, 170), (120, 170, 90), (170, 150, 80))
-"""Of the planes; the board that moves is red."""
+"""Colours of the static boards; the moving board is red."""
 
 
 def texture(seed: int, color: tuple[int, int, int], size: int, cells: tuple[int, ...]) -> np.ndarray:
@@ -46,41 +44,41 @@ def pose(time: float, travel: float = 1.0) -> np.ndarray:
     return np.hstack([rotation, -rotation @ center[:, None]])
 
 
-def mover(time: float) -> tuple[float, float, float]:
-    """Center of the board that moves."""
+def board_center(time: float) -> tuple[float, float, float]:
+    """Centre of the moving board."""
     return (0.7 * np.sin(5.0 * time), 0.1 + 0.4 * np.cos(6.0 * time), 3.0)
 
 
-def _draw(image: np.ndarray, board: tuple, paint: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Paints a board over the picture; returns where."""
+def _render(image: np.ndarray, board: tuple, paint: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """Renders a board over the image; returns the mask of its pixels."""
     (x, y, z), (half_x, half_y) = board
     corners = np.array([[x + i * half_x, y + j * half_y, z] for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-    seen = corners @ view[:, :3].T + view[:, 3]
-    pixels = FOCAL * seen[:, :2] / seen[:, 2:] + np.array(SIZE) / 2.0 - 0.5
+    in_camera = corners @ view[:, :3].T + view[:, 3]
+    pixels = FOCAL * in_camera[:, :2] / in_camera[:, 2:] + np.array(SIZE) / 2.0 - 0.5
     side = len(paint) - 1
     square = np.array([[0, 0], [side, 0], [side, side], [0, side]], np.float32)
     homography = cv2.getPerspectiveTransform(square, pixels.astype(np.float32))
-    drawn = cv2.warpPerspective(paint, homography, SIZE, flags=cv2.INTER_AREA)
+    rendered = cv2.warpPerspective(paint, homography, SIZE, flags=cv2.INTER_AREA)
     where = cv2.warpPerspective(np.ones(paint.shape[:2], np.uint8), homography, SIZE, flags=cv2.INTER_NEAREST) > 0
-    image[where] = drawn[where]
+    image[where] = rendered[where]
     return where
 
 
 def depth(view: np.ndarray) -> np.ndarray:
-    """[H, W] depth of the planes that stand as a camera sees them, along its axis."""
+    """[H, W] depth of the static boards along the axis of a camera."""
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5)
     rays = np.stack([(x - SIZE[0] / 2) / FOCAL, (y - SIZE[1] / 2) / FOCAL, np.ones_like(x)], -1) @ view[:, :3]
     center, nearest = -view[:, :3].T @ view[:, 3], np.full(x.shape, np.inf)
     for middle, half in PLANES:
         distance = (middle[2] - center[2]) / rays[..., 2]
-        place = center + distance[..., None] * rays
-        hit = (np.abs(place[..., :2] - middle[:2]) <= half).all(-1)
+        position = center + distance[..., None] * rays
+        hit = (np.abs(position[..., :2] - middle[:2]) <= half).all(-1)
         nearest = np.where(hit, np.minimum(nearest, distance), nearest)
     return nearest
 
 
-def film(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """[H, W, 3] RGB pictures, and [H, W] true where the board that moves is."""
+def record(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """[H, W, 3] RGB images, and [H, W] masks of the moving board."""
     paints = [texture(0, COLORS[0], 512, (20, 60)), *(texture(k, COLORS[k], 128, (5, 14)) for k in (1, 2, 3))]
     red = texture(9, (190, 60, 50), 128, (4, 12))
     images, masks = [], []
@@ -88,22 +86,22 @@ def film(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple
         time = k / (num_frames - 1)
         image, view = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose(time, travel)
         for board, paint in sorted(zip(PLANES, paints, strict=True), key=lambda b: -b[0][0][2]):
-            _draw(image, board, paint, view)
+            _render(image, board, paint, view)
         mask = np.zeros(SIZE[::-1], bool)
         if moves:
-            mask = _draw(image, (mover(time), MOVER_HALF), red, view)
+            mask = _render(image, (board_center(time), BOARD_HALF), red, view)
         images.append(image)
         masks.append(mask)
     return images, masks
 
 
 def poses(num_frames: int = 24) -> np.ndarray:
-    """[F, 3, 4] of the film's pictures."""
+    """[F, 3, 4] poses of the video's frames."""
     return np.array([pose(k / (num_frames - 1)) for k in range(num_frames)])
 
 
 def points(count: int = 400) -> np.ndarray:
-    """[count, 3] on the planes that stand."""
+    """[count, 3] points on the static boards."""
     generator = np.random.default_rng(1)
     chosen = [PLANES[k % len(PLANES)] for k in range(count)]
     offsets = generator.uniform(-0.6, 0.6, (count, 2))
@@ -115,13 +113,13 @@ def lens() -> Lens:
 
 
 def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
-    """A capture of the film with its true cameras and masks."""
-    images, masks = film(num_frames)
+    """A capture of the video with its true cameras and masks."""
+    images, masks = record(num_frames)
     write_folder(root / "frames", images)
     names = [path.stem for path in sorted((root / "frames").iterdir())]
     cameras = Cameras(names, lens(), poses(num_frames), points(), 0.1, 10.0)
     write_frames(root, root / "frames", cameras, masks)
-    write_facts(root, cameras, [SourceFrame(name, name, k) for k, name in enumerate(names)], holdout)
+    write_scene(root, cameras, {name: k for k, name in enumerate(names)}, holdout)
     return root
 
 

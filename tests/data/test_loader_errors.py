@@ -1,4 +1,4 @@
-"""What is no capture is refused in one line that names the file and what was expected."""
+"""Invalid captures are refused in one line that names the file and what was expected."""
 
 import json
 import shutil
@@ -24,13 +24,13 @@ def read_all(root, **options):
 
 
 def refused(root, match, **options):
-    """The capture is refused at the door, or when its frames are read, in one line."""
+    """The capture is refused in one line, on opening or when its frames are read."""
     with pytest.raises(ValueError, match=match) as caught:
         read_all(root, **options)
     assert "\n" not in str(caught.value)
 
 
-def test_the_kind_given_wins_over_the_files(root):
+def test_the_given_dataset_overrides_recognition(root):
     shutil.copytree(root / "rgb/1x", root / "rgb/2x")
     refused(root, r"resized_mask.2x is missing", dataset="hypernerf")
 
@@ -38,11 +38,11 @@ def test_the_kind_given_wins_over_the_files(root):
 def test_a_damaged_colmap_model_is_refused(root):
     (root / "points.npy").unlink()
     (root / "sparse/0").mkdir(parents=True)
-    refused(root, r"sparse.0 is no COLMAP model")
+    refused(root, r"sparse.0 is not a COLMAP model")
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), np.zeros(3), np.full((4, 3), np.nan)])
-def test_points_that_are_none_are_refused(root, points):
+def test_invalid_points_are_refused(root, points):
     write_array(root / "points.npy", points)
     refused(root, r"points\.npy must hold finite points")
 
@@ -65,10 +65,10 @@ BAD_CAMERAS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "said"), BAD_CAMERAS, ids=[str(k) for k in range(len(BAD_CAMERAS))])
-def test_a_bad_camera_is_refused_by_file_and_field(root, changes, said):
+@pytest.mark.parametrize(("changes", "message"), BAD_CAMERAS, ids=[str(k) for k in range(len(BAD_CAMERAS))])
+def test_a_bad_camera_is_refused_by_file_and_field(root, changes, message):
     edit_json(root / "camera/right_000002.json", **changes)
-    refused(root, rf"right_000002\.json.*{said}")
+    refused(root, rf"right_000002\.json.*{message}")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "[" * 100_000, '{"a": ' + "9" * 5000 + "}", "\udcff"])
@@ -84,31 +84,31 @@ def test_a_missing_file_is_refused_by_name(root, path):
     refused(root, rf"{path} is missing")
 
 
-def test_a_missing_mask_of_a_training_frame_is_refused_at_the_door(root):
+def test_a_missing_mask_of_a_training_frame_is_refused_on_opening(root):
     (root / "resized_mask/1x/left_000001.png.png").unlink()
     with pytest.raises(ValueError, match=r"left_000001\.png\.png is missing: every training frame"):
         load_capture(root)
 
 
 @pytest.mark.parametrize("folder", ["", "nowhere", "rgb", "scene.json"])
-def test_a_wrong_folder_is_told_what_a_capture_has(root, folder):
+def test_the_error_for_a_wrong_folder_lists_the_files_of_a_capture(root, folder):
     refused(root.parent if folder == "" else root / folder, "dataset.json is missing: a capture has .*camera")
 
 
-def test_a_missing_size_is_told_which_sizes_there_are(root):
+def test_the_error_for_a_missing_size_lists_the_existing_sizes(root):
     refused(root, r"rgb.4x is missing: .* has 1x", factor=4)
 
 
 @pytest.mark.usefixtures("contracts_off")
 def test_an_unknown_dataset_is_refused_with_the_known_ones(root):
-    refused(root, "unknown dataset 'blender', expected one of nerfds, hypernerf, iphone", dataset="blender")
+    refused(root, "unknown dataset 'blender', expected one of iphone, nerfds, hypernerf", dataset="blender")
 
 
 def test_a_factor_below_one_is_refused(root):
     refused(root, "factor must be at least 1, got 0", factor=0)
 
 
-def test_a_bad_perturbation_is_refused_at_the_door(root):
+def test_a_bad_perturbation_is_refused_on_opening(root):
     with pytest.raises(ValueError, match="erode"):
         load_capture(root, perturbation=MaskPerturbation(erode=-1))
 
@@ -133,7 +133,7 @@ def test_bad_scene_units_are_refused(root, scene):
     refused(root, r"scene\.json must have")
 
 
-def test_a_truncated_picture_is_refused_when_it_is_read(root):
+def test_a_truncated_image_is_refused_when_it_is_read(root):
     path = root / "rgb/1x/left_000001.png"
     path.write_bytes(path.read_bytes()[:-20])
     refused(root, r"left_000001\.png is truncated")

@@ -1,4 +1,4 @@
-"""The three layouts, read as the real datasets have them."""
+"""Loaders read captures as the real datasets have them."""
 
 import json
 import shutil
@@ -11,11 +11,14 @@ import pytest
 import torch
 
 from tests.data import captures
-from tests.data.captures import CENTER, SCALE, SIZE, edit_json, picture, write_array, write_capture, write_json
+from tests.data.captures import CENTER, SCALE, SIZE, edit_json, image_of, write_array, write_capture, write_json
+from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
-from warpgs.data.loaders.nerfies import load_capture, recognise
+from warpgs.data import loaders
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.loaders import LOADERS, load_capture, recognize
 
-KINDS = pytest.mark.parametrize("kind", ["nerfds", "hypernerf", "iphone"])
+DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
 
 
 @pytest.fixture
@@ -33,40 +36,40 @@ def hypernerf(tmp_path):
     return write_capture(tmp_path / "toy", "hypernerf")
 
 
-@KINDS
-def test_each_layout_is_recognised_from_its_files(tmp_path, kind):
-    assert recognise(write_capture(tmp_path / "vrig-misleading", kind)) == kind
+@DATASETS
+def test_each_dataset_is_recognized_from_its_files(tmp_path, dataset):
+    assert recognize(write_capture(tmp_path / "vrig-misleading", dataset)) == dataset
 
 
-@KINDS
-def test_each_layout_is_read_whole(tmp_path, kind):
-    scene = load_capture(write_capture(tmp_path / "toy", kind))
-    train, val = captures.ids_of(kind)
+@DATASETS
+def test_each_dataset_is_read_completely(tmp_path, dataset):
+    scene = load_capture(write_capture(tmp_path / "toy", dataset))
+    train, val = captures.ids_of(dataset)
     assert (scene.train, scene.val) == (tuple(train), tuple(val))
-    size = (SIZE[0] // captures.FACTORS[kind], SIZE[1] // captures.FACTORS[kind])
+    size = (SIZE[0] // captures.FACTORS[dataset], SIZE[1] // captures.FACTORS[dataset])
     for name in (*train, *val):
         frame = scene.frame(name)
         assert frame.camera.size == size
-        assert np.array_equal(frame.image.numpy(), picture(name, size))
-        assert (frame.static_mask is not None) == (kind == "nerfds")
-        assert (frame.inverse_depth is not None) == (kind == "iphone" and name in train)
-        assert (frame.covisible is not None) == (kind == "iphone" and name in val)
+        assert np.array_equal(frame.image.numpy(), image_of(name, size))
+        assert (frame.static_mask is not None) == (dataset == "nerfds")
+        assert (frame.inverse_depth is not None) == (dataset == "iphone" and name in train)
+        assert (frame.covisible is not None) == (dataset == "iphone" and name in val)
 
 
-def test_dychecks_additions_do_not_turn_hypernerf_into_iphone(hypernerf):
+def test_hypernerf_captures_with_dychecks_additions_are_recognized(hypernerf):
     write_json(hypernerf / "splits/train_mono.json", {"frame_names": []})
     write_json(hypernerf / "extra.json", {})
     (hypernerf / "covisible/2x/val_mono").mkdir(parents=True)
-    assert recognise(hypernerf) == "hypernerf"
+    assert recognize(hypernerf) == "hypernerf"
 
 
-def test_an_iphone_capture_that_was_never_split_is_recognised_by_its_depth(iphone):
+def test_an_iphone_capture_without_splits_is_recognized_by_its_depth(iphone):
     shutil.rmtree(iphone / "splits")
     shutil.rmtree(iphone / "covisible")
-    assert recognise(iphone) == "iphone"
+    assert recognize(iphone) == "iphone"
 
 
-def test_without_any_split_camera_0_of_an_iphone_capture_trains(iphone):
+def test_an_iphone_capture_without_any_split_trains_on_camera_0(iphone):
     shutil.rmtree(iphone / "splits")
     edit_json(iphone / "dataset.json", train_ids=None, val_ids=None)
     scene = load_capture(iphone)
@@ -78,16 +81,16 @@ def test_a_single_camera_iphone_capture_has_no_evaluation_frames(iphone):
     assert load_capture(iphone).val == ()
 
 
-@KINDS
-def test_a_point_falls_where_the_files_camera_model_says(tmp_path, kind):
-    root = write_capture(tmp_path / "toy", kind)
-    name, factor = captures.ids_of(kind)[0][2], captures.FACTORS[kind]
+@DATASETS
+def test_points_are_projected_as_the_camera_model_of_the_files_defines(tmp_path, dataset):
+    root = write_capture(tmp_path / "toy", dataset)
+    name, factor = captures.ids_of(dataset)[0][2], captures.FACTORS[dataset]
     edit_json(root / f"camera/{name}.json", pixel_aspect_ratio=1.25)
-    facts = json.loads((root / f"camera/{name}.json").read_text())
+    fields = json.loads((root / f"camera/{name}.json").read_text())
     world = np.array([0.4, -0.3, 1.0])
-    x, y, z = np.array(facts["orientation"]) @ (world - facts["position"])
-    u = facts["focal_length"] * x / z + facts["principal_point"][0]
-    v = 1.25 * facts["focal_length"] * y / z + facts["principal_point"][1]
+    x, y, z = np.array(fields["orientation"]) @ (world - fields["position"])
+    u = fields["focal_length"] * x / z + fields["principal_point"][0]
+    v = 1.25 * fields["focal_length"] * y / z + fields["principal_point"][1]
     camera = load_capture(root).cameras[name]
     scene = torch.tensor((world - CENTER) * SCALE, dtype=torch.float32)
     viewed = camera.viewmat[:3, :3] @ scene + camera.viewmat[:3, 3]
@@ -96,17 +99,17 @@ def test_a_point_falls_where_the_files_camera_model_says(tmp_path, kind):
     assert torch.allclose(pixel, torch.tensor([u / factor, v / factor, 1.0], dtype=torch.float32), atol=1e-4)
 
 
-def test_a_pixel_centre_has_the_ray_that_nerfies_casts_through_it(root):
+def test_the_ray_of_a_pixel_centre_is_that_of_nerfies(root):
     """Nerfies casts the ray of pixel (column, row) through (column + 0.5, row + 0.5) of the file's coordinates."""
     name = captures.ids_of("nerfds")[0][1]
-    facts = json.loads((root / f"camera/{name}.json").read_text())
-    local = (np.array([7.5, 3.5]) - facts["principal_point"]) / facts["focal_length"]
-    world = np.array(facts["orientation"]).T @ (2.0 * np.array([*local, 1.0])) + facts["position"]
+    fields = json.loads((root / f"camera/{name}.json").read_text())
+    local = (np.array([7.5, 3.5]) - fields["principal_point"]) / fields["focal_length"]
+    world = np.array(fields["orientation"]).T @ (2.0 * np.array([*local, 1.0])) + fields["position"]
     ours = load_capture(root).cameras[name].unproject(torch.tensor([3]), torch.tensor([7]), torch.tensor([2.0 * SCALE]))
     assert torch.allclose(ours[0], torch.tensor((world - CENTER) * SCALE, dtype=torch.float32), atol=1e-5)
 
 
-def test_odd_sizes_are_rounded_as_nerfies_does(hypernerf):
+def test_odd_sizes_are_rounded_as_in_nerfies(hypernerf):
     for path in (hypernerf / "camera").iterdir():
         edit_json(path, image_size=[39, 23])
     assert {camera.size for camera in load_capture(hypernerf).cameras.values()} == {(20, 12)}
@@ -116,25 +119,25 @@ def test_old_camera_files_may_call_the_tangential_distortion_tangential(root):
     path = root / "camera/left_000000.json"
     edit_json(path, tangential_distortion=None, tangential=[0.02, 0.01])
     scene = load_capture(root)
-    assert not np.array_equal(scene.frame("left_000000").image.numpy(), picture("left_000000"))
+    assert not np.array_equal(scene.frame("left_000000").image.numpy(), image_of("left_000000"))
 
 
-def test_three_tangential_zeros_are_two(root):
+def test_a_third_tangential_coefficient_may_be_zero(root):
     edit_json(root / "camera/left_000000.json", tangential_distortion=[0.0, 0.0, 0.0])
     assert len(load_capture(root).train) == 4
 
 
-def test_a_distorted_frame_is_straightened_with_all_its_parts(root):
+def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
     edit_json(root / "camera/left_000000.json", radial_distortion=[0.8, 0.0, 0.0])
     scene = load_capture(root)
-    bent, straight = scene.frame("left_000000"), scene.frame("left_000001")
-    assert bent.camera.K[0, 0] > straight.camera.K[0, 0]
-    assert torch.equal(bent.camera.K[:2, 2], straight.camera.K[:2, 2])
-    assert bent.static_mask.dtype == torch.bool
-    assert not torch.equal(bent.static_mask, straight.static_mask)
+    distorted, pinhole = scene.frame("left_000000"), scene.frame("left_000001")
+    assert distorted.camera.K[0, 0] > pinhole.camera.K[0, 0]
+    assert torch.equal(distorted.camera.K[:2, 2], pinhole.camera.K[:2, 2])
+    assert distorted.static_mask.dtype == torch.bool
+    assert not torch.equal(distorted.static_mask, pinhole.static_mask)
 
 
-def test_iphone_depth_says_nothing_where_the_sensor_saw_nothing_or_too_far(iphone):
+def test_iphone_depth_is_unknown_where_the_sensor_has_no_value_or_a_clamped_one(iphone):
     path = iphone / "depth/2x/0_00000.npy"
     depth = np.load(path)
     depth[0, 0], depth[0, 1], depth[0, 2] = 0.0, 3.0, np.nan
@@ -145,7 +148,7 @@ def test_iphone_depth_says_nothing_where_the_sensor_saw_nothing_or_too_far(iphon
     assert inverse[5, 5] == pytest.approx(1.0 / (2.0 * SCALE))
 
 
-def test_depth_of_the_full_size_serves_any_factor(hypernerf):
+def test_full_size_depth_is_used_with_any_factor(hypernerf):
     name = captures.ids_of("hypernerf")[0][0]
     captures.write_png(hypernerf / f"depth/1x/{name}.png", np.full((SIZE[1], SIZE[0]), 51, np.uint8))
     inverse = load_capture(hypernerf).frame(name).inverse_depth
@@ -158,19 +161,19 @@ def test_an_evaluation_frame_may_lack_its_mask(root):
     assert load_capture(root).frame("right_000000").static_mask is None
 
 
-def test_masks_in_a_folder_called_mask_are_found(root):
+def test_masks_may_be_in_a_folder_called_mask(root):
     (root / "resized_mask").rename(root / "mask")
     assert not load_capture(root, "nerfds").frame("left_000000").static_mask[5, 5]
 
 
 def test_only_training_masks_are_perturbed(root):
     scene = load_capture(root, perturbation=MaskPerturbation(dilate=2))
-    truth = torch.from_numpy(captures.moving_block() == 255)
+    truth = torch.from_numpy(captures.dynamic_block() == 255)
     assert scene.frame("left_000000").static_mask.sum() < truth.sum()
     assert torch.equal(scene.frame("right_000000").static_mask, truth)
 
 
-def test_opening_a_capture_reads_no_picture(root):
+def test_opening_a_capture_reads_no_image(root):
     for path in (root / "rgb/1x").iterdir():
         path.write_bytes(b"")
     assert len(load_capture(root).train) == 4
@@ -181,7 +184,7 @@ def test_a_capture_without_points_opens(root):
     assert load_capture(root).points.shape == (0, 3)
 
 
-def test_points_of_a_colmap_model_come_with_colours_when_there_is_no_points_file(root):
+def test_without_a_points_file_points_and_colours_of_a_colmap_model_are_read(root):
     pycolmap = pytest.importorskip("pycolmap")
     (root / "points.npy").unlink()
     model = pycolmap.Reconstruction()
@@ -195,24 +198,24 @@ def test_points_of_a_colmap_model_come_with_colours_when_there_is_no_points_file
     assert scene.point_colors.tolist() == [[0, 20, 30], [10, 20, 30]]
 
 
-def test_a_single_moment_is_time_zero(tmp_path):
+def test_a_single_time_is_0(tmp_path):
     root = write_capture(tmp_path / "toy")
     edit_json(root / "dataset.json", train_ids=["left_000000"], val_ids=["right_000000"])
     assert [camera.time for camera in load_capture(root).cameras.values()] == [0.0, 0.0]
 
 
-def test_the_image_of_a_straightened_capture_agrees_with_opencv(root):
-    """Where no zoom is needed, OpenCV's own undistortion is what we do, with its pixel centres."""
+def test_an_undistorted_image_agrees_with_opencv(root):
+    """If no zoom is needed, OpenCV's own undistortion gives the same image, with its pixel centres."""
     name, k1 = "left_000000", -0.4
     edit_json(root / f"camera/{name}.json", radial_distortion=[k1, 0.0, 0.0])
     frame = load_capture(root).frame(name)
     K = frame.camera.K.double().numpy()
     K[:2, 2] -= 0.5
-    theirs = cv2.undistort(picture(name), K, np.array([k1, 0.0, 0.0, 0.0, 0.0]))
+    theirs = cv2.undistort(image_of(name), K, np.array([k1, 0.0, 0.0, 0.0, 0.0]))
     assert np.abs(frame.image.numpy().astype(int) - theirs).max() <= 12  # OpenCV rounds positions to 1/32 pixel
 
 
-def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_half_way(hypernerf):
+def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_halfway(hypernerf):
     ids = [name for pair in zip(*captures.ids_of("hypernerf"), strict=False) for name in pair]
     for name in captures.ids_of("hypernerf")[0][2:]:
         ids.append(name)
@@ -221,7 +224,7 @@ def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_half_wa
     assert (scene.train, scene.val) == ((ids[0], ids[4]), (ids[2],))
 
 
-def test_time_is_the_time_id_over_the_largest_of_training_and_evaluation(root):
+def test_time_is_the_time_id_over_the_maximum_of_training_and_evaluation_frames(root):
     metadata = json.loads((root / "metadata.json").read_text())
     metadata["right_000002"]["time_id"] = 12
     metadata["left_000001"]["warp_id"] = 7
@@ -230,25 +233,25 @@ def test_time_is_the_time_id_over_the_largest_of_training_and_evaluation(root):
     assert (times["left_000000"], times["left_000001"], times["right_000002"]) == (0.0, 1 / 12, 1.0)
 
 
-def test_time_is_the_warp_id_where_there_is_no_time_id(iphone):
+def test_without_a_time_id_time_is_the_warp_id(iphone):
     assert load_capture(iphone).cameras["1_00002"].time == pytest.approx(2 / 3)
 
 
-def test_points_come_in_scene_units(root):
+def test_points_are_in_scene_units(root):
     expected = (np.arange(30).reshape(10, 3) - CENTER) * SCALE
     assert np.allclose(load_capture(root).points.numpy(), expected, atol=1e-6)
 
 
-def test_the_covisible_mask_is_true_where_the_file_is_bright(iphone):
+def test_the_covisible_mask_is_true_where_bright(iphone):
     frame = load_capture(iphone).frame("1_00000")
-    assert np.array_equal(frame.covisible.numpy(), captures.moving_block((SIZE[0] // 2, SIZE[1] // 2)) == 255)
+    assert np.array_equal(frame.covisible.numpy(), captures.dynamic_block((SIZE[0] // 2, SIZE[1] // 2)) == 255)
 
 
 ARCHIVE = Path(__file__).parents[3] / "shared/data/studio_a.tar"
 
 
 def one_frame(root, name):
-    """A frame of the path-traced capture, whose pictures are packed as .webp, as a capture of its own."""
+    """A capture of one frame of the path-traced capture, whose images are .webp files."""
     with tarfile.open(ARCHIVE) as tar:
         for member in tar:
             path = Path(*Path(member.name).parts[1:])
@@ -267,8 +270,8 @@ def one_frame(root, name):
 
 
 @pytest.mark.skipif(not ARCHIVE.exists(), reason="the path-traced capture is not on this machine")
-def test_a_real_captures_points_lie_at_the_depth_that_its_frame_shows(tmp_path):
-    """Up to a scale and an offset of inverse depth, and but for points that other surfaces hide: so by ranks."""
+def test_the_points_of_a_real_capture_agree_with_its_depth(tmp_path):
+    """Compared by rank: depth has an unknown scale and offset, and some points are hidden."""
     scene = load_capture(one_frame(tmp_path, "left_000040"))
     frame = scene.frame("left_000040")
     row, column, depth, inside = frame.camera.project(scene.points)
@@ -280,6 +283,36 @@ def test_a_real_captures_points_lie_at_the_depth_that_its_frame_shows(tmp_path):
     assert torch.corrcoef(ranks)[0, 1] > 0.9
 
 
-def test_pictures_in_full_size_alone_are_of_nerfds_even_without_masks(root):
+def test_a_capture_with_full_size_images_only_is_nerfds_even_without_masks(root):
     shutil.rmtree(root / "resized_mask")
-    assert recognise(root) == "nerfds"
+    assert recognize(root) == "nerfds"
+
+
+class TextLoader:
+    """A layout that has nothing in common with that of Nerfies."""
+
+    def recognizes(self, root):
+        return (root / "capture.txt").is_file()
+
+    def load(self, root, *, factor, perturbation, cache_frames):
+        self.arguments = factor, perturbation, cache_frames
+        camera = Camera(torch.eye(4), torch.eye(3), 4, 2)
+        frame = Frame("a", camera, torch.zeros(2, 4, 3, dtype=torch.uint8))
+        name = (root / "capture.txt").read_text()
+        return Capture(name, {"a": camera}, ["a"], [], torch.zeros(0, 3), None, lambda _: frame)
+
+
+def test_a_dataset_is_added_by_one_entry(tmp_path, monkeypatch):
+    loader = TextLoader()
+    monkeypatch.setitem(LOADERS, "text", loader)
+    (tmp_path / "capture.txt").write_text("mine")
+    assert recognize(tmp_path) == "text"
+    assert load_capture(tmp_path).name == "mine"
+    assert loader.arguments == (None, MaskPerturbation(), 256)
+    load_capture(tmp_path, "text", factor=3, perturbation=MaskPerturbation(erode=1), cache_frames=7)
+    assert loader.arguments == (3, MaskPerturbation(erode=1), 7)
+
+
+def test_a_folder_that_no_loader_recognizes_is_read_as_the_fallback(tmp_path):
+    assert recognize(tmp_path) == loaders.FALLBACK
+    assert loaders.FALLBACK in LOADERS

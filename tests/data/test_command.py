@@ -1,0 +1,53 @@
+"""``warpgs check`` as it is called."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import tyro
+
+from tests.prepare import boards
+from warpgs.data.command import Check
+
+HEAVY = ("torch", "numpy", "cv2", "warp", "scipy")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return boards.write_capture(tmp_path_factory.mktemp("commands"))
+
+
+def check(*arguments):
+    tyro.cli(Check, args=[str(argument) for argument in arguments]).run()
+
+
+def test_a_fit_capture_is_reported_without_an_exit(root, capsys):
+    check(root)
+    assert capsys.readouterr().out.strip().endswith("fit to train on")
+
+
+def test_an_unfit_capture_exits_with_code_1_and_prints_json_on_request(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        check(tmp_path, "--json")
+    assert stop.value.code == 1
+    assert json.loads(capsys.readouterr().out)["fit"] is False
+
+
+def test_an_unknown_dataset_is_reported_with_the_known_ones(root, capsys):
+    with pytest.raises(SystemExit) as stop:
+        check(root, "--dataset", "blender")
+    assert stop.value.code == 1
+    assert "unknown dataset 'blender', expected one of iphone, nerfds, hypernerf" in capsys.readouterr().out
+
+
+def test_the_dataset_and_factor_given_are_used(root, capsys):
+    check(root, "--dataset", "hypernerf", "--factor", "2")
+    assert "read as hypernerf" in capsys.readouterr().out
+
+
+def test_importing_the_command_imports_no_heavy_package():
+    """Otherwise ``warpgs --help`` would be slow."""
+    code = f"import warpgs.data.command, sys; print([name for name in {HEAVY} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

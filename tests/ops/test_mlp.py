@@ -1,0 +1,124 @@
+"""The multilayer perceptron, and the backward pass of ReLU and bias in half precision."""
+
+import pytest
+import torch
+
+from tests.reference import mlp as reference
+from tests.scenes import error, generator, random_like, relative_error
+from warpgs.ops.mlp import MAX_CHUNKS, ROWS_PER_CHUNK, num_sums, num_values, perceptron, relu_backward, split
+
+COLUMNS, WIDTH, OUTPUTS = 6, 16, 5
+LAYOUTS = [(9, 4), (4, 2), (4, 1), (5, 0), (2, 0)]
+"""Numbers of layers with the last one, and the layer that reads the encoding again (0: none)."""
+
+
+def make_shapes(depth, skip):
+    hidden = [(WIDTH, WIDTH + COLUMNS * (k == skip)) for k in range(1, depth - 1)]
+    return [(WIDTH, COLUMNS), *hidden, (OUTPUTS + 2, WIDTH)]
+
+
+def random_inputs(num, skip):
+    """Encodings with free columns before them if there is a skip connection."""
+    inputs = torch.randn(num, COLUMNS + (WIDTH if skip else 0), generator=generator())
+    inputs[:, :-COLUMNS] = torch.nan
+    return inputs
+
+
+def random_values(shapes):
+    values = 0.3 * torch.randn(num_values(shapes), generator=generator(1))
+    return values.requires_grad_()
+
+
+def double_layers(values, shapes):
+    return [tuple(part.detach().double().requires_grad_() for part in layer) for layer in split(values, shapes)]
+
+
+@pytest.mark.parametrize("num", [0, 1, 37])
+@pytest.mark.parametrize(("depth", "skip"), LAYOUTS)
+def test_outputs_and_gradients_equal_the_reference(depth, skip, num):
+    shapes = make_shapes(depth, skip)
+    inputs, values = random_inputs(num, skip), random_values(shapes)
+    layers = double_layers(values, shapes)
+    expected = reference.perceptron(inputs[:, -COLUMNS:].double(), layers, skip)[:, :OUTPUTS]
+    outputs = perceptron(inputs, values, shapes, skip, OUTPUTS)
+    assert outputs.shape == (num, OUTPUTS)
+    (v_outputs,) = random_like([outputs])
+    outputs.backward(v_outputs)
+    expected.backward(v_outputs.double())
+    if num > 0:
+        assert relative_error(outputs, expected) < 2e-6
+    for layer, wanted in zip(split(values.grad, shapes), layers, strict=True):
+        for gradient, part in zip(layer, wanted, strict=True):
+            assert error(gradient, part.grad) < 1e-5 * (1 + part.grad.abs().max())
+
+
+def test_inputs_get_no_gradient():
+    shapes = make_shapes(3, 0)
+    inputs = random_inputs(4, 0).requires_grad_()
+    perceptron(inputs, random_values(shapes), shapes, 0, OUTPUTS).sum().backward()
+    assert inputs.grad is None
+
+
+def test_sizes_that_do_not_fit_half_precision_are_refused():
+    shapes = make_shapes(3, 0)
+    with pytest.raises(ValueError, match="multiples of 8"):
+        perceptron(random_inputs(4, 0).half(), random_values(shapes), shapes, 0, OUTPUTS)
+
+
+# Backward pass of ReLU ------------------------------------------------------------------------------------------------
+
+
+def random_half(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed)).half()
+
+
+def empty_sums(gradients):
+    return torch.full((num_sums(len(gradients)), gradients.shape[1]), torch.nan)
+
+
+@pytest.mark.parametrize(
+    ("num", "columns", "extra"), [(1, 8, 0), (37, 16, 24), (MAX_CHUNKS * ROWS_PER_CHUNK + 3, 8, 0)]
+)
+def test_gradients_pass_where_features_are_positive_and_are_summed(num, columns, extra):
+    features = random_half(num, columns + extra)
+    features[:, :columns].clamp_min_(0.0)
+    features[0, 0] = 0.0
+    gradients = random_half(num, columns, seed=1)
+    expected, _ = reference.relu_backward(features[:, :columns], gradients)
+    sums = empty_sums(gradients)
+    relu_backward(features, gradients, sums)
+    assert torch.equal(gradients, expected)
+    assert torch.allclose(sums.double().sum(0), expected.double().sum(0), rtol=1e-6, atol=1e-5)
+
+
+def test_tiny_features_and_nan_count_as_positive():
+    features = torch.tensor([[6e-8, 0.0, torch.nan, torch.inf, 1.0, 0.0, 0.0, 0.0]]).half()
+    gradients = torch.arange(1, 9).half()[None]
+    relu_backward(features, gradients, empty_sums(gradients))
+    assert gradients.tolist() == [[1, 0, 3, 4, 5, 0, 0, 0]]
+
+
+def test_no_rows_have_no_partial_sums():
+    assert num_sums(0) == 0
+    relu_backward(random_half(0, 8), random_half(0, 8), torch.zeros(0, 8))
+
+
+def test_sums_of_a_wrong_size_are_refused():
+    with pytest.raises(ValueError, match="sums must"):
+        relu_backward(random_half(9, 8), random_half(9, 8), torch.zeros(2, 8))
+
+
+@pytest.mark.parametrize(
+    ("features", "gradients", "words"),
+    [
+        (random_half(3, 8), random_half(3, 12), "multiple of 8"),
+        (random_half(3, 8), random_half(3, 16), "at most"),
+        (random_half(4, 8), random_half(3, 8), "gradients must"),
+        (random_half(3, 8).float(), random_half(3, 8), "features must"),
+        (random_half(3, 8), random_half(8, 3).T, "gradients must"),
+    ],
+)
+@pytest.mark.usefixtures("contracts_off")
+def test_relu_backward_refuses_inputs_that_do_not_fit(features, gradients, words):
+    with pytest.raises(ValueError, match=words):
+        relu_backward(features, gradients, empty_sums(gradients))

@@ -1,0 +1,118 @@
+"""Splat rows: packing and its backward pass."""
+
+import pytest
+import torch
+
+from tests.reference import rows as reference
+from tests.scenes import GEOMETRY, HEIGHT, WIDTH, error, generator, make_camera, make_splats, relative_error
+from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
+from warpgs.kernels.rows import NUM_MOMENTS, gradient_stride
+from warpgs.ops.projection import Geometry, Projection, View, project
+from warpgs.ops.rows import Rows
+from warpgs.runtime.tape import OpContext
+
+NUM = 150
+SIZE = (WIDTH, HEIGHT)
+
+
+def projected(num=NUM) -> Projection:
+    splats, camera = make_splats(num), make_camera()
+    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
+    return project(geometry, View(camera.viewmat, camera.K, *SIZE))
+
+
+def random_features(num=NUM, channels=5) -> torch.Tensor:
+    return torch.rand(num, channels, generator=generator())
+
+
+def pack(splats: Projection, features: torch.Tensor, with_depth: bool = False) -> tuple[OpContext, Rows]:
+    ctx = OpContext(features.device, [features])
+    rows = Rows(ctx, splats, features.shape[1], with_depth, SIZE)
+    rows.add_features(ctx, features)
+    return ctx, rows
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+@pytest.mark.parametrize("channels", [1, 3, 4, 5])
+def test_rows_of_visible_splats_equal_the_reference(channels, with_depth):
+    splats, features = projected(), random_features(channels=channels)
+    visible = splats.radii[:, 0] > 0
+    assert 10 < visible.sum() < NUM
+    _, rows = pack(splats, features, with_depth)
+    packed = torch.cat([features, splats.depths[:, None]], 1) if with_depth else features
+    doubles = [t[visible].double() for t in (splats.means2d, splats.conics, splats.opacities, packed)]
+    assert relative_error(rows.packed[visible].flatten(1), reference.pack(*doubles)) < 1e-6
+
+
+def test_culled_splats_are_marked_and_sorted_last():
+    splats = projected()
+    visible = splats.radii[:, 0] > 0
+    _, rows = pack(splats, random_features())
+    assert torch.equal(rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY, ~visible)
+    assert (rows.depth_keys[:NUM][~visible] == CULLED_DEPTH).all()
+    depths = torch.where(visible, splats.depths, torch.inf)
+    order = rows.depth_keys[:NUM].argsort(stable=True)
+    assert torch.equal(order, depths.argsort(stable=True))
+    assert torch.equal(rows.gaussian_from_rank[:NUM], torch.arange(NUM, dtype=torch.int32))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_splat_with_a_feature_that_is_not_finite_is_marked_as_culled(value):
+    splats, features = projected(), random_features()
+    features[::3, 2] = value
+    _, rows = pack(splats, features)
+    culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
+    assert culled[::3].all()
+    assert torch.equal(culled[1::3], splats.radii[1::3, 0] == 0)
+
+
+def random_gradient_rows(splats: Projection, pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int):
+    """[1, N, stride] random gradients of features, and the moments of s = alpha v_alpha."""
+    means2d, conics, opacities = (t.double() for t in (splats.means2d, splats.conics, splats.opacities))
+    s = reference.log_alpha(means2d, conics, opacities, pixels).exp() * v_alpha
+    rows = torch.zeros(1, len(means2d), gradient_stride(channels))
+    rows[0, :, :channels] = torch.randn(len(means2d), channels, generator=generator(5))
+    rows[0, :, channels : channels + NUM_MOMENTS] = reference.moments(means2d, pixels, s)
+    return rows
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_gradients_equal_the_reference(with_depth):
+    splats, features = projected(), random_features()
+    visible = splats.radii[:, 0] > 0
+    pixels = torch.rand(40, 2, generator=generator(1)).double() * torch.tensor(SIZE)
+    v_alpha = torch.randn(NUM, 40, generator=generator(2)).double()
+    ctx, rows = pack(splats, features, with_depth)
+    channels = features.shape[1] + int(with_depth)
+    gradient_rows = random_gradient_rows(splats, pixels, v_alpha, channels)
+    ctx.backward([rows.packed], [gradient_rows])
+
+    leaves = [t[visible].double().requires_grad_() for t in (splats.means2d, splats.conics, splats.opacities)]
+    (reference.log_alpha(*leaves, pixels).exp() * v_alpha[visible]).sum().backward()
+    for tensor, leaf in zip((splats.means2d, splats.conics, splats.opacities), leaves, strict=True):
+        gradient = ctx.gradient(tensor)
+        assert relative_error(gradient[visible], leaf.grad) < 1e-5
+        assert not gradient[~visible].any()
+    assert error(ctx.gradient(features), gradient_rows[0, :, : features.shape[1]]) == 0
+    if with_depth:
+        assert error(ctx.gradient(splats.depths), gradient_rows[0, :, channels - 1]) == 0
+    half_size = torch.tensor(SIZE) / 2
+    assert relative_error(rows.gradient_norms[visible, 0], (leaves[0].grad * half_size).norm(dim=1)) < 1e-5
+    assert not rows.gradient_norms[~visible].any()
+
+
+def test_gradients_are_summed_over_shards():
+    splats, features = projected(), random_features()
+    ctx, rows = pack(splats, features)
+    shards = torch.rand(3, NUM, gradient_stride(5), generator=generator())
+    ctx.backward([rows.packed], [shards])
+    assert error(ctx.gradient(features), shards[:, :, :5].sum(0)) < 1e-6
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_few_gaussians_are_enough(num):
+    splats, features = projected(num), random_features(num)
+    ctx, rows = pack(splats, features)
+    ctx.backward([rows.packed], [torch.zeros(1, num, gradient_stride(5))])
+    assert rows.packed.shape == (num, 4, 4)
+    assert ctx.gradient(features).shape == (num, 5)

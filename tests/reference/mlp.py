@@ -1,0 +1,22 @@
+"""The multilayer perceptron in plain torch, any dtype."""
+
+import torch
+from torch import Tensor
+
+
+def perceptron(encoding: Tensor, layers: list[tuple[Tensor, Tensor]], skip: int) -> Tensor:
+    """Layers of (weight, bias) with ReLU after all but the last one; layer ``skip`` > 0 reads the encoding again."""
+    values = encoding
+    for k, (weight, bias) in enumerate(layers):
+        if k > 0 and k == skip:
+            values = torch.cat([values, encoding], 1)
+        values = values @ weight.T + bias
+        if k < len(layers) - 1:
+            values = values.clamp_min(0.0)
+    return values
+
+
+def relu_backward(features: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the inputs of ReLU, and their sum over the rows, given its outputs and their gradients."""
+    masked = torch.where(features > 0, gradients, 0.0)
+    return masked, masked.sum(0)

@@ -1,0 +1,109 @@
+"""The cache of CUDA graphs; without a GPU, a replay is simulated by repeating the work."""
+
+import pytest
+import torch
+
+from warpgs.runtime import graphs
+from warpgs.runtime.graphs import WARM_UPS, GraphCache
+
+
+@pytest.fixture
+def captures(monkeypatch):
+    """A list with one entry for each capture."""
+    made = []
+
+    def record(work, _stream=None, _pool=None):
+        made.append(work)
+        return work
+
+    monkeypatch.setattr(graphs, "record", record)
+    return made
+
+
+class Work:
+    """Counts its runs in a tensor that stays at the same address."""
+
+    def __init__(self):
+        self.count = torch.zeros(1)
+
+    def __call__(self):
+        self.count += 1
+        return (self.count,)
+
+
+def run(cache, key, work, times):
+    for _ in range(times):
+        outputs = cache.run(key, work)
+    return outputs
+
+
+def test_the_first_runs_are_eager(captures):
+    cache, work = GraphCache(2), Work()
+    for number in range(1, WARM_UPS + 1):
+        (count,) = cache.run("key", work)
+        assert count == number
+        assert not cache.is_captured("key")
+    assert not captures
+
+
+def test_one_capture_per_key_is_replayed(captures):
+    cache, first, second = GraphCache(2), Work(), Work()
+    run(cache, "first", first, WARM_UPS + 3)
+    assert len(captures) == 1
+    assert cache.is_captured("first")
+    assert not cache.is_captured("second")
+    run(cache, "second", second, WARM_UPS + 3)
+    run(cache, "first", first, 2)
+    assert len(captures) == 2
+    assert (first.count, second.count) == (WARM_UPS + 5, WARM_UPS + 3)
+
+
+def test_replays_return_the_same_tensors(captures):
+    cache = GraphCache(1)
+    produced = []
+
+    def work():
+        produced.append(torch.ones(2))
+        return produced[0], produced[-1]
+
+    run(cache, "key", work, WARM_UPS + 1)
+    captures.clear()
+    cache._graphs["key"].replay = lambda: None  # a graph does not run Python
+    first, second = cache.run("key", work), cache.run("key", work)
+    assert all(a is b for a, b in zip(first, second, strict=True))
+    assert not captures
+
+
+def test_a_key_is_captured_again_after_invalidation_without_warm_up(captures):
+    cache, work = GraphCache(2), Work()
+    run(cache, "key", work, WARM_UPS + 1)
+    cache.invalidate()
+    assert not cache.is_captured("key")
+    run(cache, "key", work, 2)
+    assert len(captures) == 2
+    assert cache.is_captured("key")
+
+
+def test_the_oldest_graph_is_dropped(captures):
+    cache, work = GraphCache(2), Work()
+    for key in ("oldest", "middle", "newest"):
+        run(cache, key, work, WARM_UPS + 1)
+    assert [cache.is_captured(key) for key in ("oldest", "middle", "newest")] == [False, True, True]
+    run(cache, "oldest", work, 1)
+    assert len(captures) == 4
+    assert [cache.is_captured(key) for key in ("oldest", "middle", "newest")] == [True, False, True]
+
+
+def test_a_capture_that_fails_is_not_kept(captures, monkeypatch):
+    def record(_work, _stream, _pool):
+        raise RuntimeError("the capture failed")
+
+    cache, work = GraphCache(1), Work()
+    run(cache, "key", work, WARM_UPS)
+    with monkeypatch.context() as patched:
+        patched.setattr(graphs, "record", record)
+        with pytest.raises(RuntimeError, match="the capture failed"):
+            cache.run("key", work)
+    assert not cache.is_captured("key")
+    run(cache, "key", work, 1)
+    assert cache.is_captured("key")

@@ -1,0 +1,89 @@
+"""Errors of commands end with one line and an exit code."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from warpgs.errors import ADVICE, is_out_of_memory, one_line, run_command
+
+
+def failing(error):
+    def command():
+        raise error
+
+    return command
+
+
+@pytest.mark.parametrize(("returned", "code"), [(None, 0), (0, 0), (1, 1), (130, 130), ("text", 0), (True, 0)])
+def test_a_command_that_succeeds_decides_its_exit_code(returned, code, capsys):
+    assert run_command(lambda: returned) == code
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("error", [ValueError, ImportError, OSError, FileNotFoundError])
+def test_errors_of_the_user_are_one_line_and_exit_code_2(error, capsys):
+    assert run_command(failing(error("a file\n  is missing"))) == 2
+    assert capsys.readouterr().err == "warpgs: a file is missing\n"
+
+
+def test_ctrl_c_is_one_line_and_exit_code_130(capsys):
+    assert run_command(failing(KeyboardInterrupt()), prog="train.py") == 130
+    assert capsys.readouterr().err == "train.py: stopped\n"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory.\nTried 2 GiB"),
+        MemoryError(),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4 bytes"),
+    ],
+)
+def test_lack_of_memory_is_one_line_with_advice_and_exit_code_2(error, capsys):
+    assert run_command(failing(error), advice="use less") == 2
+    line = capsys.readouterr().err
+    assert line.startswith("warpgs: out of memory (")
+    assert line.endswith("; use less\n")
+    assert line.count("\n") == 1
+
+
+def test_lack_of_memory_has_advice_by_default(capsys):
+    run_command(failing(MemoryError()))
+    assert capsys.readouterr().err.endswith(f"; {ADVICE}\n")
+
+
+@pytest.mark.parametrize("error", [RuntimeError("shapes differ"), AssertionError(), KeyError("x")])
+def test_bugs_are_raised(error):
+    with pytest.raises(type(error)):
+        run_command(failing(error))
+
+
+def test_an_exit_of_the_command_is_kept():
+    with pytest.raises(SystemExit) as stop:
+        run_command(failing(SystemExit(1)))
+    assert stop.value.code == 1
+
+
+def test_real_allocation_failures_are_recognized():
+    for allocate in (lambda: torch.empty(1 << 60, dtype=torch.uint8), lambda: np.empty(1 << 60, np.uint8)):
+        with pytest.raises((RuntimeError, MemoryError)) as caught:
+            allocate()
+        assert is_out_of_memory(caught.value)
+
+
+def test_other_errors_are_not_lack_of_memory():
+    assert not is_out_of_memory(RuntimeError("shapes differ"))
+
+
+def test_one_line_has_no_line_breaks():
+    assert one_line(ValueError("a\n\n  b\tc ")) == "a b c"
+
+
+def test_importing_errors_imports_no_torch():
+    """Otherwise ``warpgs --help`` would be slow."""
+    code = "import warpgs.errors, sys; print('torch' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"

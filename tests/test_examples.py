@@ -1,0 +1,67 @@
+"""The example programs, on tiny sizes."""
+
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+import warpgs
+from tests import tiny
+from warpgs.runs.run import Run
+from warpgs.visualize import to_bytes
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs an example with arguments, as ``python examples/NAME.py ARGUMENTS``; returns what it printed."""
+
+    def run(name: str, *arguments: object) -> str:
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    with tiny.in_haste():
+        yield run
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in EXAMPLES.glob("*.py")))
+def test_every_example_has_a_help_text(name, run, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run(name, "--help")
+    assert ended.value.code == 0
+    assert "--out" in capsys.readouterr().out
+
+
+def test_fit_image_improves_the_psnr_by_more_than_12_decibels_in_60_steps(run, tmp_path):
+    printed = run("fit_image", "--width", 48, "--gaussians", 400, "--steps", 60, "--out", tmp_path)
+    before, after = (float(value) for value in re.findall(r"([\d.]+) dB", printed))
+    assert after > before + 12
+    for name in ("before.png", "after.png"):
+        assert cv2.imread(str(tmp_path / name)).shape == (48, 48, 3)
+
+
+def test_fit_image_reads_greyscale_images(run, tmp_path):
+    grey = cv2.imread(str(EXAMPLES.parent / "docs" / "images" / "page.jpg"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "grey.png"), grey[:90, :180])
+    run("fit_image", tmp_path / "grey.png", "--width", 32, "--gaussians", 20, "--steps", 1, "--out", tmp_path)
+    assert cv2.imread(str(tmp_path / "after.png")).shape == (16, 32, 3)
+
+
+def test_train_from_python_leaves_a_run_with_metrics(run, finished_run, tmp_path):
+    data = Run.open(finished_run).config.data
+    run("train_from_python", "--data", data, "--iterations", 6, "--out", tmp_path / "run")
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
+def test_render_a_time_writes_the_image_of_that_view_and_time(run, finished_run, tmp_path):
+    out = tmp_path / "time.png"
+    run("render_a_time", finished_run, "--time", 0.25, "--view", 2, "--out", out)
+    capture, scene = Run.open(finished_run).open_capture(), warpgs.open_run(finished_run)
+    camera = capture.cameras[capture.train[2]].to(scene.device)
+    expected = to_bytes(scene.render(camera, 0.25).joint.image)
+    assert (cv2.imread(str(out))[..., ::-1] == expected).all()

@@ -1,0 +1,24 @@
+"""HyperNeRF: captures of two cameras (vrig-*) and interpolation captures of one camera."""
+
+from pathlib import Path
+from typing import Any
+
+from .nerfies import NerfiesLoader, Split, read_ids
+
+
+class HyperNerfLoader(NerfiesLoader):
+    """Loads captures of HyperNeRF: factor 2, split by train_ids and val_ids, else by every fourth frame."""
+
+    default_factor = 2
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether there are images of half the size."""
+        return (root / "rgb/2x").is_dir()
+
+    def split(self, root: Path, dataset: dict[str, Any], metadata: dict[str, Any]) -> Split:
+        """train_ids and val_ids; of an interpolation capture every fourth frame and those halfway between them."""
+        split = super().split(root, dataset, metadata)
+        if split.val and not set(split.train) & set(split.val):
+            return split
+        ids = read_ids(split.source, dataset, "ids") or split.train
+        return Split(split.source, ids[::4], ids[2::4])

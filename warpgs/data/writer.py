@@ -1,0 +1,134 @@
+"""Writes captures in the layout of NeRF-DS, as ``loaders`` reads them.
+
+One function per part: images, masks, depth and camera of each frame, then the scene, then the index. The index comes
+last, because its dataset.json makes the folder a capture.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Shaped, UInt8
+
+from warpgs.files import write_array, write_json, write_png
+
+from .lens import Lens
+from .units import SceneUnits
+
+
+def write_image(root: Path, name: str, image: UInt8[np.ndarray, "H W 3"], factors: Sequence[int] = (1,)) -> None:
+    """Writes rgb/<factor>x/<name>.png for every downscaling factor.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    for factor in factors:
+        size = _reduced_size(image, factor)
+        write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def write_mask(root: Path, name: str, static_mask: Bool[np.ndarray, "H W"], factors: Sequence[int] = (1,)) -> None:
+    """Writes resized_mask/<factor>x/<name>.png.png for every downscaling factor: 0 = dynamic, 255 = static.
+
+    A pixel of a reduced mask is dynamic if any part of it is.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    dynamic = np.where(static_mask, 0, 255).astype(np.uint8)
+    for factor in factors:
+        static = cv2.resize(dynamic, _reduced_size(dynamic, factor), interpolation=cv2.INTER_AREA) == 0
+        write_png(root / f"resized_mask/{factor}x/{name}.png.png", static.astype(np.uint8) * 255)
+
+
+def write_depth(root: Path, name: str, inverse_depth: Shaped[np.ndarray, "H W"]) -> None:
+    """Writes inverse depth, up to a scale and an offset: 8 or 16 bits as depth/1x/<name>.png, floats as .npy.
+
+    Raises:
+        OSError: If the file cannot be written; the message names it.
+    """
+    if inverse_depth.dtype.kind == "f":
+        write_array(root / f"depth/1x/{name}.npy", inverse_depth)
+    else:
+        write_png(root / f"depth/1x/{name}.png", inverse_depth)
+
+
+def write_camera(
+    root: Path, name: str, lens: Lens, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]
+) -> None:
+    """Writes camera/<name>.json.
+
+    Args:
+        root: Folder of the capture.
+        name: Id of the frame.
+        lens: Intrinsics of the image in full size.
+        rotation: [3, 3] world-to-camera rotation, OpenCV axes.
+        position: [3] camera centre in the world.
+
+    Raises:
+        OSError: If the file cannot be written; the message names it.
+    """
+    fields = {
+        "orientation": rotation.tolist(),
+        "position": position.tolist(),
+        "focal_length": lens.focal[0],
+        "principal_point": lens.center,
+        "skew": 0.0,
+        "pixel_aspect_ratio": lens.focal[1] / lens.focal[0],
+        "radial_distortion": lens.radial,
+        "tangential_distortion": lens.tangential,
+        "image_size": [lens.width, lens.height],
+    }
+    write_json(root / f"camera/{name}.json", fields)
+
+
+def write_scene(root: Path, units: SceneUnits, points: Float[np.ndarray, "P 3"], near: float, far: float) -> None:
+    """Writes scene.json and points.npy.
+
+    Args:
+        root: Folder of the capture.
+        units: Scene units of the capture.
+        points: [P, 3] sparse static points in the world.
+        near, far: Depth range [scene units].
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    bbox = [[-1, -1, -1], [1, 1, 1]]
+    scene = {"center": units.center.tolist(), "scale": units.scale, "bbox": bbox, "near": near, "far": far}
+    write_json(root / "scene.json", scene)
+    write_array(root / "points.npy", points)
+
+
+def write_index(
+    root: Path, time_ids: Mapping[str, int], val: Collection[str] = (), camera_ids: Mapping[str, int] | None = None
+) -> None:
+    """Writes metadata.json, then dataset.json, which makes the folder a capture.
+
+    warp_id and appearance_id are the index of the frame's time among all times.
+
+    Args:
+        root: Folder of the capture.
+        time_ids: Time step of every frame, in the order of dataset.json.
+        val: Frames to evaluate on; all others are trained on.
+        camera_ids: Camera of every frame; all are camera 0 if None.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    index = {step: k for k, step in enumerate(sorted(set(time_ids.values())))}
+    metadata = {}
+    for name, step in time_ids.items():
+        camera_id = 0 if camera_ids is None else camera_ids[name]
+        ids = {"time_id": step, "warp_id": index[step], "appearance_id": index[step], "camera_id": camera_id}
+        metadata[name] = ids
+    write_json(root / "metadata.json", metadata)
+    train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
+    counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}
+    write_json(root / "dataset.json", {**counts, "ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids})
+
+
+def _reduced_size(image: np.ndarray, factor: int) -> tuple[int, int]:
+    """(width, height), rounded as ``camera_files`` rounds it."""
+    return round(image.shape[1] / factor), round(image.shape[0] / factor)

@@ -1,0 +1,78 @@
+"""Cameras and sparse points as structure from motion recovers them."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from warpgs.data.lens import Lens, pinhole_matrix
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Posed frames of one lens, and sparse points.
+
+    Attributes:
+        names: Frames that were registered, in temporal order.
+        lens: The lens of all frames.
+        poses: [F, 3, 4] world to camera, OpenCV axes.
+        points: [P, 3] in the world.
+        error: Mean reprojection error [px].
+        angle: Median triangulation angle of the points [degrees].
+        weak_features: Whether features of low contrast were used.
+    """
+
+    names: list[str]
+    lens: Lens
+    poses: Float[np.ndarray, "F 3 4"]
+    points: Float[np.ndarray, "P 3"]
+    error: float
+    angle: float
+    weak_features: bool = False
+
+    @property
+    def centers(self) -> Float[np.ndarray, "F 3"]:
+        """[F, 3] centres of the cameras in the world."""
+        return -np.einsum("fji,fj->fi", self.poses[:, :, :3], self.poses[:, :, 3])
+
+    def undistorted(self) -> "Cameras":
+        """The cameras of the undistorted frames."""
+        return dataclasses.replace(self, lens=pinhole_lens(self.lens))
+
+    def save(self, path: Path) -> None:
+        """Writes <path>.npz."""
+        lens = self.lens
+        np.savez(
+            f"{path}.npz",
+            names=np.array(self.names),
+            lens=np.array([lens.width, lens.height, *lens.focal, *lens.center, *lens.radial, *lens.tangential]),
+            poses=self.poses,
+            points=self.points,
+            quality=np.array([self.error, self.angle]),
+            weak_features=np.array(self.weak_features),
+        )
+
+    @staticmethod
+    def load(path: Path) -> "Cameras":
+        """The cameras that ``save`` wrote."""
+        with np.load(f"{path}.npz") as z:
+            v = z["lens"].tolist()
+            lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
+            error, angle = z["quality"].tolist()
+            weak = bool(z["weak_features"])
+            return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)
+
+
+def pinhole_lens(lens: Lens) -> Lens:
+    """The pinhole lens of the images that ``undistort`` makes."""
+    K = pinhole_matrix(lens)
+    return Lens(lens.width, lens.height, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
+
+
+def resized_lens(lens: Lens, width: int, height: int) -> Lens:
+    """The lens of images that were resized to another size."""
+    x, y = width / lens.width, height / lens.height
+    focal, center = (lens.focal[0] * x, lens.focal[1] * y), (lens.center[0] * x, lens.center[1] * y)
+    return dataclasses.replace(lens, width=width, height=height, focal=focal, center=center)

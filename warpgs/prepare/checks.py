@@ -1,0 +1,60 @@
+"""Checks of the options before a preparation starts, and of the number of frames once they are taken."""
+
+from pathlib import Path
+
+from .depth import DEPTHS
+from .frames import check_selection
+from .masks import MASKERS
+from .options import Options
+from .scene import held_out
+from .weights import find_weights
+
+MIN_FOR_MOTION = 10
+"""Minimum number of frames to find what moves; with fewer, some lack three far frames (``revisits``)."""
+
+
+def check_options(source: Path, root: Path, options: Options) -> None:
+    """Checks the options, and that the capture's folder does not contain what is read.
+
+    Raises:
+        ValueError: If a value is invalid, or a folder or the weights of a network are missing.
+        ImportError: If the package of a network is missing.
+    """
+    check_selection(options.selection)
+    if options.holdout < 0 or options.holdout == 1:
+        raise ValueError(f"--holdout must be 0 (none) or at least 2, got {options.holdout}")
+    if options.masks not in MASKERS and not Path(options.masks).is_dir():
+        raise ValueError(f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder")
+    if options.depth not in DEPTHS:
+        raise ValueError(f"--depth must be one of {', '.join(DEPTHS)}, got {options.depth}")
+    _check_networks(options)
+    inputs = [("source", source)]
+    inputs += [("masks", Path(options.masks))] if options.masks not in MASKERS else []
+    inputs += [("weights", options.weights)] if options.weights is not None else []
+    for name, path in inputs:
+        if root.resolve() in (path.resolve(), *path.resolve().parents):
+            raise ValueError(f"{root} contains the {name} {path}: choose a separate folder for the capture")
+
+
+def _check_networks(options: Options) -> None:
+    methods = MASKERS.get(options.masks), DEPTHS[options.depth]
+    networks = [method.network for method in methods if method is not None and method.network is not None]
+    if options.weights is not None and not networks:
+        known = [method.network.option for method in (*MASKERS.values(), *DEPTHS.values()) if method and method.network]
+        raise ValueError(f"--weights is for {' and '.join(known)}: neither is used")
+    for network in networks:
+        find_weights(network, options.weights)
+
+
+def check_count(count: int, options: Options) -> None:
+    """Checks that the options are possible with this number of frames.
+
+    Raises:
+        ValueError: If there are too few frames.
+    """
+    if MASKERS.get(options.masks) is not None and count < MIN_FOR_MOTION:
+        raise ValueError(
+            f"{count} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take more "
+            "(--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
+        )
+    held_out([""] * count, options.holdout)

@@ -1,0 +1,70 @@
+"""Dense optical flow between the frames of a video."""
+
+import threading
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+Pair = tuple[int, int]
+
+
+class Flows:
+    """Optical flow (DIS, Kroeger et al. 2016) between frames of one size. Threads may share it.
+
+    The flow between two frames is needed only while one of them is processed; it is computed once and kept until
+    ``release`` was called for both.
+
+    Attributes:
+        grey: [H, W] grey levels of every frame.
+        planes: [H, W] the same with local contrast equalized, so that dark regions count as much as bright ones.
+        x, y: [H, W] column and row of every pixel.
+    """
+
+    def __init__(self, images: Sequence[UInt8[np.ndarray, "H W 3"]]) -> None:
+        contrast = cv2.createCLAHE(2.0, (8, 8))
+        self.grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+        self.planes = [contrast.apply(plane) for plane in self.grey]
+        height, width = self.planes[0].shape
+        self.x, self.y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        self._engines = threading.local()
+        self._flows: dict[Pair, np.ndarray] = {}
+        self._locks: dict[Pair, threading.Lock] = {}
+        self._lock = threading.Lock()
+        self._released: set[int] = set()
+
+    def compute(self, a: UInt8[np.ndarray, "H W"], b: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 2"]:
+        """[H, W, 2] displacement of every pixel of plane a in plane b [px]."""
+        if not hasattr(self._engines, "dis"):
+            self._engines.dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        return self._engines.dis.calc(a, b, None)
+
+    def flow(self, a: int, b: int) -> Float[np.ndarray, "H W 2"]:
+        """[H, W, 2] displacement of every pixel of frame a in frame b [px]."""
+        with self._lock:
+            lock = self._locks.setdefault((a, b), threading.Lock())
+        with lock:  # another thread may be computing this flow
+            flow = self._flows.get((a, b))
+            if flow is None:
+                flow = self.compute(self.planes[a], self.planes[b]).astype(np.float16)
+                self._flows[a, b] = flow
+        return flow.astype(np.float32)
+
+    def release(self, frame: int) -> None:
+        """Marks a frame as processed: drops the flows between it and other processed frames."""
+        with self._lock:
+            self._released.add(frame)
+            for pair in [pair for pair in self._locks if self._released.issuperset(pair)]:
+                del self._locks[pair]
+                self._flows.pop(pair, None)
+
+    def track(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "H W"]]:
+        """Column and row in b of every pixel of a, and whether the flow from there leads back to it (it is visible)."""
+        forward, backward = self.flow(a, b), self.flow(b, a)
+        x, y = self.x + forward[..., 0], self.y + forward[..., 1]
+        outside = (1e4, 1e4, 0.0, 0.0)
+        backward = cv2.remap(backward, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
+        distance = forward + backward
+        tolerance = 0.5 + 0.05 * np.hypot(forward[..., 0], forward[..., 1])
+        return x, y, np.hypot(distance[..., 0], distance[..., 1]) < tolerance

@@ -1,0 +1,80 @@
+"""Depth of static surfaces by triangulation from optical flow, without a network.
+
+Every frame is triangulated from its neighbours (``triangulation``). Dynamic pixels are omitted, and so are pixels whose
+depth the neighbours' own depth does not confirm.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .flow import Flows
+from .images import brighten
+from .parallel import map_frames
+from .posed_frames import PosedFrames
+from .triangulation import LocalGeometry, triangulate
+
+MAX_RESIDUAL = 1.5
+"""Maximum residual of a pixel with depth [px]."""
+
+MAX_RELATIVE_SIGMA = 0.08
+"""Maximum standard deviation of inverse depth, relative to inverse depth."""
+
+AGREEMENT = 0.06
+"""Relative difference of inverse depths that confirm each other, in addition to twice their standard deviations."""
+
+MIN_CONFIRMATIONS = 2
+
+
+def static_depth(
+    frames: PosedFrames, dynamic: Sequence[Bool[np.ndarray, "H W"]], quiet: bool = True
+) -> list[Float[np.ndarray, "H W"]]:
+    """[H, W] inverse depth of every frame in the units of the poses; NaN where dynamic or not known well.
+
+    Args:
+        frames: At working size.
+        dynamic: [H, W] dynamic mask of each frame.
+        quiet: Whether to show no progress.
+    """
+    flows, indices = Flows(brighten(frames.images)), range(len(frames.images))
+
+    def local(frame: int) -> LocalGeometry:
+        found = triangulate(frames.observations(frame, flows), frames.lens.focal[0])
+        flows.release(frame)
+        with np.errstate(invalid="ignore"):
+            bad = dynamic[frame] | ~(found.residual < MAX_RESIDUAL)
+            bad |= ~(found.sigma < MAX_RELATIVE_SIGMA * found.inverse_depth)
+        found.inverse_depth[bad] = np.nan
+        return found
+
+    geometry = map_frames(local, indices, "depth", quiet)
+    return map_frames(lambda frame: _confirmed(frames, geometry, frame), indices, "depth: cross-checks", quiet)
+
+
+def _confirmed(frames: PosedFrames, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:
+    """[H, W] the inverse depth that at least two neighbours confirm, or all where there are fewer."""
+    rho, sigma = geometry[frame].inverse_depth, geometry[frame].sigma
+    lens, near = frames.lens, frames.neighbours[frame]
+    votes = np.zeros(rho.shape, np.uint8)
+    for other in near:
+        rotation, translation = frames.relative(frame, other)
+        rotated = frames.rotated_rays(rotation)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = rotated[2] + rho * translation[2]
+            x, y = (rotated[0] + rho * translation[0]) / depth, (rotated[1] + rho * translation[1]) / depth
+            column, row = lens.image(x, y)
+            visible = (depth > 1e-3) & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+            x = np.where(visible, column - 0.5, -9.0).astype(np.float32)
+            y = np.where(visible, row - 0.5, -9.0).astype(np.float32)
+            theirs, theirs_sigma = (_nearest(p, x, y) for p in (geometry[other].inverse_depth, geometry[other].sigma))
+            expected, gain = rho / depth, rotated[2] / depth**2
+            tolerance = AGREEMENT * expected + 2.0 * np.hypot(gain * sigma, theirs_sigma)
+            votes += visible & (np.abs(theirs - expected) < tolerance)
+    return np.where(votes >= min(MIN_CONFIRMATIONS, len(near)), rho, np.float32(np.nan))
+
+
+def _nearest(plane: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    nothing = (np.nan,) * 4
+    return cv2.remap(plane, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nothing)

@@ -1,0 +1,125 @@
+"""Frames at working size with their poses: parallax, neighbours, and where neighbours observe a frame's pixels."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from warpgs.data.lens import Lens
+
+from .cameras import Cameras, resized_lens
+from .flow import Flows
+from .images import read_images, resize_to_side
+from .triangulation import Observation
+
+PARALLAX = (4.0, 8.0, 16.0)
+"""Parallax that the neighbours in each temporal direction should have [px of an image 512 wide]."""
+
+WINDOW = 16
+"""Number of frames in each temporal direction that neighbours are chosen from."""
+
+
+class PosedFrames:
+    """Images of one lens with their poses.
+
+    Attributes:
+        images: [H, W, 3] of every frame.
+        lens: The lens.
+        poses: [F, 3, 4] world to camera.
+        points: [P, 3] some points of the scene.
+        rays: [H, W, 2] x, y on the plane z = 1 of every pixel's centre.
+        neighbours: Up to six frames near each frame, see ``_neighbours``.
+    """
+
+    def __init__(
+        self,
+        images: Sequence[UInt8[np.ndarray, "H W 3"]],
+        lens: Lens,
+        poses: Float[np.ndarray, "F 3 4"],
+        points: Float[np.ndarray, "P 3"],
+    ) -> None:
+        self.images, self.lens, self.poses = images, lens, poses
+        self.points = points[:: max(1, len(points) // 400)]
+        self.rays = _rays(lens)
+        self._ray_planes = np.ascontiguousarray(self.rays.transpose(2, 0, 1))
+        self.neighbours = [self._neighbours(frame) for frame in range(len(poses))]
+
+    def relative(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation and translation from the camera of a to that of b."""
+        rotation = self.poses[b, :, :3] @ self.poses[a, :, :3].T
+        translation = self.poses[b, :, 3] - rotation @ self.poses[a, :, 3]
+        return rotation.astype(np.float32), translation.astype(np.float32)
+
+    def rotated_rays(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 H W"]:
+        """[3, H, W] the pixels' rays (x, y, 1), rotated."""
+        x, y = self._ray_planes
+        return np.stack([a * x + b * y + c for a, b, c in rotation.astype(np.float32)])
+
+    def parallax(self, a: int, b: int) -> float:
+        """Median displacement that the translation from a to b, without its rotation, causes in b [px]."""
+        in_a = self.points @ self.poses[a, :, :3].T + self.poses[a, :, 3]
+        rotation, translation = self.relative(a, b)
+        rotated = in_a @ rotation.T
+        in_b = rotated + translation
+        front = (in_a[:, 2] > 0) & (rotated[:, 2] > 0) & (in_b[:, 2] > 0)
+        if not front.any():
+            return 0.0
+        rotated, in_b = rotated[front], in_b[front]
+        displacement = in_b[:, :2] / in_b[:, 2:] - rotated[:, :2] / rotated[:, 2:]
+        return float(self.lens.focal[0] * np.median(np.hypot(displacement[:, 0], displacement[:, 1])))
+
+    def _neighbours(self, frame: int) -> list[int]:
+        """Up to three frames in each temporal direction, the nearest with enough parallax.
+
+        Where the camera hardly moves within the window, the last frame of the window is used.
+        """
+        chosen = []
+        for step in (-1, 1):
+            offset = 0
+            for wanted in PARALLAX:
+                offset += 1
+                while offset < WINDOW and 0 <= frame + step * (offset + 1) < len(self.poses):
+                    if self.parallax(frame, frame + step * offset) >= wanted * self.lens.width / 512:
+                        break
+                    offset += 1
+                if not 0 <= frame + step * offset < len(self.poses):
+                    break
+                chosen.append(frame + step * offset)
+        return chosen
+
+    def observations(self, frame: int, flows: Flows) -> list[Observation]:
+        """Where the frame's neighbours observe its pixels, by optical flow between the images."""
+        found = []
+        for other in self.neighbours[frame]:
+            x, y, visible = flows.track(frame, other)
+            rotation, translation = self.relative(frame, other)
+            position = cv2.remap(self.rays, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            position = np.ascontiguousarray(position.transpose(2, 0, 1))
+            found.append(Observation(position, self.rotated_rays(rotation), translation, visible))
+        return found
+
+
+def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: float = math.inf) -> PosedFrames:
+    """The frames of the cameras, resized so that the longer side has ``side`` pixels.
+
+    Args:
+        folder: Folder of the images <name>.png.
+        cameras: Cameras of these images in full size.
+        side: Longer side [px].
+        max_factor: Maximum enlargement.
+    """
+    images = [resize_to_side(image, side, max_factor) for image in read_images(folder, cameras.names)]
+    height, width = images[0].shape[:2]
+    return PosedFrames(images, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
+
+
+def _rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
+    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    K = np.array([[lens.focal[0], 0, lens.center[0]], [0, lens.focal[1], lens.center[1]], [0, 0, 1.0]])
+    k1, k2, k3 = lens.radial
+    distorted = np.stack([u, v], -1).reshape(-1, 1, 2)
+    rays = cv2.undistortPoints(distorted, K, np.array([k1, k2, *lens.tangential, k3]))
+    return rays.reshape(lens.height, lens.width, 2).astype(np.float32)

@@ -1,0 +1,152 @@
+"""The steps of a preparation: each checks the disk space, calls the function that does the work, and is journaled."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .cameras import Cameras
+from .checks import check_count
+from .depth import DEPTHS, add_depth
+from .frames import Frames, take_frames
+from .given_masks import find_given_masks, read_dynamic
+from .journal import Journal
+from .masks import MASKERS, Masks, find_masks, write_masks
+from .options import Options
+from .scene import write_capture
+from .sfm import NoCamerasError, Settings, recover_cameras
+
+MIN_SPACE = 100
+"""Disk space that is required before any frame is taken [MB]."""
+
+CAPTURE_BYTES = 16
+"""Disk space per pixel of a frame that a preparation needs: the image twice, its mask, depth, and features [bytes]."""
+
+FEATURE_BYTES, MASK_BYTES, IMAGE_BYTES, DEPTH_BYTES = 5, 1, 5, 2
+"""The same for single steps."""
+
+
+def take(source: Path, options: Options, journal: Journal) -> Frames:
+    """The selected frames of the source; a capture that is being replaced stays complete until they are all taken."""
+
+    def make(path: Path) -> str:
+        new = journal.work / "new"
+        shutil.rmtree(new, ignore_errors=True)
+        try:
+            journal.require_space(MIN_SPACE)
+            frames = take_frames(source, new, options.selection, journal.quiet, journal.notes)
+            check_count(len(frames.taken), options)
+            journal.require_space(frames.megabytes(CAPTURE_BYTES))
+            journal.clear(keep=new)
+            new.rename(path)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+        return f"{len(frames.taken)} of {frames.width}×{frames.height}"
+
+    return journal.result("frames", Frames.load, make)
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps after the frames are taken."""
+
+    frames: Frames
+    options: Options
+    journal: Journal
+
+    def recover(
+        self,
+        name: str,
+        names: list[str],
+        masks: Masks | None = None,
+        *,
+        thorough: bool = True,
+        weak_features: bool = False,
+    ) -> Cameras:
+        """The cameras of the named frames, from features outside of the masks."""
+        settings = Settings(self.options.lens, masks.folder if masks else None, thorough, weak_features)
+
+        def make(path: Path) -> str:
+            return _save(self._reconstruct(names, settings), path, names)
+
+        return self.journal.result(name, Cameras.load, make)
+
+    def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
+        """The cameras of the first pass, recovered again from features outside of the masks."""
+        settings = Settings(self.options.lens, masks.folder, thorough=True, weak_features=first.weak_features)
+
+        def make(path: Path) -> str:
+            try:
+                found = self._reconstruct(first.names, settings)
+                if len(found.names) == len(first.names):
+                    return _save(found, path, first.names)
+                reason = "fewer frames were registered"
+            except NoCamerasError as error:
+                reason = str(error)
+            # The static regions were sufficient for the first pass; its cameras are as good as without masks.
+            first.save(path)
+            self.journal.notes.append(f"the cameras are those of the first pass, without masks: with masks, {reason}")
+            return f"{len(first.names)} frames, those of the first pass"
+
+        return self.journal.result(name, Cameras.load, make)
+
+    def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
+        """The masks of the cameras' frames."""
+        masker = MASKERS[self.options.masks]
+        assert masker is not None
+
+        def make(path: Path) -> str:
+            folder, weights, quiet = self.frames.folder, self.options.weights, self.journal.quiet
+            dynamic = find_masks(folder, cameras, masker, weights, half_size=half_size, quiet=quiet)
+            self._require_space(MASK_BYTES)
+            return write_masks(path, cameras.names, dynamic)
+
+        return self.journal.result(name, Masks.load, make)
+
+    def copy_masks(self, name: str) -> Masks:
+        """The masks given by the user, in the size of the frames."""
+
+        def make(path: Path) -> str:
+            files, undistorted = find_given_masks(Path(self.options.masks), self.frames.taken)
+            dynamic = [read_dynamic(file, (self.frames.width, self.frames.height)) for file in files]
+            self._require_space(MASK_BYTES)
+            return write_masks(path, self.frames.names, dynamic, undistorted)
+
+        return self.journal.result(name, Masks.load, make)
+
+    def write_capture(self, name: str, cameras: Cameras, masks: Masks) -> None:
+        """Writes the capture without depth."""
+
+        def make() -> str:
+            self._require_space(IMAGE_BYTES)
+            root, notes = self.journal.root, self.journal.notes
+            return write_capture(root, self.frames, cameras, masks, holdout=self.options.holdout, notes=notes)
+
+        self.journal.step(name, make)
+
+    def add_depth(self, name: str, cameras: Cameras) -> None:
+        """Adds depth to the capture."""
+        method = DEPTHS[self.options.depth]
+
+        def make() -> str:
+            if method is None:
+                return "none"
+            self._require_space(DEPTH_BYTES)
+            return add_depth(self.journal.root, cameras, method, self.options.weights, self.journal.quiet)
+
+        self.journal.step(name, make)
+
+    def _reconstruct(self, names: list[str], settings: Settings) -> Cameras:
+        self._require_space(FEATURE_BYTES)
+        return recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings)
+
+    def _require_space(self, bytes_per_pixel: int) -> None:
+        self.journal.require_space(self.frames.megabytes(bytes_per_pixel))
+
+
+def _save(cameras: Cameras, path: Path, names: Sequence[str]) -> str:
+    cameras.save(path)
+    return (
+        f"{len(cameras.names)} of {len(names)} frames, {len(cameras.points)} points, "
+        f"reprojection error {cameras.error:.2f} px, triangulation angle {cameras.angle:.0f}°"
+    )

@@ -1,0 +1,1 @@
+"""Run folders: config, checkpoints, and the trained scene in them."""

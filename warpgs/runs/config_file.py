@@ -1,0 +1,78 @@
+"""config.json of a run folder: the training config, written and read back."""
+
+import dataclasses
+import json
+import reprlib
+import sys
+import typing
+from pathlib import Path
+from typing import Any
+
+from warpgs.config import TrainConfig, validate
+from warpgs.files import read_json, write_text
+
+NAME = "config.json"
+MAX_BYTES = 1 << 20
+"""Size of config.json [bytes]."""
+
+RENAMED = {"relight_from": "appearance_from"}
+"""Fields that earlier versions wrote under another name."""
+
+
+def write_config(folder: Path, config: TrainConfig) -> None:
+    """Writes config.json into a run folder, with absolute paths.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
+    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
+    write_text(folder / NAME, json.dumps(plain, indent=2, default=str) + "\n")
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """The training config of a run folder.
+
+    Raises:
+        ValueError: If the folder has no config.json, or the file is damaged or has unknown or mistyped fields.
+    """
+    path = folder / NAME
+    if not path.exists():
+        raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
+    config = dataclasses.replace(_parse(TrainConfig, read_json(path, max_bytes=MAX_BYTES), path), out=folder)
+    try:
+        validate(config)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return config
+
+
+def _parse(cls: Any, values: Any, path: Path) -> Any:
+    """A (nested) dataclass from parsed JSON."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected an object for {cls.__name__}, got {values!r}")
+    values = {RENAMED.get(name, name): value for name, value in values.items()}
+    hints = typing.get_type_hints(cls)
+    if unknown := sorted(set(values) - set(hints)):
+        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}")
+    fields = {}
+    for name, value in values.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            value = _parse(hint, value, path)
+        elif Path in typing.get_args(hint) and isinstance(value, str):
+            value = Path(value)
+        elif not _matches(value, hint):
+            raise ValueError(f"{path}: {name} cannot be {reprlib.repr(value)}")
+        fields[name] = float(value) if hint is float else value
+    return cls(**fields)
+
+
+def _matches(value: Any, hint: Any) -> bool:
+    if typing.get_origin(hint) is typing.Literal:
+        return value in typing.get_args(hint)
+    if choices := typing.get_args(hint):
+        return any(_matches(value, choice) for choice in choices)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return type(value) is hint

@@ -1,0 +1,79 @@
+"""The terms of the training loss (paper Eq. 9, 12, 14, 15).
+
+To add one, write a ``LossTerm`` in a new file, add a line to ``TERMS`` and a test.
+"""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.ops.depth_error import depth_error
+
+from . import losses
+from .losses import LossInputs, LossTerm
+
+
+def static(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The static image in the static region (Eq. 9)."""
+    view, layer = inputs.view, inputs.rendering.static
+    assert layer is not None
+    return losses.static_loss(layer.image, view.image, view.static_mask, inputs.config.ssim)
+
+
+def dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The dynamic image against the masked ground truth (Eq. 12)."""
+    view, layer = inputs.view, inputs.rendering.dynamic
+    assert layer is not None
+    return losses.dynamic_loss(layer.image, view.image, view.static_mask, inputs.config.ssim, inputs.backgrounds[2])
+
+
+def joint(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The joint image against the whole ground truth."""
+    return losses.image_loss(inputs.rendering.joint.image, inputs.view.image, inputs.config.ssim)
+
+
+def depth(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The depth of the static image in the static region (Eq. 14)."""
+    view, layer = inputs.view, inputs.rendering.static
+    assert layer is not None
+    assert layer.depth is not None
+    assert inputs.alignment is not None
+    return depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, view.static_mask)
+
+
+def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The depth of the dynamic image in the dynamic region."""
+    view, layer = inputs.view, inputs.rendering.dynamic
+    assert layer is not None
+    assert layer.depth is not None
+    assert inputs.alignment is not None
+    return depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, ~view.static_mask)
+
+
+TERMS: dict[str, LossTerm] = {
+    "static": LossTerm(
+        static,
+        is_active=lambda phase, config: True,
+        weight=lambda plan, config: config.static,
+    ),
+    "dynamic": LossTerm(
+        dynamic,
+        is_active=lambda phase, config: phase.stage != "pretrain",
+        weight=lambda plan, config: config.dynamic,
+    ),
+    "joint": LossTerm(
+        joint,
+        is_active=lambda phase, config: phase.stage == "stage2",
+        weight=lambda plan, config: config.joint,
+    ),
+    "depth": LossTerm(
+        depth,
+        is_active=lambda phase, config: phase.with_depth,
+        weight=lambda plan, config: plan.depth_weight,
+    ),
+    "depth_dynamic": LossTerm(
+        depth_dynamic,
+        is_active=lambda phase, config: phase.with_depth and phase.stage != "pretrain" and config.depth_dynamic > 0,
+        weight=lambda plan, config: config.depth_dynamic * plan.depth_weight,
+    ),
+}
+"""Terms of the loss by name; gradients are accumulated in this order."""

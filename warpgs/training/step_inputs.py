@@ -1,0 +1,56 @@
+"""The numbers that change in every iteration, as named tensors on the device that one copy fills."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+
+class StepInputs:
+    """Inputs of a training step that the host computes, at addresses that never change, as CUDA graphs need.
+
+    Args:
+        sums: Names of the sums that the step adds to.
+        groups: Names of the parameter groups.
+        device: Device of the tensors.
+
+    Attributes:
+        time_noise: [1] added to the time that the deformation network sees.
+        backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
+        scales: [sums] what is added to each sum is multiplied by: loss terms by their weights.
+        scale: The elements of ``scales`` by name.
+        learning_rates: Learning rate of each parameter group by name.
+    """
+
+    def __init__(self, sums: Sequence[str], groups: Sequence[str], device: torch.device) -> None:
+        lengths = (1, 9, len(sums), len(groups))
+        self._buffer = torch.zeros(sum(lengths), device=device)
+        self.time_noise, backgrounds, self.scales, rates = self._buffer.split(lengths)
+        self.backgrounds = backgrounds.view(3, 3)
+        self.scale: dict[str, Tensor] = dict(zip(sums, self.scales.unbind(), strict=True))
+        self.learning_rates: dict[str, Tensor] = dict(zip(groups, rates.unbind(), strict=True))
+
+    def send(
+        self,
+        *,
+        time_noise: float,
+        dynamic_background: Sequence[float],
+        scales: Mapping[str, float],
+        learning_rates: Mapping[str, float],
+    ) -> None:
+        """Fills all tensors by one copy from the host. The joint and the static image keep a black background.
+
+        Args:
+            time_noise: Added to the time.
+            dynamic_background: Red, green and blue behind the dynamic image.
+            scales: Scale of every sum by name.
+            learning_rates: Learning rate of every parameter group by name.
+
+        Raises:
+            KeyError: If a name is missing.
+        """
+        black = [0.0] * 3
+        numbers = [time_noise, *black, *black, *dynamic_background]
+        numbers += [scales[name] for name in self.scale]
+        numbers += [learning_rates[name] for name in self.learning_rates]
+        self._buffer.copy_(torch.tensor(numbers), non_blocking=True)
