@@ -13,7 +13,6 @@ HELP = "Drag: orbit · right drag: pan · wheel: zoom · W A S D Q E: fly"
 TIMES, SPEEDS, WIDTHS = (0.0, 1.0), (0.1, 4.0), (160, 1920)
 """Ranges of the sliders of time, speed and image width [px]."""
 
-LAYER_NAMES = tuple(LAYERS)
 SPECIAL = "\\`*_{}[]()#+!|<>&~"
 """Characters with a meaning in Markdown or HTML."""
 
@@ -28,7 +27,7 @@ class Panel:
             self.play = gui.add_button(PLAY)
             self.speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: the whole scene in 5 seconds")
         with gui.add_folder("Image"):
-            self.layer = gui.add_dropdown("layer", LAYER_NAMES, initial_value=LAYER_NAMES[0])
+            self.layer = gui.add_dropdown("layer", tuple(LAYERS), initial_value=next(iter(LAYERS)))
             hint = "Off: static Gaussians have their own colours, without the appearance network"
             self.residual = gui.add_checkbox("appearance", True, hint=hint)
             hint = "Width at rest; while something changes, as much as the machine can render in time"
@@ -64,7 +63,7 @@ class Panel:
     def current_layer(self) -> str:
         """Name of the layer to show, a key of ``LAYERS``."""
         name = self.layer.value
-        return name if name in LAYER_NAMES else LAYER_NAMES[0]
+        return name if isinstance(name, str) and name in LAYERS else next(iter(LAYERS))
 
     def _add_training(self, gui: viser.GuiApi, training: TrainingCameras) -> None:
         count, first = len(training.views), training.thumbnail(0)
