@@ -1,4 +1,4 @@
-"""A headless Chromium, driven over two pipes; nothing but the browser itself is needed."""
+"""A headless Chromium, controlled over two pipes, without any other package."""
 
 import base64
 import json
@@ -25,10 +25,10 @@ for target, end in zip((3, 4), [os.dup(end) for end in ends]):
     os.dup2(end, target)
 os.execv(sys.argv[3], sys.argv[3:])
 """
-"""A browser reads its commands from the file 3 and answers in the file 4."""
+"""The browser reads commands from file descriptor 3 and writes answers to file descriptor 4."""
 
-PATIENCE = 90.0
-"""Seconds that anything may take: machines of tests are busy."""
+TIMEOUT = 90.0
+"""Maximum duration of any step [s]: test machines are busy."""
 
 
 def executable():
@@ -36,7 +36,7 @@ def executable():
 
 
 class Browser:
-    """One page in a browser of its own, with a profile in ``folder``."""
+    """One page in its own browser, with a profile in ``folder``."""
 
     def __init__(self, folder, width, height):
         commands, self._to = os.pipe()
@@ -59,7 +59,7 @@ class Browser:
 
     def __exit__(self, *_):
         self._process.terminate()
-        self._process.wait(PATIENCE)
+        self._process.wait(TIMEOUT)
         os.close(self._to)
         os.close(self._from)
 
@@ -85,7 +85,7 @@ class Browser:
             self.events.append(answer)
 
     def _next(self):
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while b"\0" not in self._received:
             ready, _, _ = select.select([self._from], [], [], max(0.0, end - time.monotonic()))
             assert ready, "the browser does not answer"
@@ -99,21 +99,21 @@ class Browser:
         return answer["result"].get("value")
 
     def until(self, expression):
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while not self.value(expression):
             assert time.monotonic() < end, (expression, self.events[-5:])
             time.sleep(0.05)
 
     def requests(self):
-        """Addresses that the page asked for."""
+        """Addresses that the page requested."""
         return [e["params"]["request"]["url"] for e in self.events if e.get("method") == "Network.requestWillBeSent"]
 
-    def complaints(self):
-        """Errors and warnings of the page, but those about the speed of a graphics card that is none."""
+    def errors(self):
+        """Errors and warnings of the page, except those about the speed of the software renderer."""
         logged = [e["params"] for e in self.events if e.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded")]
         return [entry for entry in logged if "GPU stall" not in json.dumps(entry)]
 
-    def picture(self):
+    def screenshot(self):
         """[H, W, 3] 8-bit RGB."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

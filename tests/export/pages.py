@@ -1,4 +1,4 @@
-"""The numbers of a page that was just written, to look at; it is taken at its word."""
+"""Reads the data of a page back; the page is trusted."""
 
 import base64
 import gzip
@@ -15,14 +15,16 @@ TYPES = {"geometry": np.dtype("<u4"), "colors": np.dtype("u1"), "rest": np.dtype
 
 def read_page(path):
     blocks = dict(re.findall(r'<script type="[^"]+" id="([a-z-]+)">([^<]*)</script>', path.read_text("utf-8")))
-    facts = json.loads(blocks["scene"])
-    return Baked(facts["keys"], *(branch(blocks, name, facts["branches"][name]) for name in ("static", "dynamic")))
+    metadata = json.loads(blocks["scene"])
+    return Baked(
+        metadata["keys"], *(branch(blocks, name, metadata["branches"][name]) for name in ("static", "dynamic"))
+    )
 
 
-def branch(blocks, name, facts):
-    bounds = {bound: np.array(facts[bound], np.float64) for bound in ("means", "log_scales", "colors", "rest")}
+def branch(blocks, name, metadata):
+    bounds = {bound: np.array(metadata[bound], np.float64) for bound in ("means", "log_scales", "colors", "rest")}
     arrays = {}
     for array, dtype in TYPES.items():
         data = gzip.decompress(base64.b64decode(blocks[f"{name}-{array}"]))
-        arrays[array] = from_planes(np.frombuffer(data, np.uint8), tuple(facts["shapes"][array]), dtype)
+        arrays[array] = from_planes(np.frombuffer(data, np.uint8), tuple(metadata["shapes"][array]), dtype)
     return Branch(Bounds(**bounds), **arrays)

@@ -1,4 +1,4 @@
-"""Small clouds and a small scene that moves, for the tests of exports."""
+"""Small clouds and a small trained scene for tests."""
 
 import torch
 
@@ -6,6 +6,7 @@ from tests import tiny
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.export.cloud import Cloud
+from warpgs.export.clouds import Clouds
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
@@ -17,7 +18,7 @@ METADATA = Metadata(iteration=32, use_deformation=True, use_appearance=True, sh_
 
 
 def cloud(num, degree=1, seed=0):
-    """Gaussians before the camera below, the second half of them dynamic."""
+    """Gaussians in front of ``camera()``, the second half of them dynamic."""
     random = torch.Generator().manual_seed(seed)
     splats = Splats(
         means=torch.rand(num, 3, generator=random) * 2 - 1,
@@ -45,7 +46,7 @@ def psnr(a, b):
 
 
 def refusal(read, path):
-    """What a reader says of a file that it does not take; any other error is one of the test."""
+    """The message of the reader's ValueError; None if the file is read. Any other error fails the test."""
     try:
         read(path)
     except ValueError as error:
@@ -67,7 +68,7 @@ def trained_scene(num_static=40, num_dynamic=20, seed=0):
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return TrainedScene(scene, TrainConfig(model=tiny.MODEL, device="cpu"), METADATA)
+    return TrainedScene(scene.requires_grad_(False), TrainConfig(model=tiny.MODEL, device="cpu"), METADATA)
 
 
 def _random(num):

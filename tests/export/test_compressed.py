@@ -1,4 +1,4 @@
-"""Compressed PLY: laid out as its other readers expect, and the same image to within its few bits."""
+"""Compressed PLY: the layout that other readers expect, and the same image up to quantisation."""
 
 import dataclasses
 
@@ -16,13 +16,13 @@ def path(tmp_path):
     return tmp_path / "a.compressed.ply"
 
 
-def near(a, b):
-    """Rows of b in the order of those of a that are at the same places."""
+def matched(a, b):
+    """The Gaussians of b in the order of the closest ones of a."""
     return b.select(((a.means[:, None] - b.means[None]) ** 2).sum(2).argmin(1))
 
 
 @pytest.mark.parametrize("num", [0, 1, 255, 256, 257, 600])
-def test_it_has_a_chunk_for_every_256_gaussians_and_16_bytes_for_each(path, num):
+def test_a_file_has_one_chunk_per_256_gaussians_and_16_bytes_per_gaussian(path, num):
     write_compressed(path, scenes.cloud(num, degree=0))
     tables = read_ply(path)
     assert [len(tables["chunk"]), len(tables["vertex"])] == [-(-num // 256), num]
@@ -34,16 +34,16 @@ def test_it_has_a_chunk_for_every_256_gaussians_and_16_bytes_for_each(path, num)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_the_image_is_nearly_the_same_after_export_and_import(path, degree):
+def test_the_image_is_almost_the_same_after_export_and_import(path, degree):
     cloud = scenes.cloud(300, degree)
     write_compressed(path, cloud)
     assert scenes.psnr(scenes.image(read_compressed(path)), scenes.image(cloud)) > 40
 
 
-def test_values_come_back_to_within_their_bits(path):
+def test_values_are_restored_to_within_half_a_step(path):
     cloud = scenes.cloud(200, degree=2)
     write_compressed(path, cloud)
-    back = near(cloud, read_compressed(path))
+    back = matched(cloud, read_compressed(path))
     assert np.abs(back.means - cloud.means).max() <= 2 / 1023 / 2 * 1.01
     assert np.abs(back.log_scales - cloud.log_scales).max() <= np.ptp(cloud.log_scales) / 1023 / 2 * 1.01
     assert np.abs(back.sh[:, 1:] - cloud.sh[:, 1:]).max() <= 8 / 255 / 2 * 1.01
@@ -53,7 +53,7 @@ def test_values_come_back_to_within_their_bits(path):
     assert np.abs((back.quats * cloud.quats).sum(1)).min() > 1 - 1e-5
 
 
-def test_bits_are_where_playcanvas_looks_for_them(path):
+def test_the_bits_are_in_the_layout_of_playcanvas(path):
     # One Gaussian at the far x, y, z of a chunk of two; its rotation's largest component is z, the others (w, x, y).
     cloud = scenes.cloud(2, degree=1)
     means = np.array([[0, 0, 0], [1, 2, 3]], np.float32)
@@ -75,7 +75,7 @@ def test_bits_are_where_playcanvas_looks_for_them(path):
     assert [rest["f_rest_0"], rest["f_rest_1"], rest["f_rest_3"]] == [255, 0, 159]  # red, red, green
 
 
-def test_a_file_without_ranges_of_colours_is_read(path):
+def test_a_file_without_colour_ranges_is_read(path):
     cloud = dataclasses.replace(scenes.cloud(10, degree=0), sh=np.zeros((10, 1, 3), np.float32))
     write_compressed(path, cloud)
     tables = read_ply(path)
@@ -95,22 +95,25 @@ def damaged(path, change):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
-        (lambda t: t.pop("chunk"), "lacks the element chunk or vertex"),
+        (lambda t: t.pop("chunk"), "has no element chunk or vertex"),
         (lambda t: t.update(chunk=t["chunk"][:1]), "has 1 chunks, expected 2 for 300 Gaussians"),
         (lambda t: t.update(sh=t["sh"][:7]), "has 7 rows of sh for 300 Gaussians"),
         (lambda t: t["chunk"].__setitem__("max_y", np.nan), "ranges that are not finite"),
-        (lambda t: t.update(vertex=t["vertex"].astype([(n, "<f4") for n in t["vertex"].dtype.names])), "has the type"),
+        (
+            lambda t: t.update(vertex=t["vertex"].astype([(n, "<f4") for n in t["vertex"].dtype.names])),
+            "has the wrong type",
+        ),
     ],
 )
-def test_a_file_that_contradicts_itself_is_refused(path, change, words):
+def test_an_inconsistent_file_is_refused(path, change, message):
     damaged(path, change)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=message):
         read_compressed(path)
 
 
-def test_a_standard_file_is_no_compressed_one(path):
+def test_a_standard_ply_file_is_refused(path):
     write_ply(path, {"vertex": np.zeros(1, [("x", "<f4")])})
-    with pytest.raises(ValueError, match="is no compressed PLY file"):
+    with pytest.raises(ValueError, match="is not a compressed PLY file"):
         read_compressed(path)

@@ -1,4 +1,4 @@
-"""The page in a browser: what it shows is what the renderer shows."""
+"""The page in a browser: it shows what the renderer shows."""
 
 import cv2
 import numpy as np
@@ -8,27 +8,27 @@ import torch
 from tests.export import scenes
 from tests.export.browser import Browser, executable
 from tests.export.test_page import start
-from warpgs import visualize as pictures
+from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
 from warpgs.video.camera_paths import evenly_spaced
 
-pytestmark = pytest.mark.skipif(executable() is None, reason="no Chromium here")
+pytestmark = pytest.mark.skipif(executable() is None, reason="the test needs Chromium")
 
-SIZE = (320, 240)  # five times the picture that the page's intrinsics are for
+SIZE = (320, 240)  # five times the image size of the page's intrinsics
 SETTLED = "document.body?.dataset.state === 'settled'"
 ENDED = "['settled', 'failed'].includes(document.body?.dataset.state)"
 
 
 @pytest.fixture(scope="module")
-def moments():
-    return scenes.moments()
+def clouds():
+    return scenes.clouds()
 
 
 @pytest.fixture(scope="module")
-def baked(moments):
-    return bake(moments.at, evenly_spaced(5))
+def baked(clouds):
+    return bake(clouds.at, evenly_spaced(5))
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +48,12 @@ def shown(browser, page, options):
     browser.open(f"file://{page}#play=0&controls=0&{options}")
     browser.until(ENDED)
     assert browser.value("document.body.dataset.state") == "settled"
-    return browser.picture()
+    return browser.screenshot()
 
 
 def expected(cloud):
     camera = scenes.camera(*SIZE)
-    return pictures.to_bytes(scenes.image(cloud, camera))
+    return visualize.to_bytes(scenes.image(cloud, camera))
 
 
 def psnr(a, b):
@@ -66,34 +66,34 @@ def test_the_page_shows_the_image_of_the_renderer(browser, page, baked, time):
 
 
 @pytest.mark.parametrize("layer", ["static", "dynamic"])
-def test_the_page_shows_one_layer_alone(browser, page, baked, layer):
+def test_the_page_shows_a_single_layer(browser, page, baked, layer):
     cloud = baked.at(0.25)
     alone = cloud.select(cloud.is_dynamic == (layer == "dynamic"))
     assert psnr(shown(browser, page, f"time=0.25&layers={layer}"), expected(alone)) > 40
 
 
-def test_the_page_asks_for_nothing_and_complains_of_nothing(browser, page):
+def test_the_page_requests_nothing_and_reports_no_errors(browser, page):
     browser.events.clear()
     shown(browser, page, "time=0.5")
     browser.value("0")
     assert {address.split(":")[0] for address in browser.requests()} == {"file", "blob"}
-    assert browser.complaints() == []
+    assert browser.errors() == []
 
 
-def test_turning_the_view_changes_it_and_resetting_brings_it_back(browser, page):
+def test_moving_the_camera_changes_the_image_and_reset_restores_it(browser, page):
     first = shown(browser, page, "time=0.5")
-    for move in ("orbit.turn(0.4, 0.2)", "orbit.shift(0.1, 0)", "orbit.approach(0.7)"):
-        browser.value(f"delete document.body.dataset.state, {move}, touch()")
+    for move in ("orbit.rotate(0.4, 0.2)", "orbit.pan(0.1, 0)", "orbit.zoom(0.7)"):
+        browser.value(f"delete document.body.dataset.state, {move}, update()")
         browser.until(SETTLED)
-        assert psnr(browser.picture(), first) < 35
+        assert psnr(browser.screenshot(), first) < 35
         browser.value("delete document.body.dataset.state, home()")
         browser.until(SETTLED)
-        assert (browser.picture() == first).all()
+        assert (browser.screenshot() == first).all()
 
 
-def test_a_turned_view_is_that_of_the_renderer(browser, page, baked):
+def test_an_orbited_view_matches_the_renderer(browser, page, baked):
     shown(browser, page, "time=0.5")
-    browser.value("delete document.body.dataset.state, orbit.turn(0.7, -0.4), touch()")
+    browser.value("delete document.body.dataset.state, orbit.rotate(0.7, -0.4), update()")
     browser.until(SETTLED)
     seen = browser.value("orbit.camera")
     rotation, position = torch.tensor(seen["rotation"]), torch.tensor(seen["position"])
@@ -101,10 +101,10 @@ def test_a_turned_view_is_that_of_the_renderer(browser, page, baked):
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     assert (rotation @ rotation.T - torch.eye(3)).abs().max() < 1e-5
     camera = Camera(viewmat, scenes.camera(*SIZE).K, *SIZE)
-    assert psnr(browser.picture(), pictures.to_bytes(scenes.image(baked.at(0.5), camera))) > 40
+    assert psnr(browser.screenshot(), visualize.to_bytes(scenes.image(baked.at(0.5), camera))) > 40
 
 
-def test_playing_moves_time_on_and_the_slider_holds_it(browser, page):
+def test_playing_advances_time_and_the_slider_stops_it(browser, page):
     shown(browser, page, "time=0.1")
     browser.value("toggle()")
     browser.until("state.time > 0.11 && document.getElementById('time').value > 0.11")
@@ -113,21 +113,21 @@ def test_playing_moves_time_on_and_the_slider_holds_it(browser, page):
 
 
 @pytest.mark.parametrize(("static", "dynamic"), [(30, 0), (0, 12)])
-def test_a_scene_of_one_branch_and_of_one_time_is_shown(browser, tmp_path, static, dynamic):
-    baked = bake(scenes.moments(static, dynamic).at, [0.0])
+def test_a_scene_with_one_branch_and_one_key_time_is_shown(browser, tmp_path, static, dynamic):
+    baked = bake(scenes.clouds(static, dynamic).at, [0.0])
     write_page(tmp_path / "one.html", baked, start())
     assert psnr(shown(browser, tmp_path / "one.html", "time=0.5"), expected(baked.at(0.0))) > 40
 
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
-def test_colours_depend_on_the_view_as_the_renderers_do(browser, tmp_path, degree):
+def test_view_dependent_colours_match_the_renderer(browser, tmp_path, degree):
     cloud = scenes.cloud(60, degree)
     baked = bake(lambda time: cloud, [0.0])
     write_page(tmp_path / "sh.html", baked, start())
     assert psnr(shown(browser, tmp_path / "sh.html", ""), expected(baked.at(0.0))) > 40
 
 
-def test_a_page_that_is_damaged_says_so(browser, page, tmp_path):
+def test_a_damaged_page_shows_a_message(browser, page, tmp_path):
     text = page.read_text().replace('id="dynamic-colors">', 'id="dynamic-colors">AAAA')
     (tmp_path / "damaged.html").write_text(text)
     browser.open(f"file://{tmp_path / 'damaged.html'}#play=0")
@@ -135,7 +135,7 @@ def test_a_page_that_is_damaged_says_so(browser, page, tmp_path):
     assert "could not be shown" in browser.value("document.getElementById('message').textContent")
 
 
-def test_pictures_of_the_browser_are_of_the_size_asked_for(browser, page):
-    picture = shown(browser, page, "time=0")
-    assert picture.shape == (SIZE[1], SIZE[0], 3)
-    assert cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).max() > 50
+def test_screenshots_have_the_requested_size(browser, page):
+    image = shown(browser, page, "time=0")
+    assert image.shape == (SIZE[1], SIZE[0], 3)
+    assert cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).max() > 50

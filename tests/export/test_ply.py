@@ -1,4 +1,4 @@
-"""PLY files: what was written is read, and whatever else comes is refused in one line before memory is taken."""
+"""PLY files: written files are read back, and all others are refused in one line before memory is allocated."""
 
 import tracemalloc
 
@@ -17,14 +17,14 @@ def path(tmp_path):
     return tmp_path / "a.ply"
 
 
-def put(path, header, data=b""):
+def write(path, header, data=b""):
     path.write_bytes("\n".join(["ply", *header, "end_header", ""]).encode() + data)
 
 
 BINARY = "format binary_little_endian 1.0"
 
 
-def test_tables_come_back_as_they_were(path):
+def test_tables_are_read_back_exactly(path):
     size = ply.write_ply(path, {"vertex": TABLE, "other": TABLE[:1]})
     back = ply.read_ply(path)
     assert list(back) == ["vertex", "other"]
@@ -33,24 +33,28 @@ def test_tables_come_back_as_they_were(path):
     assert size == path.stat().st_size
 
 
-def test_a_table_of_no_rows_comes_back(path):
+def test_an_empty_table_is_read_back(path):
     ply.write_ply(path, {"vertex": TABLE[:0]})
     assert len(ply.read_ply(path)["vertex"]) == 0
 
 
-def test_comments_and_both_kinds_of_type_names_are_understood(path):
-    put(path, [BINARY, "comment by someone", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?")
+def test_comments_and_both_names_of_types_are_read(path):
+    write(path, [BINARY, "comment any text", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?")
     assert ply.read_ply(path)["vertex"]["x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize(
-    ("header", "data", "words"),
+    ("header", "data", "message"),
     [
-        ([], b"", "is not in the form binary_little_endian"),
-        (["format ascii 1.0", "element vertex 0", "property float x"], b"", "is not in the form binary_little_endian"),
-        (["format binary_big_endian 1.0"], b"", "is not in the form"),
-        ([BINARY, "element vertex 1", "property list uchar int x"], b"", "a header line that this program does not"),
-        ([BINARY, "element vertex 1", "property half x"], b"", "a header line that this program does not read"),
+        ([], b"", "is not in the format binary_little_endian"),
+        (
+            ["format ascii 1.0", "element vertex 0", "property float x"],
+            b"",
+            "is not in the format binary_little_endian",
+        ),
+        (["format binary_big_endian 1.0"], b"", "is not in the format"),
+        ([BINARY, "element vertex 1", "property list uchar int x"], b"", "a header line that is not supported"),
+        ([BINARY, "element vertex 1", "property half x"], b"", "a header line that is not supported"),
         ([BINARY, "element vertex -1", "property float x"], b"", "a header line"),
         ([BINARY, "element vertex 1e3", "property float x"], b"", "a header line"),
         ([BINARY, "element vertex ²", "property float x"], b"", "a header line"),
@@ -60,43 +64,43 @@ def test_comments_and_both_kinds_of_type_names_are_understood(path):
         ([BINARY, "element vertex 1", *(f"property float x{k}" for k in range(300))], b"", "has 300 properties"),
         ([BINARY, "element vertex 1", "property float x", "property float x"], b"", "two properties of the same name"),
         ([BINARY, "element a 1", "property float x", "element a 1"], b"", "two elements named a"),
-        ([BINARY, "element vertex 2", "property float x"], bytes(7), "is cut short: 2 rows of vertex take 8 bytes"),
-        ([BINARY, "element vertex 999999999999999", "property double x"], bytes(64), "is cut short"),
+        ([BINARY, "element vertex 2", "property float x"], bytes(7), "is truncated: 2 rows of vertex take 8 bytes"),
+        ([BINARY, "element vertex 999999999999999", "property double x"], bytes(64), "is truncated"),
         ([BINARY, "element vertex 1", "property float x"], bytes(5), "1 bytes follow its last element"),
     ],
 )
 @pytest.mark.parametrize("read", READERS)
-def test_what_is_no_such_file_is_refused_in_a_line(path, header, data, words, read):
-    put(path, header, data)
-    with pytest.raises(ValueError, match=words) as error:
+def test_an_invalid_file_is_refused_in_one_line(path, header, data, message, read):
+    write(path, header, data)
+    with pytest.raises(ValueError, match=message) as error:
         read(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("data", [b"", b"ply", b"PK\x03\x04", b"\x80\x04cposix\nsystem\n", b"plyx\n"])
-def test_other_files_are_refused(path, data):
+def test_files_of_other_types_are_refused(path, data):
     path.write_bytes(data)
-    with pytest.raises(ValueError, match=r"a\.ply is no PLY file"):
+    with pytest.raises(ValueError, match=r"a\.ply is not a PLY file"):
         ply.read_ply(path)
 
 
-def test_a_file_without_an_end_of_its_header_is_refused(path):
+def test_a_header_without_an_end_is_refused(path):
     path.write_bytes(b"ply\n" + b"comment x\n" * 20_000)
     with pytest.raises(ValueError, match="has no PLY header"):
         ply.read_ply(path)
 
 
-def test_a_file_that_is_not_there_is_refused(path):
-    with pytest.raises(ValueError, match="is no file"):
+def test_a_missing_file_is_refused(path):
+    with pytest.raises(ValueError, match="is missing"):
         ply.read_ply(path)
 
 
 @pytest.mark.parametrize("count", [10**9, 10**15 - 1])
-def test_a_huge_count_takes_no_memory(path, count):
-    put(path, [BINARY, f"element vertex {count}", "property double x"], bytes(64))
+def test_a_huge_count_allocates_no_memory(path, count):
+    write(path, [BINARY, f"element vertex {count}", "property double x"], bytes(64))
     tracemalloc.start()
-    with pytest.raises(ValueError, match="is cut short"):
+    with pytest.raises(ValueError, match="is truncated"):
         ply.read_ply(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -104,27 +108,27 @@ def test_a_huge_count_takes_no_memory(path, count):
 
 
 @pytest.mark.parametrize(
-    ("write", "read"),
+    ("write_cloud", "read"),
     [
         (standard.write_standard, standard.read_standard),
         (compressed.write_compressed, compressed.read_compressed),
     ],
 )
-def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(path, write, read):
-    write(path, scenes.cloud(30))
+def test_a_damaged_file_is_read_or_refused_in_one_line(path, write_cloud, read):
+    write_cloud(path, scenes.cloud(30))
     whole, random = path.read_bytes(), np.random.default_rng(0)
     for _ in range(400):
         data = bytearray(whole)
         match random.integers(4):
-            case 0:  # cut short
+            case 0:  # truncated
                 del data[random.integers(len(data)) :]
-            case 1:  # some bytes are others
-                for place in random.integers(0, len(data), 8):
-                    data[place] = random.integers(256)
-            case 2:  # the header is
-                for place in random.integers(0, min(len(data), 1200), 3):
-                    data[place] = random.integers(256)
-            case _:  # a digit is
+            case 1:  # changed bytes
+                for index in random.integers(0, len(data), 8):
+                    data[index] = random.integers(256)
+            case 2:  # changed bytes in the header
+                for index in random.integers(0, min(len(data), 1200), 3):
+                    data[index] = random.integers(256)
+            case _:  # a changed digit in the header
                 digits = [k for k, byte in enumerate(data[:1200]) if chr(byte).isdigit()]
                 data[digits[random.integers(len(digits))]] = ord("0") + random.integers(10)
         path.write_bytes(data)
@@ -133,13 +137,13 @@ def test_a_damaged_file_is_read_or_refused_in_a_line_but_never_anything_else(pat
         assert refusal is not None or read(path).finite.all()
 
 
-def test_a_file_that_can_not_be_written_is_named(tmp_path):
+def test_an_error_while_writing_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"a\.ply could not be written"):
         ply.write_ply(tmp_path / "file" / "a.ply", {"vertex": TABLE})
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+def test_a_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.ply"
     path.write_bytes(b"old")
 

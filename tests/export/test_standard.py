@@ -1,4 +1,4 @@
-"""The PLY file of 3DGS: its bytes are where other programs look for them, and it comes back without loss."""
+"""The PLY file of 3DGS: the layout that other programs expect, read back without loss."""
 
 import dataclasses
 import struct
@@ -18,7 +18,7 @@ def path(tmp_path):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("num", [0, 1, 37])
-def test_a_cloud_comes_back_as_it_was(path, degree, num):
+def test_a_cloud_is_read_back_exactly(path, degree, num):
     cloud = scenes.cloud(num, degree)
     write_standard(path, cloud)
     back = read_standard(path)
@@ -51,7 +51,7 @@ def test_a_row_has_248_bytes_in_the_order_of_3dgs(path):
     assert row[58:62] == pytest.approx(cloud.quats[0])
 
 
-def test_coefficients_are_all_of_red_then_green_then_blue(path):
+def test_coefficients_are_ordered_by_channel(path):
     cloud = scenes.cloud(1, degree=1)
     write_standard(path, cloud)
     row = struct.unpack("<62f", path.read_bytes()[-BYTES_PER_GAUSSIAN:])
@@ -76,7 +76,7 @@ def test_a_file_of_a_lower_degree_with_other_columns_is_read(path):
 
 
 @pytest.mark.parametrize("name", ["x", "opacity", "rot_3", "f_dc_2", "f_rest_7"])
-def test_a_property_that_is_missing_or_of_another_type_is_named(path, name):
+def test_a_missing_or_mistyped_property_is_named(path, name):
     write_standard(path, scenes.cloud(2))
     table = read_ply(path)["vertex"]
     others = [column for column in COLUMNS if column != name]
@@ -84,7 +84,7 @@ def test_a_property_that_is_missing_or_of_another_type_is_named(path, name):
     with pytest.raises(ValueError, match=f"no property {name}|44 properties f_rest"):
         read_standard(path)
     write_ply(path, {"vertex": table.astype([(c, "<u4" if c == name else "<f4") for c in COLUMNS])})
-    with pytest.raises(ValueError, match=f"{name} has the type uint32"):
+    with pytest.raises(ValueError, match=f"{name} has the wrong type uint32"):
         read_standard(path)
 
 
@@ -99,7 +99,7 @@ def test_values_that_are_not_finite_are_refused(path, name, value):
         read_standard(path)
 
 
-def test_a_rotation_of_no_length_is_refused(path):
+def test_a_zero_quaternion_is_refused(path):
     cloud = scenes.cloud(4)
     write_standard(path, dataclasses.replace(cloud, quats=np.zeros((4, 4), np.float32)))
     with pytest.raises(ValueError, match="4 Gaussians with values that are not finite"):

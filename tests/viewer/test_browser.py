@@ -1,4 +1,4 @@
-"""The viewer in a real browser: what a person does there changes what is shown."""
+"""The viewer in a real browser: the controls change the image."""
 
 import json
 import shutil
@@ -16,15 +16,16 @@ sync_api = pytest.importorskip(
 )
 
 from tests.viewer import watched  # noqa: E402
-from warpgs.runs import trained as playback  # noqa: E402
+from warpgs.runs.trained import TrainedScene  # noqa: E402
+from warpgs.runtime import graphs  # noqa: E402
 from warpgs.viewer import source as source_module  # noqa: E402
-from warpgs.viewer.command import training_cameras  # noqa: E402
-from warpgs.viewer.layers import picture  # noqa: E402
+from warpgs.viewer.layers import render_layer  # noqa: E402
 from warpgs.viewer.pose import camera_of, pose_of  # noqa: E402
+from warpgs.viewer.serve import training_cameras  # noqa: E402
 from warpgs.viewer.server import Viewer  # noqa: E402
 from warpgs.viewer.source import open_source  # noqa: E402
 
-# viser warns of what it can't tell a browser that has left; the command ignores that, too.
+# viser warns of messages to browsers that have disconnected; the command ignores these warnings, too.
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -62,16 +63,16 @@ def run(finished_run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def viewer(run):
-    source_module.LOOK_EVERY, before = 0.2, source_module.LOOK_EVERY
+    source_module.POLL_SECONDS, before = 0.2, source_module.POLL_SECONDS
     source = open_source(run, "cpu", True)
-    with Viewer(source, training_cameras(source), "127.0.0.1", 0) as viewer:
+    with Viewer(source, training_cameras(source, pytest.fail), "127.0.0.1", 0) as viewer:
         yield viewer
-    source_module.LOOK_EVERY = before
+    source_module.POLL_SECONDS = before
 
 
 @pytest.fixture(scope="module")
 def visit(browser, viewer):
-    """The page, the session that serves it, and the addresses that it asked for."""
+    """The page, its session, and the addresses that it requested."""
     page, asked = browser.new_page(viewport=SIZE), []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"http://127.0.0.1:{viewer.port}")
@@ -89,7 +90,7 @@ def page(visit):
 
 @pytest.fixture
 def session(visit):
-    """At rest, showing everything at the middle of time."""
+    """At rest, showing the joint layer at time 0.5."""
     session = visit[1]
     session.panel.layer.value = "joint"
     session.panel.residual.value = True
@@ -102,17 +103,17 @@ def session(visit):
 def until(condition, seconds=60.0):
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "it does not happen"
+        assert time.monotonic() < end, "timeout"
         time.sleep(0.05)
 
 
 def settle(session):
-    """Waits for the whole picture of what the controls say now."""
-    until(lambda: session._shown and session._shown[1] == 1 and session._shown[0] == session._wish())
+    """Waits for the image at full resolution that the controls ask for."""
+    until(lambda: session._shown and session._shown == (session._request(), 1))
 
 
 def seen(page, session):
-    """What the browser shows beside the panel, once nothing changes any more."""
+    """What the browser shows beside the panel, once it no longer changes."""
     settle(session)
     before = None
     for _ in range(40):
@@ -121,33 +122,36 @@ def seen(page, session):
             return now.astype(float)
         before = now
         time.sleep(0.2)
-    raise AssertionError("the picture does not come to rest")
+    raise AssertionError("the image keeps changing")
 
 
-def test_the_page_asks_nobody_but_the_viewer(visit, viewer):
+def test_the_page_requests_nothing_from_other_servers(visit, viewer):
     schemes = {url.split(":")[0] for url in visit[2] if not url.startswith(f"http://127.0.0.1:{viewer.port}/")}
     assert visit[2]
     assert schemes <= {"blob", "data"}
 
 
-def test_the_picture_is_the_scene_through_the_camera(page, session):
+def test_the_image_shows_the_scene_through_the_camera(page, session):
     image = seen(page, session)
-    wish = session._shown[0]
-    wished = picture(wish.player.splats(wish.moment), camera_of(wish.pose, wish.size, wish.moment), wish.layer)
-    wished = cv2.resize(wished, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
-    assert wished.std() > 10
-    assert np.abs(image - wished).mean() < 4.0
+    request = session._shown.request
+    camera = camera_of(request.pose, request.size, request.time)
+    expected = render_layer(request.layer, request.scene.splats(request.time), camera)
+    expected = cv2.resize(expected, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
+    assert expected.std() > 10
+    assert np.abs(image - expected).mean() < 4.0
 
 
-def test_where_frames_can_be_recorded_whole_joint_pictures_are_replayed(page, session, monkeypatch):
-    """As on a GPU, but for the recording: there is none on the CPU."""
+def test_with_cuda_graphs_joint_images_at_full_resolution_are_replayed(page, session, monkeypatch):
+    """As on a GPU, except that a graph is a function that is called again."""
     before = seen(page, session)
-    player = session._shown[0].player
-    monkeypatch.setattr(playback, "capture", lambda step: step)
-    monkeypatch.setattr(playback.Player, "records", True)
-    session.panel.time.value = 0.9
+    trained = session._shown.request.scene
+    monkeypatch.setattr(graphs, "record", lambda work, stream=None, pool=None: work)
+    monkeypatch.setattr(TrainedScene, "uses_graphs", True)
+    for k in range(graphs.WARM_UPS + 1):
+        session.panel.time.value = 0.9 - 0.05 * (graphs.WARM_UPS - k)
+        settle(session)
     moved = seen(page, session)
-    assert player.is_recorded(session._shown[0].size)
+    assert trained.is_captured(session._shown.request.size)
     assert np.abs(moved - before).max() > 10
     monkeypatch.undo()
     session.panel.time.value = 0.1
@@ -163,7 +167,7 @@ def test_a_screenshot_is_written(page, session, tmp_path_factory):
     assert cv2.imread(str(path)).shape == (SIZE["height"], SIZE["width"], 3)
 
 
-def test_the_slider_moves_time_and_the_picture(page, session):
+def test_the_time_slider_changes_the_image(page, session):
     before = seen(page, session)
     box = page.locator("input[type=text]:visible:not([readonly])").first
     box.fill("0.95")
@@ -172,7 +176,7 @@ def test_the_slider_moves_time_and_the_picture(page, session):
     assert np.abs(seen(page, session) - before).max() > 10
 
 
-def test_the_slider_moves_by_keys(page, session):
+def test_keys_move_the_time_slider(page, session):
     thumb = page.get_by_role("slider").first
     thumb.focus()
     before = session.panel.time.value
@@ -182,7 +186,7 @@ def test_the_slider_moves_by_keys(page, session):
 
 
 @pytest.mark.parametrize("layer", ["static", "dynamic", "depth", "alpha", "dynamic mask"])
-def test_layers_switch(page, session, layer):
+def test_the_menu_changes_the_layer(page, session, layer):
     before = seen(page, session)
     page.locator("input[role=combobox]:visible").first.click()
     page.get_by_role("option", name=layer, exact=True).click()
@@ -190,7 +194,7 @@ def test_layers_switch(page, session, layer):
     assert np.abs(seen(page, session) - before).mean() > 1.0
 
 
-def test_the_residual_switches_off(page, session):
+def test_the_appearance_network_can_be_switched_off(page, session):
     before = seen(page, session)
     page.get_by_role("checkbox").first.click()
     until(lambda: session.panel.residual.value is False)
@@ -208,32 +212,32 @@ def test_time_plays_and_pauses(page, session):
 
 
 def test_dragging_orbits(page, session):
-    before, picture_before = session._pose(), seen(page, session)
+    before, image_before = session._pose(), seen(page, session)
     page.mouse.move(200, 400)
     page.mouse.down()
     page.mouse.move(260, 420, steps=5)
     page.mouse.up()
     until(lambda: session._pose() != before)
-    assert np.abs(seen(page, session) - picture_before).mean() > 1.0
+    assert np.abs(seen(page, session) - image_before).mean() > 1.0
 
 
-def test_dragging_turns_around_what_is_ahead(page, session, viewer):
-    """Of the training view: the point stays in the middle of the picture, at its distance."""
-    ahead = viewer._training.ahead(int(session.panel.view.value) - 1)
-    distance = np.linalg.norm(ahead - np.array(session._pose().position))
+def test_dragging_orbits_the_target_of_the_training_camera(page, session, viewer):
+    """The target stays in the middle of the image, at its distance."""
+    target = viewer._training.target(int(session.panel.view.value) - 1)
+    distance = np.linalg.norm(target - np.array(session._pose().position))
     page.mouse.move(200, 400)
     page.mouse.down()
     page.mouse.move(260, 400, steps=5)
     page.mouse.up()
-    until(lambda: np.linalg.norm(np.array(session._pose().position) - ahead) == pytest.approx(distance, rel=1e-3))
-    row, column, _, inside = session._look().project(torch.tensor(ahead[None]).float())
-    middle = session._look()
+    until(lambda: np.linalg.norm(np.array(session._pose().position) - target) == pytest.approx(distance, rel=1e-3))
+    row, column, _, inside = session._camera().project(torch.tensor(target[None]).float())
+    middle = session._camera()
     assert bool(inside)
     assert abs(int(column) - middle.width / 2) < 3
     assert abs(int(row) - middle.height / 2) < 3
 
 
-def test_keys_fly(page, session):
+def test_keys_move_the_camera(page, session):
     page.mouse.click(200, 400)
     before = np.array(session._pose().position)
     page.keyboard.down("w")
@@ -242,7 +246,7 @@ def test_keys_fly(page, session):
     settle(session)
 
 
-def test_looking_through_a_training_camera_is_its_pose_and_its_time(page, session, viewer):
+def test_looking_through_a_training_camera_takes_its_pose_and_time(page, session, viewer):
     view = viewer._training.views[2]
     session.panel.view.value = 3
     until(lambda: session.panel.time.value == pytest.approx(view.time))
@@ -250,11 +254,11 @@ def test_looking_through_a_training_camera_is_its_pose_and_its_time(page, sessio
     assert session._pose().position == pytest.approx(view.pose.position, abs=1e-4)
     width, height = session._canvas()
     across = height * view.aspect * np.tan(view.pose.fov / 2) / np.tan(session._pose().fov / 2)
-    assert across == pytest.approx(min(width, height * view.aspect))  # the whole picture of the camera, and no more
+    assert across == pytest.approx(min(width, height * view.aspect))  # exactly the whole image of the camera
     assert np.abs(np.array(session._pose().wxyz) @ np.array(view.pose.wxyz)) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_training_cameras_are_drawn_and_taken_away(page, session):
+def test_training_cameras_are_shown_and_removed(page, session):
     camera = session._client.camera
     camera.position = camera.position - (camera.look_at - camera.position)
     before = seen(page, session)
@@ -278,10 +282,10 @@ def test_a_camera_path_is_saved(page, session, run):
     assert last["width"] == session.panel.width.value
     assert last["width"] / last["height"] == pytest.approx(SIZE["width"] / SIZE["height"], rel=0.01)
     assert last["time"] == pytest.approx(session.panel.time.value)
-    assert session._look().viewmat.tolist() == [pytest.approx(row, abs=1e-5) for row in last["viewmat"]]
+    assert session._camera().viewmat.tolist() == [pytest.approx(row, abs=1e-5) for row in last["viewmat"]]
 
 
-def test_keyframes_can_be_taken_back(page, session):
+def test_keyframes_can_be_removed(page, session):
     page.get_by_role("button", name="Add keyframe").click()
     until(lambda: session.path.cameras)
     while session.path.cameras:
@@ -293,15 +297,15 @@ def test_keyframes_can_be_taken_back(page, session):
     page.get_by_text("a path needs at least one keyframe").wait_for()
 
 
-def test_counts_and_speed_are_shown(page, session):
-    scene = session._shown[0].player.scene
+def test_the_status_shows_counts_and_fps(page, session):
+    scene = session._shown.request.scene.scene
     page.get_by_text(f"{len(scene.static)} static, {len(scene.dynamic)} dynamic Gaussians").wait_for()
     page.get_by_text("FPS").wait_for()
 
 
-def test_training_is_followed(page, session, run):
+def test_newer_checkpoints_are_shown(page, session, run):
     before = seen(page, session)
-    iteration = session._shown[0].player.metadata.iteration
+    iteration = session._shown.request.scene.metadata.iteration
     watched.advance(run, 7)
     page.get_by_text(f"iteration {iteration + 7}").wait_for(timeout=20_000)
     assert np.abs(seen(page, session) - before).max() > 0
@@ -326,5 +330,5 @@ def pose_time(viewer, session):
     return viewer._training.views[int(session.panel.view.value) - 1].time
 
 
-def test_poses_are_exact(session):
-    assert pose_of(session._look()).fov == pytest.approx(session._pose().fov)
+def test_the_pose_of_the_camera_is_exact(session):
+    assert pose_of(session._camera()).fov == pytest.approx(session._pose().fov)

@@ -1,4 +1,4 @@
-"""What the viewer shows of a scene."""
+"""The layers that the viewer shows."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,14 @@ import torch
 
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
-from warpgs.viewer.layers import LAYERS, picture
+from warpgs.viewer.layers import LAYERS, render_layer
 
 BLACK = [0, 0, 0]
 CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]]), 32, 24)
 
 
 def splats(depths=(2.0, 4.0), is_dynamic=(False, True)):
-    """A red static Gaussian left and a green dynamic one right, each opaque."""
+    """An opaque red static Gaussian on the left and an opaque green dynamic one on the right."""
     N = len(depths)
     means = torch.tensor([[(-0.2 + 0.4 * k) * z, 0.0, z] for k, z in enumerate(depths)]).view(-1, 3)
     quats = torch.tensor([[1.0, 0, 0, 0]]).expand(N, 4).contiguous()
@@ -23,60 +23,60 @@ def splats(depths=(2.0, 4.0), is_dynamic=(False, True)):
 
 
 def sides(layer, scene=None):
-    """The colours in the middle of both Gaussians."""
-    image = picture(scene or splats(), CAMERA, layer)
+    """The colours at the centres of both Gaussians."""
+    image = render_layer(layer, scene or splats(), CAMERA)
     assert image.shape == (24, 32, 3)
     assert image.dtype == np.uint8
     return image[12, 8].tolist(), image[12, 24].tolist()
 
 
-def test_the_joint_layer_has_both():
+def test_the_joint_layer_shows_all_gaussians():
     left, right = sides("joint")
     assert left[0] > 200
     assert right[1] > 200
 
 
-def test_the_static_layer_has_static_ones_alone():
+def test_the_static_layer_shows_only_static_gaussians():
     left, right = sides("static")
     assert left[0] > 200
     assert right == BLACK
 
 
-def test_the_dynamic_layer_has_dynamic_ones_alone():
+def test_the_dynamic_layer_shows_only_dynamic_gaussians():
     left, right = sides("dynamic")
     assert left == BLACK
     assert right[1] > 200
 
 
-def test_alpha_is_white_where_something_is():
-    image = picture(splats(), CAMERA, "alpha")
+def test_alpha_is_white_where_the_image_is_opaque():
+    image = render_layer("alpha", splats(), CAMERA)
     assert min(image[12, 8]) > 200
     assert image[0, 16].tolist() == BLACK
 
 
-def test_the_mask_is_white_where_something_moves():
+def test_the_dynamic_mask_is_white_on_dynamic_gaussians():
     left, right = sides("dynamic mask")
     assert left == BLACK
     assert min(right) > 200
 
 
-def test_what_static_ones_hide_is_not_in_the_mask():
+def test_the_dynamic_mask_omits_hidden_gaussians():
     scene = splats()
     front = scene.means.clone()
-    front[1] = 2.0 * front[0]  # the dynamic one is now behind the static one
+    front[1] = 2.0 * front[0]  # the dynamic Gaussian is now behind the static one
     hidden = Splats(front, scene.quats, scene.scales, scene.opacities, sh=scene.sh, is_dynamic=scene.is_dynamic)
     assert max(sides("dynamic mask", hidden)[0]) < 20
 
 
-def test_depth_is_red_near_and_blue_far_and_black_where_nothing_is():
+def test_depth_is_red_near_blue_far_and_black_where_empty():
     (near_red, _, near_blue), (far_red, _, far_blue) = sides("depth")
     assert near_red > near_blue
     assert far_blue > far_red
-    assert picture(splats(), CAMERA, "depth")[0, 16].tolist() == BLACK
+    assert render_layer("depth", splats(), CAMERA)[0, 16].tolist() == BLACK
 
 
-def test_a_scene_at_one_depth_has_a_depth_picture():
-    assert picture(splats((2.0,), (False,)), CAMERA, "depth")[12, 8].any()
+def test_a_scene_at_one_depth_has_a_depth_image():
+    assert render_layer("depth", splats((2.0,), (False,)), CAMERA)[12, 8].any()
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -89,10 +89,18 @@ def test_an_empty_scene_is_black(layer):
         sh=torch.zeros(0, 4, 3),
         is_dynamic=torch.zeros(0, dtype=torch.bool),
     )
-    assert not picture(empty, CAMERA, layer).any()
+    assert not render_layer(layer, empty, CAMERA).any()
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_one_pixel_is_a_picture(layer):
+def test_an_image_of_one_pixel_is_rendered(layer):
     camera = Camera(CAMERA.viewmat, torch.tensor([[1.0, 0, 0.5], [0, 1.0, 0.5], [0, 0, 1]]), 1, 1)
-    assert picture(splats(), camera, layer).shape == (1, 1, 3)
+    assert render_layer(layer, splats(), camera).shape == (1, 1, 3)
+
+
+def test_another_layer_takes_one_entry(monkeypatch):
+    def inverted(splats, camera, antialias):
+        return 255 - LAYERS["joint"](splats, camera, antialias)
+
+    monkeypatch.setitem(LAYERS, "inverted", inverted)
+    assert (render_layer("inverted", splats(), CAMERA) == 255 - render_layer("joint", splats(), CAMERA)).all()

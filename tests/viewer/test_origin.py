@@ -1,4 +1,4 @@
-"""Which pages may talk to the viewer."""
+"""Connections of foreign pages are refused."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from tests.viewer import watched
-from warpgs.viewer.origin import REFUSED, is_foreign
+from warpgs.viewer.origin import POLICY_VIOLATION, is_foreign
 from warpgs.viewer.server import Viewer
 from warpgs.viewer.source import open_source
 
@@ -30,7 +30,7 @@ from warpgs.viewer.source import open_source
         ("http://127.0.0.1:8080", None, "127.0.0.1", True),
     ],
 )
-def test_a_page_is_foreign_unless_it_came_from_where_it_connects_to(origin, host, listening, foreign):
+def test_a_page_is_foreign_unless_it_connects_to_its_own_server(origin, host, listening, foreign):
     assert is_foreign(origin, host, listening) is foreign
 
 
@@ -49,9 +49,9 @@ def connected(viewer, origin):
 def test_a_foreign_page_is_sent_nothing(viewer):
     with connected(viewer, "http://evil.example") as socket, pytest.raises(ConnectionClosed) as closed:
         socket.recv(timeout=30)
-    assert closed.value.rcvd.code == REFUSED
+    assert closed.value.rcvd.code == POLICY_VIOLATION
 
 
-def test_our_own_page_is_sent_the_scene(viewer):
+def test_the_page_of_the_viewer_is_sent_the_scene(viewer):
     with connected(viewer, f"http://127.0.0.1:{viewer.port}") as socket:
         assert socket.recv(timeout=30)

@@ -1,4 +1,4 @@
-"""The browser's cameras and ours are the same cameras."""
+"""Conversion between cameras and browser poses."""
 
 import math
 
@@ -11,14 +11,14 @@ from warpgs.viewer.pose import Pose, camera_of, pose_of
 SIZE = (64, 48)
 
 
-def looking(position, target, focal=50.0):
+def camera_at(position, target, focal=50.0):
     up = torch.tensor([0.1, -1.0, 0.2])
     return Camera.looking_at(torch.tensor(position), torch.tensor(target), up, focal, SIZE, 0.25)
 
 
 @pytest.mark.parametrize("position", [[0.0, 0.0, -2.0], [1.5, -0.3, 0.7], [-3.0, 2.0, 5.0]])
-def test_a_camera_comes_back_from_the_browser_as_it_was(position):
-    camera = looking(position, [0.1, 0.2, 0.3])
+def test_a_camera_survives_the_conversion_to_a_pose_and_back(position):
+    camera = camera_at(position, [0.1, 0.2, 0.3])
     back = camera_of(pose_of(camera), SIZE, camera.time)
     torch.testing.assert_close(back.viewmat, camera.viewmat, atol=1e-5, rtol=0)
     torch.testing.assert_close(back.K, camera.K, atol=1e-4, rtol=0)
@@ -47,6 +47,6 @@ def test_the_field_of_view_is_vertical():
         Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 3.2),
     ],
 )
-def test_a_pose_that_is_none_is_refused(pose):
-    with pytest.raises(ValueError, match="the browser's camera can't be used"):
+def test_an_invalid_pose_is_refused(pose):
+    with pytest.raises(ValueError, match="the browser sent an invalid camera"):
         camera_of(pose, SIZE, 0.0)

@@ -1,4 +1,4 @@
-"""The viewer's address, and what keeps it from starting: one line each."""
+"""The server of the viewer, its sessions, and one-line errors."""
 
 import importlib.util
 import shutil
@@ -12,8 +12,9 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[v
 
 from tests.viewer import watched
 from warpgs.cli import main
-from warpgs.viewer import command, server
-from warpgs.viewer.command import View, training_cameras
+from warpgs.viewer import serve, server
+from warpgs.viewer.command import View
+from warpgs.viewer.serve import training_cameras
 from warpgs.viewer.server import Viewer, check_address
 from warpgs.viewer.source import open_source
 from warpgs.viewer.training_cameras import MAX_FRUSTUMS
@@ -26,20 +27,20 @@ def run(finished_run, tmp_path_factory):
 
 @pytest.fixture
 def taken():
-    """A port that somebody listens on."""
+    """A port in use."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         yield listening.getsockname()[1]
 
 
-def refusal(capsys, *arguments):
-    """The one line that a command ends with."""
+def error_line(capsys, *arguments):
+    """The one line of an error of the command."""
     assert main(["view", *map(str, arguments)]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    return said
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
 
 
-def test_only_this_machine_can_connect_unless_told_otherwise(run):
+def test_only_this_machine_can_connect_by_default(run):
     with Viewer(open_source(run, "cpu", False), None, View(run).host, 0) as viewer:
         listening = viewer._server._websock_server
         assert listening._host == "127.0.0.1"
@@ -47,21 +48,21 @@ def test_only_this_machine_can_connect_unless_told_otherwise(run):
             assert page.status == 200
 
 
-def test_no_browser_can_ask_for_a_public_address(run):
+def test_a_browser_cannot_request_a_public_address(run):
     with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
         assert viewer._server.request_share_url() is None
 
 
-class Watched:
-    """A session that only says whether it was stopped; the browser leaves while it is being made, if it does."""
+class FakeSession:
+    """A session that only records whether it was stopped; it calls ``on_create`` when it is created."""
 
-    leaves = None
+    on_create = None
 
     def __init__(self, client, *_):
         self.stopped = False
-        made.append(self)
-        if Watched.leaves is not None:
-            Watched.leaves(client)
+        sessions.append(self)
+        if FakeSession.on_create is not None:
+            FakeSession.on_create(client)
 
     def stop(self):
         self.stopped = True
@@ -70,35 +71,35 @@ class Watched:
         pass
 
 
-made: list[Watched] = []
+sessions: list[FakeSession] = []
 
 
 @pytest.fixture
 def viewer(run, monkeypatch, contracts_off):
-    made.clear()
-    monkeypatch.setattr(server, "Session", Watched)
-    monkeypatch.setattr(server, "aim", lambda *_: None)
+    sessions.clear()
+    monkeypatch.setattr(server, "Session", FakeSession)
+    monkeypatch.setattr(server, "set_camera", lambda *_: None)
     with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
         yield viewer
 
 
-def test_a_browser_that_leaves_while_its_session_is_made_leaves_no_session(viewer, monkeypatch):
-    monkeypatch.setattr(Watched, "leaves", viewer._end)  # viser forgets a client before it says that it left
-    viewer._begin(SimpleNamespace(client_id=7, camera=None))
+def test_a_browser_that_disconnects_while_its_session_is_created_has_no_session(viewer, monkeypatch):
+    monkeypatch.setattr(FakeSession, "on_create", viewer._remove_session)  # viser drops a client before it reports it
+    viewer._add_session(SimpleNamespace(client_id=7, camera=None))
     assert viewer.sessions == {}
-    assert [session.stopped for session in made] == [True]
+    assert [session.stopped for session in sessions] == [True]
 
 
-def test_a_session_that_is_made_while_the_viewer_stops_is_stopped_too(viewer, monkeypatch):
+def test_a_session_created_while_the_viewer_stops_is_stopped(viewer, monkeypatch):
     client = SimpleNamespace(client_id=7, camera=None)
     monkeypatch.setattr(viewer._server, "get_clients", lambda: {7: client})
-    viewer._begin(client)
+    viewer._add_session(client)
     assert list(viewer.sessions) == [7]
-    assert [session.stopped for session in made] == [False]
-    viewer._take_all()
-    viewer._begin(client)
+    assert [session.stopped for session in sessions] == [False]
+    viewer._remove_all()
+    viewer._add_session(client)
     assert viewer.sessions == {}
-    assert made[1].stopped
+    assert sessions[1].stopped
 
 
 def test_a_port_is_free_again_after_the_viewer(run):
@@ -107,89 +108,92 @@ def test_a_port_is_free_again_after_the_viewer(run):
     check_address("127.0.0.1", port)
 
 
-def test_a_port_in_use_is_one_line(run, taken, capsys):
-    assert f"can't listen on 127.0.0.1, port {taken}: Address already in use" in refusal(capsys, run, "--port", taken)
+def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):
+    assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use" in error_line(
+        capsys, run, "--port", taken
+    )
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", ""])
-def test_a_host_that_is_not_ours_is_one_line(run, capsys, host):
+def test_a_host_of_another_machine_is_refused_in_one_line(run, capsys, host):
     if host:
-        assert f"can't listen on {host}, port 8080" in refusal(capsys, run, "--host", host)
+        assert f"cannot listen on {host}, port 8080" in error_line(capsys, run, "--host", host)
     else:
         with pytest.raises(OSError, match="port 70000"):
             check_address(host, 70000)
 
 
 @pytest.mark.parametrize("port", [-1, 65536, 99999])
-def test_a_port_that_there_is_not_is_one_line(run, capsys, port):
-    assert f"can't listen on port {port}: choose a --port from 0 to 65535" in refusal(capsys, run, "--port", port)
+def test_an_invalid_port_is_refused_in_one_line(run, capsys, port):
+    assert f"cannot listen on port {port}: choose a --port from 0 to 65535" in error_line(capsys, run, "--port", port)
 
 
-def test_a_missing_package_is_one_line_that_says_how_to_get_it(run, capsys, monkeypatch):
+def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert "pip install -e '.[viewer]'" in refusal(capsys, run)
+    assert "pip install 'warpgs[viewer]'" in error_line(capsys, run)
 
 
-def test_what_is_no_run_is_one_line(tmp_path, capsys):
-    assert f"{tmp_path} is no run folder" in refusal(capsys, tmp_path, "--port", 0)
+def test_a_folder_that_is_not_a_run_is_refused_in_one_line(tmp_path, capsys):
+    assert f"{tmp_path} is not a run folder" in error_line(capsys, tmp_path, "--port", 0)
 
 
-def test_a_run_of_another_version_is_one_line(run, tmp_path, capsys):
+def test_a_run_of_another_version_is_refused_in_one_line(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "run")
     text = (copy / "config.json").read_text()
     (copy / "config.json").write_text(text.replace('"seed"', '"sead"'))
-    assert "config.json has fields of another version: sead" in refusal(capsys, copy, "--port", 0)
+    assert "config.json has fields of another version: sead" in error_line(capsys, copy, "--port", 0)
 
 
-def test_a_damaged_checkpoint_is_one_line(run, tmp_path, capsys):
+def test_a_damaged_checkpoint_is_refused_in_one_line(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "run")
     next((copy / "checkpoints").iterdir()).write_bytes(b"nonsense")
     for path in (copy / "checkpoints").iterdir():
         path.write_bytes(b"nonsense")
-    assert "is damaged" in refusal(capsys, copy, "--port", 0)
+    assert "is damaged" in error_line(capsys, copy, "--port", 0)
 
 
-def test_a_run_whose_capture_is_gone_is_shown_without_its_cameras(run, tmp_path, capsys):
+def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_path):
     copy = shutil.copytree(run, tmp_path / "run")
     text = (copy / "config.json").read_text()
     (copy / "config.json").write_text(text.replace("/capture", "/gone"))
     source = open_source(copy, "cpu", False)
-    assert training_cameras(source) is None
-    assert "without training cameras: " in capsys.readouterr().err
+    warnings = []
+    assert training_cameras(source, warnings.append) is None
+    assert warnings[0].startswith("without training cameras: ")
     with Viewer(source, None, "127.0.0.1", 0) as viewer:
         assert viewer.port > 0
 
 
-def test_the_command_says_where_to_look(run, capsys, monkeypatch):
-    monkeypatch.setattr(command, "_wait", lambda: None)
-    monkeypatch.setattr(command.os, "nice", lambda _: pytest.fail("a finished run has no trainer to give way to"))
+def test_the_command_prints_the_address(run, capsys, monkeypatch):
+    monkeypatch.setattr(serve, "_wait", lambda: None)
+    monkeypatch.setattr(serve.os, "nice", lambda _: pytest.fail("lowered the priority without training"))
     assert main(["view", str(run), "--port", "0", "--device", "cpu"]) == 0
     assert f"{run}: http://127.0.0.1:" in capsys.readouterr().out
 
 
-def test_a_viewer_beside_a_trainer_lets_it_go_first(run, monkeypatch):
+def test_a_viewer_of_a_run_in_training_has_a_low_priority(run, monkeypatch):
     given = []
-    monkeypatch.setattr(command, "_wait", lambda: None)
-    monkeypatch.setattr(command.os, "nice", given.append)
+    monkeypatch.setattr(serve, "_wait", lambda: None)
+    monkeypatch.setattr(serve.os, "nice", given.append)
     View(run, port=0, while_training=True, device="cpu").run()
-    assert given == [command.NICENESS]
+    assert given == [serve.NICENESS]
 
 
-def test_training_cameras_are_in_order_of_time_and_not_too_many(run):
-    training = training_cameras(open_source(run, "cpu", False))
+def test_training_cameras_are_in_the_order_of_their_times_and_limited_in_number(run):
+    training = training_cameras(open_source(run, "cpu", False), pytest.fail)
     times = [view.time for view in training.views]
     assert times == sorted(times)
     training.views = training.views * 40
-    chosen = training.spread()
+    chosen = training.frustums()
     assert len(chosen) <= MAX_FRUSTUMS
     assert (chosen[0], chosen[-1]) == (0, len(training.views) - 1)
 
 
-def test_a_picture_that_cannot_be_read_is_left_out(run, monkeypatch):
-    training = training_cameras(open_source(run, "cpu", False))
+def test_an_image_that_cannot_be_read_has_no_thumbnail(run, monkeypatch):
+    training = training_cameras(open_source(run, "cpu", False), pytest.fail)
 
     def read(_):
         raise ValueError("damaged")
 
     monkeypatch.setattr(training._capture, "frame", read)
-    assert training.picture(0) is None
+    assert training.thumbnail(0) is None

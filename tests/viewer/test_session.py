@@ -1,4 +1,4 @@
-"""What a browser says is not taken on trust, and its events may come in any order."""
+"""Values from a browser are checked, and its events may arrive in any order."""
 
 import math
 from types import SimpleNamespace
@@ -11,6 +11,7 @@ import threading
 
 from tests.video.test_camera_paths import capture
 from warpgs.viewer import path_editor
+from warpgs.viewer.layers import LAYERS
 from warpgs.viewer.panel import Panel
 from warpgs.viewer.path_editor import PathEditor
 from warpgs.viewer.pose import Pose, camera_of
@@ -22,7 +23,7 @@ TRAINING = TrainingCameras(capture([0.0, 0.1, 0.2, 0.3, 0.4], [0.0, 0.25, 0.5, 0
 
 
 def panel(**values):
-    """A panel whose controls have values as a browser sent them."""
+    """A panel whose controls have the values that a browser sent."""
     made = Panel.__new__(Panel)
     for name, value in values.items():
         setattr(made, name, SimpleNamespace(value=value))
@@ -30,37 +31,37 @@ def panel(**values):
 
 
 def session(canvas=(900, 700), **controls):
-    """A session that renders nothing, with a canvas and a panel as the browser claims them."""
+    """A session that renders nothing, with the canvas and the controls that a browser sent."""
     made = Session.__new__(Session)
     camera = SimpleNamespace(image_width=canvas[0], image_height=canvas[1])
     made._client = SimpleNamespace(camera=camera, scene=Scene())
-    made._changing = threading.Lock()
+    made._lock = threading.Lock()
     made._pose = lambda: Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0)
     made.panel = panel(**controls)
     return made
 
 
 @pytest.fixture(autouse=True)
-def _without_pictures(monkeypatch):
-    monkeypatch.setattr(TRAINING, "picture", lambda _: None)
+def _without_thumbnails(monkeypatch):
+    monkeypatch.setattr(TRAINING, "thumbnail", lambda _: None)
 
 
 class Scene:
-    """What is drawn into it."""
+    """Records the names of its objects."""
 
     def __init__(self):
-        self.drawn = []
+        self.names = []
 
     def add_camera_frustum(self, name, *_, **__):
-        self.drawn.append(name)
+        self.names.append(name)
         return SimpleNamespace(on_click=lambda _: None)
 
     def remove_by_name(self, name):
-        self.drawn = [other for other in self.drawn if not other.startswith(name)]
+        self.names = [other for other in self.names if not other.startswith(name)]
 
 
 @pytest.mark.parametrize(
-    ("claimed", "canvas"),
+    ("sent", "canvas"),
     [
         ((900, 700), (900, 700)),
         ((0, 0), (1, 1)),
@@ -71,21 +72,21 @@ class Scene:
         ((10**9, 1), (4096, 1)),
     ],
 )
-def test_no_canvas_is_larger_than_a_screen(claimed, canvas):
-    assert session(claimed)._canvas() == canvas
+def test_the_canvas_size_is_limited(sent, canvas):
+    assert session(sent)._canvas() == canvas
     assert canvas[0] <= MAX_CANVAS[0]
     assert canvas[1] <= MAX_CANVAS[1]
 
 
 @pytest.mark.parametrize("size", [(1, 10**6), (10**6, 1), (900, 700)])
-def test_a_keyframe_has_a_size_that_can_be_rendered(size):
-    camera = session(size, width=10**9, time=0.5)._look()
+def test_the_size_of_a_keyframe_is_limited(size):
+    camera = session(size, width=10**9, time=0.5)._camera()
     assert 1 <= camera.width <= 1920
     assert 1 <= camera.height <= MAX_ASPECT * 1920
 
 
 @pytest.mark.parametrize(
-    ("sent", "moment", "pace", "across"),
+    ("sent", "time", "speed", "width"),
     [
         (0.5, 0.5, 0.5, 160),
         (-1.0, 0.0, 0.1, 160),
@@ -94,53 +95,58 @@ def test_a_keyframe_has_a_size_that_can_be_rendered(size):
         (math.nan, 0.0, 0.1, 160),
     ],
 )
-def test_sliders_are_within_their_ends_whatever_is_sent(sent, moment, pace, across):
-    told = panel(time=sent, speed=sent, width=sent)
-    assert (told.moment, told.pace, told.across) == (moment, pace, across)
+def test_values_of_sliders_are_clamped_to_their_ranges(sent, time, speed, width):
+    made = panel(time=sent, speed=sent, width=sent)
+    assert (made.current_time, made.current_speed, made.current_width) == (time, speed, width)
 
 
-def test_training_cameras_are_drawn_while_the_panel_says_so():
+@pytest.mark.parametrize("sent", ["no layer", None, [], 3])
+def test_an_unknown_layer_is_replaced_by_the_first(sent):
+    assert panel(layer=sent).current_layer == next(iter(LAYERS))
+
+
+def test_training_cameras_are_shown_while_the_checkbox_is_set():
     here = session(show_cameras=True)
     here._show_cameras(TRAINING)
-    assert here._client.scene.drawn == [f"/training/{k}" for k in TRAINING.spread()]
+    assert here._client.scene.names == [f"/training/{k}" for k in TRAINING.frustums()]
     here.panel.show_cameras.value = False
     here._show_cameras(TRAINING)
-    assert here._client.scene.drawn == []
+    assert here._client.scene.names == []
 
 
-def test_cameras_that_are_switched_off_while_they_are_drawn_are_not_left(monkeypatch):
+def test_cameras_that_are_switched_off_while_they_are_added_are_removed(monkeypatch):
     here = session(show_cameras=True)
-    asked = []
+    read = []
 
-    def slow_picture(number):
-        asked.append(number)
-        here.panel.show_cameras.value = len(asked) < 3
+    def slow_thumbnail(index):
+        read.append(index)
+        here.panel.show_cameras.value = len(read) < 3
 
-    monkeypatch.setattr(TRAINING, "picture", slow_picture)
+    monkeypatch.setattr(TRAINING, "thumbnail", slow_thumbnail)
     here._show_cameras(TRAINING)
-    assert len(asked) == 3
-    assert here._client.scene.drawn == []
+    assert len(read) == 3
+    assert here._client.scene.names == []
 
 
-def test_an_event_of_before_draws_nothing():
-    """The last thing that was clicked counts, whichever thread comes first."""
+def test_an_outdated_event_shows_nothing():
+    """The last click counts, in whichever order the threads run."""
     here = session(show_cameras=False)
     here._show_cameras(TRAINING)
-    assert here._client.scene.drawn == []
+    assert here._client.scene.names == []
 
 
-def test_events_wait_for_each_other():
+def test_events_are_handled_one_at_a_time():
     here = session(show_cameras=True)
-    with here._changing:
+    with here._lock:
         other = threading.Thread(target=here._show_cameras, args=(TRAINING,))
         other.start()
         other.join(0.2)
-        assert here._client.scene.drawn == []
+        assert here._client.scene.names == []
     other.join()
-    assert here._client.scene.drawn
+    assert here._client.scene.names
 
 
-def test_a_path_has_a_largest_number_of_keyframes(tmp_path, monkeypatch):
+def test_the_number_of_keyframes_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(path_editor, "MAX_KEYFRAMES", 2)
     button = SimpleNamespace(on_click=lambda _: None)
     controls = SimpleNamespace(

@@ -1,4 +1,4 @@
-"""Where the viewer's scene comes from."""
+"""The scene that the viewer shows."""
 
 import shutil
 
@@ -6,6 +6,7 @@ import pytest
 
 from tests.viewer import watched
 from warpgs.runs import checkpoint
+from warpgs.runs.run import Run
 from warpgs.viewer import source as source_module
 from warpgs.viewer.source import open_source
 
@@ -21,62 +22,60 @@ def run(made, tmp_path):
 
 
 @pytest.fixture
-def at_once(monkeypatch):
-    """Every look at the source is a look at the folder."""
-    monkeypatch.setattr(source_module, "LOOK_EVERY", 0.0)
+def without_interval(monkeypatch):
+    """Every call of ``current`` checks the folder."""
+    monkeypatch.setattr(source_module, "POLL_SECONDS", 0.0)
 
 
-def test_a_run_is_shown_as_its_newest_checkpoint_has_it(run):
-    player = open_source(run, "cpu", False).current()
-    assert player.metadata.iteration == 32
+def test_the_newest_checkpoint_is_shown(run):
+    trained = open_source(run, "cpu", False).current()
+    assert trained.metadata.iteration == 32
     newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1]).tensors
-    assert watched.same(player.scene.static.means, newest["scene.static.means"])
+    assert watched.same(trained.scene.static.means, newest["scene.static.means"])
 
 
-def test_a_finished_run_is_not_looked_at_again(run, at_once):
+def test_without_follow_newer_checkpoints_are_ignored(run, without_interval):
     source = open_source(run, "cpu", False)
     before = source.current()
     watched.advance(run)
     assert source.current() is before
 
 
-def test_a_newer_checkpoint_is_followed(run, at_once):
+def test_a_newer_checkpoint_is_followed(run, without_interval):
     source = open_source(run, "cpu", True)
     assert source.current().metadata.iteration == 32
     watched.advance(run)
     assert source.current().metadata.iteration == 33
 
 
-def test_a_checkpoint_that_did_not_change_is_not_read_again(run, at_once):
+def test_an_unchanged_checkpoint_is_not_read_again(run, without_interval):
     source = open_source(run, "cpu", True)
     assert source.current() is source.current()
 
 
-def test_a_checkpoint_written_again_is_read_again(run, at_once):
+def test_a_rewritten_checkpoint_is_read_again(run, without_interval):
     source = open_source(run, "cpu", True)
     before = source.current()
     path = checkpoint.list_checkpoints(run)[-1]
     loaded = checkpoint.load(path)
-    checkpoint.save(path, loaded.tensors, dict(loaded.facts))
+    checkpoint.save(path, loaded.tensors, loaded.metadata)
     assert source.current() is not before
 
 
-def test_a_followed_run_is_not_read_before_somebody_looks(run, monkeypatch):
-    def read(*_):
-        raise AssertionError("read")
-
-    monkeypatch.setattr(source_module.runs, "newest_scene", read)
+def test_a_followed_run_is_not_read_before_the_first_call(run, monkeypatch):
+    monkeypatch.setattr(Run, "trained_scene", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(Run, "newest_checkpoint", lambda _: pytest.fail("read"))
     open_source(run, "cpu", True)
 
 
-def test_the_folder_is_not_looked_at_all_the_time(run, monkeypatch):
+def test_the_folder_is_not_checked_at_every_call(run, monkeypatch):
     source = open_source(run, "cpu", True)
     source.current()
-    monkeypatch.setattr(source_module.checkpoint, "saved", lambda _: pytest.fail("looked"))
+    monkeypatch.setattr(Run, "newest_checkpoint", lambda _: pytest.fail("checked"))
     source.current()
 
 
-def test_a_followed_run_may_be_without_a_checkpoint_yet(run, at_once):
+def test_a_followed_run_may_have_no_checkpoint_yet(run, without_interval):
     shutil.move(run / "checkpoints", run / "away")
     source = open_source(run, "cpu", True)
     assert source.current() is None
@@ -86,7 +85,7 @@ def test_a_followed_run_may_be_without_a_checkpoint_yet(run, at_once):
     assert source.note == ""
 
 
-def test_a_damaged_newest_checkpoint_leaves_the_scene_before_it(run, at_once):
+def test_a_damaged_checkpoint_keeps_the_scene_before_it(run, without_interval):
     source = open_source(run, "cpu", True)
     before = source.current()
     watched.advance(run).write_bytes(b"nonsense")
@@ -94,11 +93,11 @@ def test_a_damaged_newest_checkpoint_leaves_the_scene_before_it(run, at_once):
     assert "0000033.safetensors is damaged" in source.note
 
 
-def test_a_checkpoint_that_is_deleted_meanwhile_is_no_error(run, at_once, monkeypatch):
+def test_a_checkpoint_deleted_while_it_is_read_is_ignored(run, without_interval, monkeypatch):
     source = open_source(run, "cpu", True)
     before = source.current()
-    gone = [run / "checkpoints" / "0000099.safetensors"]
-    monkeypatch.setattr(source_module.checkpoint, "saved", lambda _: gone)
+    deleted = run / "checkpoints" / "0000099.safetensors"
+    monkeypatch.setattr(Run, "newest_checkpoint", lambda _: deleted)
     assert source.current() is before
     assert source.note == ""
 
@@ -110,20 +109,20 @@ def test_a_run_without_a_checkpoint_is_refused(run):
 
 
 @pytest.mark.parametrize("follow", [False, True])
-def test_what_is_no_run_is_refused(tmp_path, follow):
-    with pytest.raises(ValueError, match="is no run folder"):
+def test_a_folder_that_is_not_a_run_is_refused(tmp_path, follow):
+    with pytest.raises(ValueError, match="is not a run folder"):
         open_source(tmp_path, "cpu", follow)
 
 
 def test_a_damaged_run_is_refused(run):
     (run / "config.json").write_text("{")
-    with pytest.raises(ValueError, match=r"config\.json is damaged"):
+    with pytest.raises(ValueError, match=r"config\.json is not valid JSON"):
         open_source(run, "cpu", True)
 
 
-def test_the_residual_can_be_left_out(run):
-    player = open_source(run, "cpu", False).current()
-    plain, relit = (player.splats(0.5, residual) for residual in (False, True))
-    num = len(player.scene.static)
-    assert watched.same(plain.sh[:num], player.scene.static.sh)
-    assert not watched.same(relit.sh[:num], player.scene.static.sh)
+def test_without_residual_static_gaussians_keep_their_colours(run):
+    trained = open_source(run, "cpu", False).current()
+    plain, changed = (trained.splats(0.5, residual) for residual in (False, True))
+    num = len(trained.scene.static)
+    assert watched.same(plain.sh[:num], trained.scene.static.sh)
+    assert not watched.same(changed.sh[:num], trained.scene.static.sh)

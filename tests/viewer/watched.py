@@ -1,5 +1,6 @@
-"""A run to look at."""
+"""A small run to show in the viewer."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -11,14 +12,14 @@ from warpgs.runs import checkpoint
 
 
 def copy(finished: Path, folder: Path) -> Path:
-    """A copy of a finished tiny run that has more to see."""
+    """A copy of a finished tiny run, changed so that its images are easy to tell apart."""
     run = shutil.copytree(finished, folder / "run")
     _brighten(run)
     return run
 
 
 def _brighten(run: Path) -> None:
-    """So short a training leaves a dark scene that hardly changes."""
+    """Makes the scene bright and dynamic; after so short a training it is neither."""
     newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1])
     tensors = dict(newest.tensors)
     for branch in ("static", "dynamic"):
@@ -28,16 +29,16 @@ def _brighten(run: Path) -> None:
     for network in ("deformation", "appearance"):
         trunk = getattr(SplitScene.empty(1, 1, tiny.MODEL), network).trunk
         trunk.layers(tensors[f"scene.{network}.trunk.values"])[-1].weight.fill_(0.3)
-    checkpoint.save(newest.path, tensors, dict(newest.facts))
+    checkpoint.save(newest.path, tensors, newest.metadata)
 
 
 def advance(run: Path, by: int = 1) -> Path:
-    """Writes a checkpoint as if training had gone on; its scene is another one."""
+    """Writes a later checkpoint with another scene, as if training had continued."""
     newest = checkpoint.load(checkpoint.list_checkpoints(run)[-1])
-    iteration = newest.metadata.iteration + by
+    metadata = dataclasses.replace(newest.metadata, iteration=newest.metadata.iteration + by)
     tensors = {n: t + 0.01 if n.startswith("scene.static.means") else t for n, t in newest.tensors.items()}
-    path = checkpoint.path_of(run, iteration)
-    checkpoint.save(path, tensors, {**newest.facts, "iteration": iteration})
+    path = checkpoint.path_of(run, metadata.iteration)
+    checkpoint.save(path, tensors, metadata)
     return path
 
 

@@ -1,4 +1,4 @@
-"""Gaussians of one moment as plain arrays: what the files of other programs hold."""
+"""The Gaussians of a scene at one time as plain arrays, in the form in which files store them."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -9,25 +9,26 @@ from jaxtyping import Bool, Float32, Integer
 from torch import Tensor
 
 from warpgs.model.splats import Splats
+from warpgs.ops.sh import num_bases
 
 MIN_SCALE = 1e-20
-"""Keeps logarithms of scales finite; such a Gaussian is far thinner than any pixel."""
+"""Lower bound of a scale, so that its logarithm is finite; a Gaussian this thin covers far less than a pixel."""
 
 OPACITY_MARGIN = 1e-6
-"""Keeps logits finite: an opacity is at least this far from 0 and 1."""
+"""Minimum distance of an opacity from 0 and 1, so that its logit is finite."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """N Gaussians of one moment.
+    """N Gaussians at one time.
 
     Attributes:
         means: [N, 3] centres [scene units].
-        quats: [N, 4] rotations (w, x, y, z) of length 1.
+        quats: [N, 4] unit quaternions (w, x, y, z).
         log_scales: [N, 3] logarithms of the standard deviations.
         logit_opacities: [N] logits of the opacities.
         sh: [N, 1 | 4 | 9 | 16, 3] spherical harmonics coefficients.
-        is_dynamic: [N] branch; files do not keep it.
+        is_dynamic: [N] whether a Gaussian is dynamic; files do not store it.
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -39,26 +40,25 @@ class Cloud:
 
     @staticmethod
     def of_splats(splats: Splats) -> "Cloud":
-        """The cloud of splats that are coloured by spherical harmonics, of the degree that they use.
+        """The cloud of splats that are coloured by spherical harmonics, up to the degree in use.
 
-        Splats with a value that is not finite are kept as they are: ``finite`` tells them.
+        Gaussians with values that are not finite are kept; ``finite`` marks the others.
         """
         assert splats.sh is not None
-        degree = splats.sh_degree
-        bases = splats.sh.shape[1] if degree is None else (degree + 1) ** 2
+        bases = splats.sh.shape[1] if splats.sh_degree is None else num_bases(splats.sh_degree)
         dynamic = splats.is_dynamic
         opacities = splats.opacities.double().clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
         return Cloud(
-            means=_plain(splats.means),
-            quats=_plain(torch.nn.functional.normalize(splats.quats, dim=1)),
-            log_scales=_plain(splats.scales.clamp_min(MIN_SCALE).log()),
-            logit_opacities=_plain(torch.logit(opacities)),
-            sh=_plain(splats.sh[:, :bases]),
+            means=_to_numpy(splats.means),
+            quats=_to_numpy(torch.nn.functional.normalize(splats.quats, dim=1)),
+            log_scales=_to_numpy(splats.scales.clamp_min(MIN_SCALE).log()),
+            logit_opacities=_to_numpy(torch.logit(opacities)),
+            sh=_to_numpy(splats.sh[:, :bases]),
             is_dynamic=np.zeros(len(splats.means), bool) if dynamic is None else dynamic.cpu().numpy(),
         )
 
     def splats(self, device: torch.device | str = "cpu") -> Splats:
-        """The cloud as the renderer wants it."""
+        """The cloud as input of the renderer."""
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(device)
@@ -77,14 +77,25 @@ class Cloud:
 
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
-        """Which Gaussians have no value that is infinite or NaN; the renderer draws no other."""
+        """Whether all values of a Gaussian are finite; the renderer skips the others."""
         parts = (self.means, self.quats, self.log_scales, self.logit_opacities[:, None])
         return np.logical_and.reduce([*(np.isfinite(part).all(1) for part in parts), np.isfinite(self.sh).all((1, 2))])
 
     def select(self, rows: Integer[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> "Cloud":
-        """The Gaussians of some rows, in their order."""
+        """The Gaussians of some rows, in the order of the rows."""
         return Cloud(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
 
 
-def _plain(tensor: Tensor) -> np.ndarray:
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """1 / (1 + exp(-x)), in the precision of ``logits``."""
+    return 1.0 / (1.0 + np.exp(-logits))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """log(p / (1 - p)) of opacities, which are first clipped to ``OPACITY_MARGIN`` from 0 and 1."""
+    opacities = np.clip(opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    return np.log(opacities / (1 - opacities))
+
+
+def _to_numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().cpu().contiguous().numpy()

@@ -34,18 +34,23 @@ class Clouds:
         return cloud if self.rows is None else cloud.select(self.rows)
 
     def most_visible(self, count: int, cameras: Sequence[Camera], quiet: bool = True) -> "Clouds":
-        """The same scene with at most ``count`` Gaussians: those with the largest blend weights in some camera.
+        """The same scene with at most ``count`` Gaussians: those with the largest blend weight in any of the cameras.
+
+        Args:
+            count: Maximum number of Gaussians, at least 1.
+            cameras: Cameras to measure blend weights with, each at its own time.
+            quiet: Whether to hide the progress bar.
 
         Raises:
             ValueError: If ``count`` is not positive.
         """
         if count < 1:
-            raise ValueError(f"--max-gaussians must be at least 1, got {count}")
+            raise ValueError(f"expected at least 1 Gaussian to keep, got {count}")
         settings = RenderSettings(statistics=True, antialias=self.scene.config.antialias)
         weight = np.zeros(len(self.at(0.0)))
         if len(weight) <= count:
             return self
-        for camera in progress(cameras, "weighing Gaussians", quiet):
+        for camera in progress(cameras, "ranking Gaussians", quiet):
             weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
             assert weights is not None
             weight = np.maximum(weight, weights.numpy())

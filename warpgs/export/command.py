@@ -9,32 +9,33 @@ import tyro
 
 @dataclass(frozen=True)
 class Export:
-    """Writes a run's newest checkpoint for other programs: PLY of 3DGS, compressed PLY, or a page that plays it."""
+    """Exports the newest checkpoint of a run for other programs, as PLY files or as a web page that plays it."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
     """Run folder."""
-    format: Literal["ply", "compressed", "html"] = "ply"
-    """PLY as 3DGS has it; the compressed PLY of SuperSplat and PlayCanvas; one HTML file that plays offline."""
+    format: str = "ply"
+    """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. html: one web page that
+    plays the scene offline."""
     out: Path | None = None
-    """Folder to write into; RUN/export if left out."""
+    """Output folder; RUN/export by default."""
     time: float | None = None
-    """Moment in [0, 1] of a PLY file; 0 if left out."""
+    """Time of a PLY file, in [0, 1]; 0 by default."""
     frames: int | None = None
-    """Write a PLY file for each of so many moments, evenly spread over [0, 1]."""
+    """Write this many PLY files, one per time, at times evenly spaced over [0, 1]."""
     layers: Literal["all", "static", "dynamic", "apart"] = "all"
-    """Which Gaussians go into PLY files; apart makes a file of the static and one of the dynamic ones."""
+    """Gaussians in PLY files: all, static or dynamic ones, or both apart in two files."""
     keys: int | None = None
-    """Key times of a page, which mixes between them; 30 if left out."""
+    """Number of key times of a page, which interpolates between them; 30 by default."""
     seconds: float | None = None
-    """How long a page takes to play the scene; 5 if left out."""
+    """Duration of the scene in a page; 5 by default."""
     max_gaussians: int | None = None
-    """Keep no more than these, the ones that the filming camera sees most of."""
+    """Export at most this many Gaussians: those that the training cameras see most of."""
     max_megabytes: float | None = None
-    """Refuse a page whose Gaussians take more than this, before compression [MB]; 256 if left out."""
+    """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
     data: Path | None = None
-    """Where the capture is now, if it was moved; a page begins at its cameras."""
+    """Current folder of the capture, if it was moved; a page starts at one of its cameras."""
     quiet: bool = False
-    """Show no progress."""
+    """Hide progress bars."""
 
     def run(self) -> None:
         """Exports and prints a summary; raises as ``export_run``."""

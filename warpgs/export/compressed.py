@@ -1,9 +1,9 @@
-"""Compressed PLY, as SuperSplat and PlayCanvas write and read it: 16 bytes a Gaussian, and one a coefficient.
+"""Compressed PLY as SuperSplat and PlayCanvas write and read it: 16 bytes per Gaussian and one byte per coefficient.
 
-Gaussians come in chunks of 256 neighbours. A chunk keeps the range of its positions, of the logarithms of its scales
-and of its colours; a Gaussian keeps where it lies in them: positions and scales in 11, 10 and 11 bits, colours and
-opacity in 8 each, rotations as their three smaller components in 10 bits each. Coefficients of the higher degrees
-have 8 bits over [-4, 4], all of red first.
+Gaussians are grouped into chunks of 256 neighbours. A chunk stores the range of its positions, of its log-scales and
+of its colours; a Gaussian stores its values relative to these ranges: positions and scales in 11, 10 and 11 bits,
+colours and opacity in 8 bits each. Rotations store their three smaller components in 10 bits each. Coefficients of
+degree 1 and higher have 8 bits over [-4, 4], all of red first.
 """
 
 from pathlib import Path
@@ -12,17 +12,19 @@ import numpy as np
 
 from warpgs.model.gaussians import SH_C0
 
-from .cloud import OPACITY_MARGIN, Cloud
-from .packing import pack, pack_rotations, quantise, restore, unpack, unpack_rotations
+from .cloud import Cloud, logit, sigmoid
+from .packing import dequantise, pack, pack_rotations, quantise, unpack, unpack_rotations
 from .ply import column, read_ply, write_ply
 from .standard import num_rest
 
 CHUNK = 256
-VECTOR = (11, 10, 11)
-COLOR = (8, 8, 8, 8)
+VECTOR_BITS = (11, 10, 11)
+COLOR_BITS = (8, 8, 8, 8)
 REST = (-4.0, 4.0)
+"""Range of the coefficients of degree 1 and higher."""
+
 SCALE_RANGE = 20.0
-"""Logarithms of scales are kept within this of 0, as other writers do."""
+"""Maximum magnitude of a log-scale, as in other programs."""
 
 RANGES = [
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
@@ -33,12 +35,12 @@ WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 def write_compressed(path: Path, cloud: Cloud) -> int:
-    """Writes the Gaussians of a cloud, neighbours together; returns the size of the file [bytes].
+    """Writes the Gaussians of a cloud in Morton order; returns the size of the file [bytes].
 
     Raises:
-        OSError: If it can't be written; the message names the file.
+        OSError: If it cannot be written; the message names the file.
     """
-    cloud = cloud.select(_along_curve(cloud.means))
+    cloud = cloud.select(_morton_order(cloud.means))
     N = len(cloud)
     first = np.arange(0, N, CHUNK)
     log_scales = np.clip(cloud.log_scales, -SCALE_RANGE, SCALE_RANGE)
@@ -46,68 +48,69 @@ def write_compressed(path: Path, cloud: Cloud) -> int:
     bounds = [(_per_chunk(np.minimum, part, first), _per_chunk(np.maximum, part, first)) for part in parts]
     chunk = np.concatenate([end for pair in bounds for end in pair], 1).astype("<f4")
     position, scale = (
-        pack(_bits(part, chunk, first, k, VECTOR), VECTOR) for k, part in enumerate((cloud.means, log_scales))
+        pack(_quantise_in_chunk(part, chunk, k, VECTOR_BITS), VECTOR_BITS)
+        for k, part in enumerate((cloud.means, log_scales))
     )
-    opacity = quantise(_sigmoid(cloud.logit_opacities), (0.0, 1.0), 8)
-    color = pack(np.concatenate([_bits(parts[2], chunk, first, 2, COLOR[:3]), opacity[:, None]], 1), COLOR)
+    opacity = quantise(sigmoid(cloud.logit_opacities.astype(np.float64)), (0.0, 1.0), 8)
+    rgb = _quantise_in_chunk(parts[2], chunk, 2, COLOR_BITS[:3])
+    color = pack(np.concatenate([rgb, opacity[:, None]], 1), COLOR_BITS)
     words = np.stack([position, pack_rotations(cloud.quats), scale, color], 1).astype("<u4")
     tables = {"chunk": _table(chunk, RANGES), "vertex": _table(words, WORDS)}
     if rest := cloud.sh.shape[1] - 1:
         values = cloud.sh[:, 1:].transpose(0, 2, 1).reshape(N, 3 * rest)
-        numbers = quantise(values, REST, 8).astype(np.uint8)
-        tables["sh"] = _table(numbers, [f"f_rest_{k}" for k in range(3 * rest)])
+        integers = quantise(values, REST, 8).astype(np.uint8)
+        tables["sh"] = _table(integers, [f"f_rest_{k}" for k in range(3 * rest)])
     return write_ply(path, tables)
 
 
 def read_compressed(path: Path) -> Cloud:
-    """The Gaussians of such a file.
+    """Reads the Gaussians of a compressed PLY file.
 
     Raises:
-        ValueError: If it is no such file, damaged, or has a value that is not finite; the message names it.
+        ValueError: If it is another file, damaged, or has values that are not finite; the message names it.
     """
     tables = read_ply(path)
     if not {"chunk", "vertex"} <= tables.keys():
-        raise ValueError(f"{path} is no compressed PLY file: it lacks the element chunk or vertex")
+        raise ValueError(f"{path} is not a compressed PLY file: it has no element chunk or vertex")
     vertex = tables["vertex"]
     N = len(vertex)
     chunk = _ranges(path, tables["chunk"], N)
     if not np.isfinite(chunk).all():
         raise ValueError(f"{path} has ranges that are not finite")
     words = np.stack([column(path, vertex, name, "u").astype(np.uint32) for name in WORDS], 1)
-    color = unpack(words[:, 3], COLOR)
+    color = unpack(words[:, 3], COLOR_BITS)
     rows = np.repeat(chunk, CHUNK, 0)[:N].reshape(N, 3, 2, 3)
-    rgb = restore(color[:, :3], (rows[:, 2, 0], rows[:, 2, 1]), 8)
-    opacities = np.clip(color[:, 3] / 255.0, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    rgb = dequantise(color[:, :3], (rows[:, 2, 0], rows[:, 2, 1]), 8)
     constant = ((rgb - 0.5) / SH_C0)[:, None]
     return Cloud(
-        means=_values(words[:, 0], rows[:, 0]),
+        means=_dequantise_vectors(words[:, 0], rows[:, 0]),
         quats=unpack_rotations(words[:, 1]),
-        log_scales=_values(words[:, 2], rows[:, 1]),
-        logit_opacities=np.log(opacities / (1 - opacities)).astype(np.float32),
-        sh=np.concatenate([constant, _rest(path, tables.get("sh"), N)], 1).astype(np.float32),
+        log_scales=_dequantise_vectors(words[:, 2], rows[:, 1]),
+        logit_opacities=logit(color[:, 3] / 255.0).astype(np.float32),
+        sh=np.concatenate([constant, _read_rest(path, tables.get("sh"), N)], 1).astype(np.float32),
         is_dynamic=np.zeros(N, bool),
     )
 
 
-def _per_chunk(pick: np.ufunc, values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    return pick.reduceat(values, first, axis=0) if len(values) else values
+def _per_chunk(reduction: np.ufunc, values: np.ndarray, first: np.ndarray) -> np.ndarray:
+    return reduction.reduceat(values, first, axis=0) if len(values) else values
 
 
-def _bits(values: np.ndarray, chunk: np.ndarray, first: np.ndarray, part: int, widths: tuple[int, ...]) -> np.ndarray:
-    """Where values lie in the range of their chunk, in so many bits an axis."""
-    ranges = chunk.reshape(len(first), 3, 2, 3)[np.arange(len(values)) // CHUNK, part]
+def _quantise_in_chunk(values: np.ndarray, chunk: np.ndarray, part: int, widths: tuple[int, ...]) -> np.ndarray:
+    """Quantises each axis of [N, 3] values over its range in the chunk, with ``widths`` bits."""
+    ranges = chunk.reshape(len(chunk), 3, 2, 3)[np.arange(len(values)) // CHUNK, part]
     axes = [quantise(values[:, a], (ranges[:, 0, a], ranges[:, 1, a]), width) for a, width in enumerate(widths)]
     return np.stack(axes, 1)
 
 
-def _values(words: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    fields = unpack(words, VECTOR)
-    axes = [restore(fields[:, a], (ranges[:, 0, a], ranges[:, 1, a]), width) for a, width in enumerate(VECTOR)]
+def _dequantise_vectors(words: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    fields = unpack(words, VECTOR_BITS)
+    axes = [dequantise(fields[:, a], (ranges[:, 0, a], ranges[:, 1, a]), width) for a, width in enumerate(VECTOR_BITS)]
     return np.stack(axes, 1).astype(np.float32)
 
 
 def _ranges(path: Path, table: np.ndarray, num_vertices: int) -> np.ndarray:
-    """[chunks, 18] ranges; older files have none of colours, which are then [0, 1]."""
+    """[chunks, 18] ranges; older files have no ranges of colours, which are then [0, 1]."""
     expected = -(-num_vertices // CHUNK)
     if len(table) != expected:
         raise ValueError(f"{path} has {len(table):,} chunks, expected {expected:,} for {num_vertices:,} Gaussians")
@@ -119,21 +122,20 @@ def _ranges(path: Path, table: np.ndarray, num_vertices: int) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _rest(path: Path, table: np.ndarray | None, num_vertices: int) -> np.ndarray:
-    if table is None:
-        return np.zeros((num_vertices, 0, 3), np.float32)
-    if len(table) != num_vertices:
+def _read_rest(path: Path, table: np.ndarray | None, num_vertices: int) -> np.ndarray:
+    """[N, R, 3] coefficients of degree 1 and higher."""
+    if table is not None and len(table) != num_vertices:
         raise ValueError(f"{path} has {len(table):,} rows of sh for {num_vertices:,} Gaussians")
-    rest = num_rest(path, table)
-    if rest == 0:
+    rest = 0 if table is None else num_rest(path, table)
+    if table is None or rest == 0:
         return np.zeros((num_vertices, 0, 3), np.float32)
-    numbers = np.stack([column(path, table, f"f_rest_{k}", "u") for k in range(3 * rest)], 1).astype(np.uint32)
-    values = restore(numbers, REST, 8)
+    integers = np.stack([column(path, table, f"f_rest_{k}", "u") for k in range(3 * rest)], 1).astype(np.uint32)
+    values = dequantise(integers, REST, 8)
     return values.reshape(-1, 3, rest).transpose(0, 2, 1)
 
 
-def _along_curve(means: np.ndarray) -> np.ndarray:
-    """Rows in Morton order, so that chunks are small."""
+def _morton_order(means: np.ndarray) -> np.ndarray:
+    """Row indices along a Morton curve, so that the Gaussians of a chunk are close together."""
     if not len(means):
         return np.zeros(0, np.int64)
     cells = quantise(means, (means.min(0), means.max(0)), 10).astype(np.uint64)
@@ -142,10 +144,6 @@ def _along_curve(means: np.ndarray) -> np.ndarray:
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")
-
-
-def _sigmoid(logits: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
 
 
 def _table(values: np.ndarray, names: list[str]) -> np.ndarray:

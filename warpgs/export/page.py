@@ -1,8 +1,8 @@
-"""One HTML file that plays a moving scene without a network: the numbers of ``baking``, compressed, and a player.
+"""One HTML file that plays a dynamic scene without a network: the integers of ``baking``, compressed, and a player.
 
-The player is in ``player/``: a page, its looks, two shaders, and two scripts, one of which sorts in a worker. The
-numbers are in the page as elements ``<script type="application/gzip;base64">`` beside a JSON object that tells their
-shapes; browsers do not run scripts of such a type.
+The player is in ``player/``: the page, its style sheet, two shaders, and two scripts, one of which sorts in a worker.
+The data are in the page as elements ``<script type="application/gzip;base64">`` next to a JSON object with their
+shapes; browsers do not run scripts of this type.
 """
 
 import base64
@@ -11,84 +11,65 @@ import html
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from warpgs.files import write_bytes
 from warpgs.progress import progress
+from warpgs.video.camera_paths import evenly_spaced
 
-from .baking import Baked, Bounds, Branch
+from .baking import Baked, Bounds, Branch, bake, baked_bytes
+from .job import Job, Writer
 from .packing import to_planes
+from .start_camera import StartView, start_view
 
 VERSION = 1
+KEYS, SECONDS, MAX_MEGABYTES = 30, 5.0, 256.0
+"""Defaults of the options."""
+
 MAX_KEYS = 256
-"""Layers of a texture that every browser with WebGL2 has."""
+"""Maximum number of key times: texture layers that every browser with WebGL2 supports."""
 
 MAX_GAUSSIANS = 1 << 22
-"""Texels of 2048 rows of 2048: what every browser with WebGL2 has, a branch."""
+"""Maximum number of Gaussians per branch: texels of a 2048 × 2048 texture, which every browser with WebGL2 supports."""
 
 ARRAYS = ("geometry", "colors", "rest")
-PLACE = re.compile(r"\[\[([a-z.]+)\]\]")
-"""Where the player's page takes another of its files, the title or the scene."""
+PLACEHOLDER = re.compile(r"\[\[([a-z.]+)\]\]")
+"""Marks where the player's page includes another of its files, the title or the scene."""
 
 
-@dataclass(frozen=True)
-class Start:
-    """How a page begins.
-
-    Attributes:
-        title: Of the page.
-        size: (width, height) that ``intrinsics`` are for [px].
-        intrinsics: fx, fy, cx, cy [px].
-        viewmat: [4, 4] world to camera, where the viewer begins.
-        pivot: Distance in front of the camera around which a viewer turns [scene units].
-        track: One [4, 4] world to camera a key time, the filming camera's; may be empty.
-        seconds: How long the scene plays.
-        antialias: Whether opacities make up for the low-pass filter.
-    """
-
-    title: str
-    size: tuple[int, int]
-    intrinsics: tuple[float, float, float, float]
-    viewmat: list[list[float]]
-    pivot: float
-    track: list[list[list[float]]]
-    seconds: float
-    antialias: bool
-
-
-def write_page(path: Path, baked: Baked, start: Start, quiet: bool = True) -> int:
+def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -> int:
     """Writes the page; returns its size [bytes].
 
     Raises:
-        ValueError: If the scene has more key times or Gaussians than browsers can hold.
-        OSError: If it can't be written; the message names the file.
+        ValueError: If the scene has more key times or Gaussians than browsers support.
+        OSError: If it cannot be written; the message names the file.
     """
     branches = {"static": baked.static, "dynamic": baked.dynamic}
     check_size({name: len(branch) for name, branch in branches.items()}, baked.keys)
-    facts = {
+    metadata = {
         "format": "warpgs page",
         "version": VERSION,
         "keys": baked.keys,
         "start": {field.name: getattr(start, field.name) for field in fields(start)},
-        "branches": {name: _facts(branch) for name, branch in branches.items()},
+        "branches": {name: _metadata(branch) for name, branch in branches.items()},
     }
-    blocks = [_block("application/json", "scene", json.dumps(facts, allow_nan=False).replace("<", "\\u003c"))]
+    blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
     parts = [(name, array) for name in branches for array in ARRAYS]
     for name, array in progress(parts, "compressing", quiet):
         packed = gzip.compress(to_planes(getattr(branches[name], array)).tobytes(), 6, mtime=0)
         blocks.append(_block("application/gzip;base64", f"{name}-{array}", base64.b64encode(packed).decode()))
-    return write_bytes(path, [_page(start.title, "\n".join(blocks)).encode()])
+    return write_bytes(path, [_player(start.title, "\n".join(blocks)).encode()])
 
 
 def check_size(counts: Mapping[str, int], keys: int) -> None:
-    """Refuses what no browser can hold.
+    """Refuses a scene that is too large for browsers.
 
     Args:
         counts: Number of Gaussians of each branch.
-        keys: Key times.
+        keys: Number of key times.
 
     Raises:
         ValueError: If there are too many.
@@ -100,22 +81,52 @@ def check_size(counts: Mapping[str, int], keys: int) -> None:
             raise ValueError(f"a page holds at most {MAX_GAUSSIANS:,} {name} Gaussians, got {count:,}")
 
 
-def _page(title: str, blocks: str) -> str:
+def _player(title: str, blocks: str) -> str:
     """The player with a scene in it."""
     folder = resources.files(__package__) / "player"
     given = {"title": html.escape(title), "scene": blocks}
 
-    def part(place: re.Match[str]) -> str:
-        name = place[1]
+    def content(placeholder: re.Match[str]) -> str:
+        name = placeholder[1]
         return given[name] if name in given else (folder / name).read_text("utf-8")
 
-    return PLACE.sub(part, (folder / "page.html").read_text("utf-8"))
+    return PLACEHOLDER.sub(content, (folder / "page.html").read_text("utf-8"))
 
 
-def _block(kind: str, name: str, content: str) -> str:
-    return f'<script type="{kind}" id="{name}">{content}</script>'
+def _block(mime_type: str, name: str, content: str) -> str:
+    return f'<script type="{mime_type}" id="{name}">{content}</script>'
 
 
-def _facts(branch: Branch) -> dict[str, Any]:
+def _metadata(branch: Branch) -> dict[str, Any]:
     shapes = {array: getattr(branch, array).shape for array in ARRAYS}
     return {"shapes": shapes, **{f.name: getattr(branch.bounds, f.name).tolist() for f in fields(Bounds)}}
+
+
+def _check_memory(job: Job, keys: int) -> None:
+    """Refuses a page that would take more memory than allowed, before anything is baked."""
+    cloud = job.clouds.at(0.0)
+    num_static, num_dynamic = int((~cloud.is_dynamic).sum()), int(cloud.is_dynamic.sum())
+    check_size({"static": num_static, "dynamic": num_dynamic}, keys)
+    size = baked_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1)
+    maximum = job.options.max_megabytes or MAX_MEGABYTES
+    if size > maximum * 1e6:
+        fitting = int(len(cloud) * maximum * 1e6 / size)
+        raise ValueError(
+            f"the page would hold {size / 1e6:.0f} MB for {len(cloud):,} Gaussians at {keys} key times, more "
+            f"than {maximum:g} MB: use about --max-gaussians {fitting}, fewer --keys, or --max-megabytes"
+        )
+
+
+def _write(job: Job) -> str:
+    options, path = job.options, job.folder / "scene.html"
+    keys = options.keys or KEYS
+    _check_memory(job, keys)
+    start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
+    baked = bake(job.clouds.at, progress(evenly_spaced(keys), "baking", options.quiet))
+    size = write_page(path, baked, start, options.quiet)
+    count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
+    return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.capture_note}"
+
+
+PAGE = Writer(_write, ("keys", "seconds", "max_megabytes"))
+"""The format "html"."""

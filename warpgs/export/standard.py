@@ -1,19 +1,24 @@
-"""The PLY file of 3DGS, as its own viewer, SuperSplat and the plug-ins of game engines read it.
+"""The PLY file of 3DGS, as its viewer, SuperSplat and the plug-ins of game engines read it.
 
-One row a Gaussian, all floats: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (all of red, then green, then blue),
+One row of floats per Gaussian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (all of red, then green, then blue),
 opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Degree 3 is always written, because several readers
-want rows of exactly that length; bands that the scene does not have are zero.
+expect rows of exactly that length; coefficients that the scene does not have are zero.
 """
 
 from pathlib import Path
 
 import numpy as np
 
+from warpgs.model.gaussians import MAX_SH_DEGREE
+from warpgs.ops.sh import num_bases
+
 from .cloud import Cloud
 from .ply import column, read_ply, write_ply
 
-MAX_REST = 15
-"""Coefficients a channel beside the constant one, of degrees 1 to 3."""
+REST_COUNTS = tuple(num_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1))
+"""Number of coefficients per channel of degree 1 and higher, by degree."""
+
+MAX_REST = REST_COUNTS[-1]
 
 COLUMNS = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -24,10 +29,10 @@ BYTES_PER_GAUSSIAN = 4 * len(COLUMNS)
 
 
 def write_standard(path: Path, cloud: Cloud) -> int:
-    """Writes the Gaussians of a cloud; returns the size of the file [bytes].
+    """Writes the Gaussians of a cloud as 3DGS does; returns the size of the file [bytes].
 
     Raises:
-        OSError: If it can't be written; the message names the file.
+        OSError: If it cannot be written; the message names the file.
     """
     N, rest = len(cloud), cloud.sh.shape[1] - 1
     padded = np.zeros((N, MAX_REST, 3), np.float32)
@@ -46,10 +51,10 @@ def write_standard(path: Path, cloud: Cloud) -> int:
 
 
 def read_standard(path: Path) -> Cloud:
-    """The Gaussians of such a file, of whatever degree it has.
+    """Reads the Gaussians of a PLY file of 3DGS, of any degree.
 
     Raises:
-        ValueError: If it is no such file, damaged, or has a value that is not finite; the message names it.
+        ValueError: If it is another file, damaged, or has values that are not finite; the message names it.
     """
     tables = read_ply(path)
     if "vertex" not in tables:
@@ -69,21 +74,22 @@ def read_standard(path: Path) -> Cloud:
 
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions of length 1; a zero one, which is no rotation, becomes NaN."""
+    """Normalised quaternions; a zero quaternion, which is not a rotation, becomes NaN."""
     with np.errstate(invalid="ignore", over="ignore"):
         return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
 def num_rest(path: Path, table: np.ndarray) -> int:
-    """Coefficients a channel beside the constant one: 0, 3, 8 or 15.
+    """Number of coefficients per channel of degree 1 and higher: 0, 3, 8 or 15.
 
     Raises:
-        ValueError: If the file has any other number.
+        ValueError: If the file has any other number; the message names it.
     """
     names = table.dtype.names or ()
     count = sum(name.startswith("f_rest_") for name in names)
-    if count not in (0, 9, 24, 45):
-        raise ValueError(f"{path} has {count} properties f_rest_*, expected 0, 9, 24 or 45")
+    if count not in [3 * rest for rest in REST_COUNTS]:
+        expected = ", ".join(str(3 * rest) for rest in REST_COUNTS)
+        raise ValueError(f"{path} has {count} properties f_rest_*, expected one of {expected}")
     return count // 3
 
 
@@ -97,5 +103,5 @@ def _coefficients(path: Path, vertex: np.ndarray) -> np.ndarray:
 
 
 def _block(path: Path, vertex: np.ndarray, names: list[str]) -> np.ndarray:
-    with np.errstate(over="ignore"):  # doubles that are too large become infinite, and are refused
+    with np.errstate(over="ignore"):  # doubles that are too large become infinite, and are refused by the caller
         return np.stack([column(path, vertex, name).astype(np.float32) for name in names], 1)

@@ -1,1 +1,1 @@
-"""One HTML file about one or several runs: curves, figures of every view, pictures, timing."""
+"""One HTML file about one or several runs: metrics, curves, images, timing."""

@@ -9,24 +9,24 @@ import tyro
 
 @dataclass(frozen=True)
 class Report:
-    """Writes one HTML file about runs that were evaluated: curves, every view's figures, worst and best views, timing.
+    """Writes one HTML file about evaluated runs: metrics, curves, worst and best views, timing.
 
-    The file holds everything that it shows, and loads nothing from anywhere.
+    The file contains everything that it shows and loads nothing.
     """
 
     run_folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="run"), tyro.conf.Positional]
-    """Run folders, side by side."""
+    """Run folders, shown side by side."""
     out: Path | None = None
-    """File to write; report.html if left out, in the run folder if there is only one."""
+    """Output file; report.html by default, in the run folder if there is only one."""
     views: int = 3
-    """Worst and best views to show, so many of each."""
+    """Number of worst views and of best views to show."""
     device: Literal["cuda", "cpu"] | None = None
-    """Where to render; CUDA if there is a GPU."""
+    """Device to render on; CUDA by default if there is a GPU."""
     quiet: bool = False
-    """Show no progress."""
+    """Hide progress bars."""
 
     def run(self) -> None:
-        """Writes the report and prints its path; raises as ``write_report``."""
+        """Writes the report and prints a summary; raises as ``write_report``."""
         from .write_report import write_report
 
         print(write_report(self))

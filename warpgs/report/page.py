@@ -1,4 +1,4 @@
-"""The page: every text that comes from outside goes through ``text``."""
+"""The HTML page; ``text`` escapes every string that comes from a run folder."""
 
 import html
 import math
@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 from warpgs.visualize import ERROR_RANGE
 
 from .charts import Series, chart, color_of
-from .figures import HIGHER, LOWER, NAMES, config_rows, summary_rows
-from .record import Record
-from .strips import Strips
+from .evaluated_run import EvaluatedRun
+from .image_strips import Strips
+from .metrics_table import HIGHER, LOWER, TITLES, config_rows, summary_rows
 
 CURVES = ("psnr/train", "loss/total")
-"""Tags that come first."""
+"""Tags of the first charts."""
 
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #888; }
@@ -33,16 +33,17 @@ svg polyline { fill: none; stroke-width: 1.6; }
 """
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-"""What a browser may load for the page: nothing from anywhere."""
+"""Content security policy: the page loads nothing."""
 
 
 class Gallery(NamedTuple):
-    """Pictures of runs that share a capture, side by side.
+    """Images of runs on the same views, side by side.
 
     Attributes:
-        runs: Numbers of the runs.
-        worst, best: Views, by their mean PSNR over the runs.
-        strips: Of each run.
+        runs: Indices of the runs.
+        worst: Names of the views with the lowest mean PSNR over the runs.
+        best: Names of the views with the highest.
+        strips: Image strips of each run.
     """
 
     runs: Sequence[int]
@@ -52,47 +53,47 @@ class Gallery(NamedTuple):
 
 
 def text(value: object) -> str:
-    """A text that means nothing to HTML."""
+    """A value as text, escaped for HTML."""
     return html.escape(str(value), quote=True)
 
 
-def page(records: Sequence[Record], galleries: Sequence[Gallery], made: str) -> str:
-    """The whole page; ``made`` says when and with what."""
-    title = f"warpgs: {', '.join(record.label for record in records)}"
+def page(runs: Sequence[EvaluatedRun], galleries: Sequence[Gallery], origin: str) -> str:
+    """The whole page; ``origin`` is a line that says when and by which program it was written."""
+    title = f"warpgs: {', '.join(run.label for run in runs)}"
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         f'<meta name="viewport" content="width=device-width"><title>{text(title)}</title><style>{STYLE}</style>'
     )
     sections = [
-        f"<h1>{text(title)}</h1><p class=note>{text(made)}</p>",
-        _summary(records),
-        _charts(records),
-        *(_gallery(records, gallery) for gallery in galleries),
-        _views(records),
-        _config(records),
+        f"<h1>{text(title)}</h1><p class=note>{text(origin)}</p>",
+        _summary(runs),
+        _charts(runs),
+        *(_gallery(runs, gallery) for gallery in galleries),
+        _views(runs),
+        _config(runs),
     ]
     return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{chr(10).join(sections)}\n</body></html>\n'
 
 
-def _named(records: Sequence[Record], number: int) -> str:
-    return f'<span class="dot" style="background:{color_of(number)}"></span>{text(records[number].label)}'
+def _named(runs: Sequence[EvaluatedRun], index: int) -> str:
+    return f'<span class="dot" style="background:{color_of(index)}"></span>{text(runs[index].label)}'
 
 
-def _header(records: Sequence[Record], first: str = "") -> str:
-    names = "".join(f"<th>{_named(records, k)}</th>" for k in range(len(records)))
+def _header(runs: Sequence[EvaluatedRun], first: str = "") -> str:
+    names = "".join(f"<th>{_named(runs, k)}</th>" for k in range(len(runs)))
     return f"<tr><th>{text(first)}</th>{names}</tr>"
 
 
-def _summary(records: Sequence[Record]) -> str:
+def _summary(runs: Sequence[EvaluatedRun]) -> str:
     rows = []
-    for name, values, shown in summary_rows(records):
-        best = _best(name, values) if len(records) > 1 else None
+    for name, values, texts in summary_rows(runs):
+        best = _best(name, values) if len(runs) > 1 else None
         cells = "".join(
-            f"<td{' class=best' if best is not None and value == best else ''}>{text(words)}</td>"
-            for value, words in zip(values, shown, strict=True)
+            f"<td{' class=best' if best is not None and value == best else ''}>{text(formatted)}</td>"
+            for value, formatted in zip(values, texts, strict=True)
         )
-        rows.append(f"<tr><th>{text(NAMES.get(name, name))}</th>{cells}</tr>")
-    return f"<h2>Figures and timing</h2><table>{_header(records)}{''.join(rows)}</table>"
+        rows.append(f"<tr><th>{text(TITLES.get(name, name))}</th>{cells}</tr>")
+    return f"<h2>Metrics and timing</h2><table>{_header(runs)}{''.join(rows)}</table>"
 
 
 def _best(name: str, values: Iterable[Any]) -> float | None:
@@ -102,76 +103,79 @@ def _best(name: str, values: Iterable[Any]) -> float | None:
     return max(known) if name in HIGHER else min(known)
 
 
-def _charts(records: Sequence[Record]) -> str:
-    tags = dict.fromkeys(tag for record in records for tag in record.curves)
+def _charts(runs: Sequence[EvaluatedRun]) -> str:
+    tags = dict.fromkeys(tag for run in runs for tag in run.curves)
     ordered = [*(tag for tag in CURVES if tag in tags), *sorted(tag for tag in tags if tag not in CURVES)]
-    drawn = [
-        chart(tag, "iteration", [Series(r.label, color_of(k), r.curves.get(tag, [])) for k, r in enumerate(records)])
+    by_tag = [
+        chart(tag, "iteration", [Series(r.label, color_of(k), r.curves.get(tag, [])) for k, r in enumerate(runs)])
         for tag in ordered
     ]
-    silent = [record.label for record in records if not record.curves]
-    note = f"<p class=note>Without TensorBoard events: {text(', '.join(silent))}</p>" if silent else ""
+    without_events = [run.label for run in runs if not run.curves]
+    note = f"<p class=note>Without TensorBoard events: {text(', '.join(without_events))}</p>" if without_events else ""
     by_view = [
-        chart(f"{NAMES[name]} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(records)], dots=True)
+        chart(f"{TITLES[name]} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(runs)], dots=True)
         for name in ("psnr", "ssim", "lpips")
     ]
-    legend = " ".join(_named(records, k) for k in range(len(records)))
-    return f'<h2>Curves</h2><p>{legend}</p>{note}<div class="charts">{"".join(drawn)}{"".join(by_view)}</div>'
+    legend = " ".join(_named(runs, k) for k in range(len(runs)))
+    return f'<h2>Curves</h2><p>{legend}</p>{note}<div class="charts">{"".join(by_tag)}{"".join(by_view)}</div>'
 
 
-def _over_time(number: int, record: Record, name: str) -> Series:
-    known = [(view.time, value) for view in record.views if (value := view.figures.get(name)) is not None]
-    return Series(record.label, color_of(number), sorted((t, v) for t, v in known if math.isfinite(v)))
+def _over_time(index: int, run: EvaluatedRun, name: str) -> Series:
+    known = [(view.time, value) for view in run.views if (value := view.metrics.get(name)) is not None]
+    return Series(run.label, color_of(index), sorted((t, v) for t, v in known if math.isfinite(v)))
 
 
-def _gallery(records: Sequence[Record], gallery: Gallery) -> str:
-    names = "".join(f"<th colspan=2>{_named(records, k)}: ours | error</th>" for k in gallery.runs)
+def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
+    names = "".join(f"<th colspan=2>{_named(runs, k)}: rendered | error</th>" for k in gallery.runs)
     notes = "".join(
-        f"<p class=note>{text(records[k].label)}: {text(strips.note)}</p>"
+        f"<p class=note>{text(runs[k].label)}: {text(strips.note)}</p>"
         for k, strips in zip(gallery.runs, gallery.strips, strict=True)
         if strips.note
     )
     rows = []
     for title, views in (("Worst views", gallery.worst), ("Best views", gallery.best)):
         if views:
-            rows.append(f"<tr><th>{title}: truth</th>{names}</tr>")
-        rows += [_gallery_row(records, gallery, view) for view in views]
+            rows.append(f"<tr><th>{title}: ground truth</th>{names}</tr>")
+        rows += [_gallery_row(runs, gallery, view) for view in views]
     columns = 1 + 2 * len(gallery.runs)
-    scale = f"<p class=note>By PSNR. Error: mean over colours, black at 0, bright at {ERROR_RANGE} and above.</p>"
+    error = f"mean absolute error over the channels, black at 0, brightest from {ERROR_RANGE} on"
+    scale = f"<p class=note>Ordered by PSNR. Error: {error}.</p>"
     table = f'<div class="strips" style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
     return f"<h2>Worst and best views</h2>{scale}{notes}{table}"
 
 
-def _gallery_row(records: Sequence[Record], gallery: Gallery, name: str) -> str:
+def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> str:
     truths = [strips.by_view[name].truth for strips in gallery.strips if name in strips.by_view]
-    cells = [f'<td><img src="{text(truths[0])}" alt="truth">{text(name)}</td>' if truths else f"<td>{text(name)}</td>"]
-    for number, strips in zip(gallery.runs, gallery.strips, strict=True):
-        view = next(view for view in records[number].views if view.name == name)
-        psnr = view.figures.get("psnr")
-        words = "" if psnr is None else f"{psnr:.2f} dB"
+    cells = [
+        f'<td><img src="{text(truths[0])}" alt="ground truth">{text(name)}</td>' if truths else f"<td>{text(name)}</td>"
+    ]
+    for index, strips in zip(gallery.runs, gallery.strips, strict=True):
+        view = next(view for view in runs[index].views if view.name == name)
+        psnr = view.metrics.get("psnr")
+        quality = "" if psnr is None else f"{psnr:.2f} dB"
         if name not in strips.by_view:
-            cells.append(f"<td colspan=2>{text(words)} (no picture)</td>")
+            cells.append(f"<td colspan=2>{text(quality)} (no image)</td>")
             continue
         strip = strips.by_view[name]
-        cells.append(f'<td><img src="{text(strip.ours)}" alt="ours">{text(words)}</td>')
+        cells.append(f'<td><img src="{text(strip.rendered)}" alt="rendered">{text(quality)}</td>')
         cells.append(f'<td><img src="{text(strip.error)}" alt="error"></td>')
     return f"<tr>{''.join(cells)}</tr>"
 
 
-def _views(records: Sequence[Record]) -> str:
-    parts = ["<h2>Every view</h2>"]
-    for number, record in enumerate(records):
-        names = dict.fromkeys(name for view in record.views for name, v in view.figures.items() if v is not None)
-        head = "".join(f"<th>{text(NAMES.get(name, name))}</th>" for name in ("view", "time", *names))
+def _views(runs: Sequence[EvaluatedRun]) -> str:
+    parts = ["<h2>All views</h2>"]
+    for index, run in enumerate(runs):
+        names = dict.fromkeys(name for view in run.views for name, v in view.metrics.items() if v is not None)
+        head = "".join(f"<th>{text(TITLES.get(name, name))}</th>" for name in ("view", "time", *names))
         rows = "".join(
             f"<tr><td class=text>{text(view.name)}</td><td>{view.time:.4f}</td>"
-            + "".join(f"<td>{_number(view.figures.get(name))}</td>" for name in names)
+            + "".join(f"<td>{_number(view.metrics.get(name))}</td>" for name in names)
             + "</tr>"
-            for view in record.views
+            for view in run.views
         )
-        opened = " open" if len(records) == 1 else ""
+        opened = " open" if len(runs) == 1 else ""
         parts.append(
-            f"<details{opened}><summary>{_named(records, number)}: {len(record.views)} views</summary>"
+            f"<details{opened}><summary>{_named(runs, index)}: {len(run.views)} views</summary>"
             f"<table><tr>{head}</tr>{rows}</table></details>"
         )
     return "".join(parts)
@@ -181,13 +185,13 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}" if abs(value) < 10 else f"{value:.2f}"
 
 
-def _config(records: Sequence[Record]) -> str:
-    rows = config_rows([record.config for record in records])
-    title = "Settings that differ" if len(records) > 1 else "Settings other than the preset's"
+def _config(runs: Sequence[EvaluatedRun]) -> str:
+    rows = config_rows([run.config for run in runs])
+    title = "Settings that differ" if len(runs) > 1 else "Settings that differ from the preset"
     if not rows:
         return f"<h2>{title}</h2><p class=note>none</p>"
     body = "".join(
         f"<tr><th>{text(name)}</th>{''.join(f'<td class=text>{text(value)}</td>' for value in values)}</tr>"
         for name, values in rows
     )
-    return f"<h2>{title}</h2><table>{_header(records)}{body}</table>"
+    return f"<h2>{title}</h2><table>{_header(runs)}{body}</table>"

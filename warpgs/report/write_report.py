@@ -10,9 +10,9 @@ from warpgs.errors import one_line
 from warpgs.files import write_text
 
 from .command import Report
+from .evaluated_run import EvaluatedRun, read_runs
+from .image_strips import Strips, rendered_strips, saved_strips, saved_views
 from .page import Gallery, page
-from .record import Record, read_records
-from .strips import Strips, available, from_folder, rendered
 
 
 def write_report(options: Report) -> str:
@@ -24,49 +24,55 @@ def write_report(options: Report) -> str:
     """
     if options.views < 0:
         raise ValueError(f"--views must not be negative, got {options.views}")
-    records = read_records(options.run_folders)
-    galleries = [_gallery(options, records, group) for group in groups(records)] if options.views else []
+    runs = read_runs(options.run_folders)
+    galleries = [_gallery(options, runs, group) for group in groups(runs)] if options.views else []
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    made = f"made {now} by warpgs {importlib.metadata.version('warpgs')}"
-    out = options.out or (options.run_folders[0] if len(records) == 1 else Path()) / "report.html"
-    write_text(out, page(records, [gallery for gallery in galleries if gallery.worst], made))
+    origin = f"written {now} by warpgs {importlib.metadata.version('warpgs')}"
+    out = options.out or (options.run_folders[0] if len(runs) == 1 else Path()) / "report.html"
+    write_text(out, page(runs, [gallery for gallery in galleries if gallery.worst], origin))
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB"
 
 
-def _gallery(options: Report, records: Sequence[Record], group: Sequence[int]) -> Gallery:
+def _gallery(options: Report, runs: Sequence[EvaluatedRun], group: Sequence[int]) -> Gallery:
     """Worst and best views of runs that share a capture."""
-    chosen = [records[k] for k in group]
+    chosen = [runs[k] for k in group]
     worst, best = extremes(chosen, options.views)
     strips: list[Strips] = []
     reasons: dict[int, str] = {}
-    for k, record in enumerate(chosen):
+    for k, run in enumerate(chosen):
         try:
-            strips.append(rendered(record, [*worst, *best], options.device, options.quiet))
+            strips.append(rendered_strips(run, [*worst, *best], options.device, options.quiet))
         except (ValueError, OSError) as error:
             reasons[k] = one_line(error)
             strips.append(Strips({}, ""))
-    if len(reasons) == len(chosen):  # then only views of which there are pictures
-        worst, best = extremes(chosen, options.views, set.intersection(*map(available, chosen)))
+    if len(reasons) == len(chosen):  # only views with saved images
+        worst, best = extremes(chosen, options.views, set.intersection(*map(saved_views, chosen)))
     for k, reason in reasons.items():
-        strips[k] = from_folder(chosen[k], [*worst, *best], reason)
+        strips[k] = saved_strips(chosen[k], [*worst, *best], reason)
     return Gallery(group, worst, best, strips)
 
 
-def groups(records: Sequence[Record]) -> list[list[int]]:
-    """Numbers of the runs that were evaluated on the same views of the same capture."""
+def groups(runs: Sequence[EvaluatedRun]) -> list[list[int]]:
+    """Indices of the runs that were evaluated on the same views of the same capture."""
     found: dict[tuple[object, ...], list[int]] = {}
-    for number, record in enumerate(records):
-        key = (record.config.data, record.config.factor, *sorted(view.name for view in record.views))
-        found.setdefault(key, []).append(number)
+    for index, run in enumerate(runs):
+        key = (run.config.data, run.config.factor, *sorted(view.name for view in run.views))
+        found.setdefault(key, []).append(index)
     return list(found.values())
 
 
-def extremes(records: Sequence[Record], count: int, among: set[str] | None = None) -> tuple[list[str], list[str]]:
-    """Views of lowest and of highest PSNR, mean over runs; no view is both, and the extreme ones come first."""
+def extremes(runs: Sequence[EvaluatedRun], count: int, among: set[str] | None = None) -> tuple[list[str], list[str]]:
+    """The views with the lowest and with the highest mean PSNR over the runs, most extreme first; no view is in both.
+
+    Args:
+        runs: Runs with the same views.
+        count: Maximum number of views of either type.
+        among: Names of the views to choose from; all if None.
+    """
     scores: dict[str, list[float]] = {}
-    for record in records:
-        for view in record.views:
-            psnr = view.figures["psnr"]
+    for run in runs:
+        for view in run.views:
+            psnr = view.metrics["psnr"]
             if psnr is not None and (among is None or view.name in among):
                 scores.setdefault(view.name, []).append(psnr)
     ordered = sorted(scores, key=lambda name: (statistics.fmean(scores[name]), name))

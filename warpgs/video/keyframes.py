@@ -14,6 +14,7 @@ spaced. ``up`` defaults to the upward direction of the capture.
 
 import dataclasses
 import itertools
+import re
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
-from warpgs.files import read_json
+from warpgs.files import read_json, write_json
 
 from . import camera_paths
 
@@ -44,6 +45,48 @@ MAX_VALUE = 1e9
 
 MIN_FOCAL = 1e-3
 """Minimum focal length [px]."""
+
+FOLDER = "paths"
+"""Subfolder of a run folder for the paths that the viewer saves."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _-]{0,63}")
+"""Valid names of paths; a name comes from a browser and must not lead out of the folder."""
+
+
+def path_of(run: Path, name: str) -> Path:
+    """A file in a run folder for a new path, numbered if the name is taken.
+
+    Raises:
+        ValueError: If the name has other characters than letters, digits, spaces, - and _, or too many.
+    """
+    if not NAME.fullmatch(name):
+        raise ValueError(f"the name of a path must have 1 to 64 letters, digits, spaces, - and _, got {name!r}")
+    stem = run / FOLDER / name
+    return next(
+        p for k in range(1, 10_000) if not (p := Path(f"{stem}.json" if k == 1 else f"{stem}-{k}.json")).exists()
+    )
+
+
+def write_path(path: Path, cameras: Sequence[Camera]) -> None:
+    """Writes cameras as keyframes, in their order.
+
+    Raises:
+        ValueError: If there is no camera.
+        OSError: If the file cannot be written; the message names it.
+    """
+    if not cameras:
+        raise ValueError("a path needs at least one keyframe")
+    keyframes = [
+        {
+            "time": camera.time,
+            "viewmat": camera.viewmat.tolist(),
+            "K": camera.K.tolist(),
+            "width": camera.width,
+            "height": camera.height,
+        }
+        for camera in cameras
+    ]
+    write_json(path, {"keyframes": keyframes})
 
 
 def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:

@@ -1,1 +1,1 @@
-"""A viewer in the browser: one thread renders for each browser that is connected."""
+"""A viewer in the browser; one thread renders for each connected browser."""

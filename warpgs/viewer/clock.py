@@ -1,11 +1,11 @@
-"""The time that is shown, and how it runs."""
+"""Playback of the scene's time."""
 
 CLIP_SECONDS = 5.0
-"""What speed 1 takes from the first moment to the last."""
+"""Duration of the scene at speed 1 [s]."""
 
 
 class Clock:
-    """Runs time from 0 to 1 over and over while it plays."""
+    """Advances the scene's time in a loop from 0 to 1 while it plays."""
 
     def __init__(self) -> None:
         self.playing = False
@@ -15,9 +15,9 @@ class Clock:
         self.playing = not self.playing
         self._before = None
 
-    def advance(self, moment: float, speed: float, now: float) -> float:
-        """The moment to show at the clock's ``now`` [s], after ``moment`` was shown the time before."""
+    def advance(self, time: float, speed: float, now: float) -> float:
+        """The time in [0, 1] to show at wall-clock time ``now`` [s], after ``time`` was shown at the last call."""
         before, self._before = self._before, now
         if not self.playing or before is None:
-            return moment
-        return (moment + speed * (now - before) / CLIP_SECONDS) % 1.0
+            return time
+        return (time + speed * (now - before) / CLIP_SECONDS) % 1.0

@@ -1,6 +1,8 @@
 """``warpgs view``."""
 
+import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -9,21 +11,21 @@ import tyro
 
 @dataclass(frozen=True)
 class View:
-    """Shows a run in the browser: move through space and time, see its parts, look through its training cameras."""
+    """Shows a run in the browser: move through space and time, switch layers, look through the training cameras."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
     """Run folder."""
     host: str = "127.0.0.1"
-    """Address to listen on: this machine alone can connect, unless you give another (0.0.0.0: everybody can)."""
+    """Address to listen on. By default only this machine can connect; 0.0.0.0 accepts connections from everywhere."""
     port: int = 8080
-    """Port to listen on; 0 is any that is free."""
+    """Port to listen on; 0 chooses a free one."""
     while_training: bool = False
-    """Follow the newest checkpoint of a run that is being trained; reads nothing while no browser is connected."""
+    """Follow a run in training: show each new checkpoint. Nothing is read while no browser is connected."""
     device: Literal["cuda", "cpu"] | None = None
-    """Where to render; CUDA if there is a GPU."""
+    """Device to render on; CUDA by default if there is a GPU."""
 
     def run(self) -> None:
         """Serves until Ctrl-C; raises as ``serve``."""
         from .serve import serve
 
-        serve(self)
+        serve(self, report=partial(print, flush=True), warn=partial(print, file=sys.stderr))

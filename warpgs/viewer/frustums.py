@@ -1,4 +1,4 @@
-"""Cameras drawn into the scene of one browser."""
+"""Camera frustums in the scene of a browser."""
 
 import numpy as np
 import viser
@@ -18,7 +18,17 @@ def add_frustum(
     color: tuple[int, int, int],
     image: np.ndarray | None = None,
 ) -> viser.CameraFrustumHandle:
-    """Draws a camera whose picture is ``aspect`` times as wide as it is high."""
+    """Adds the frustum of a camera to the scene.
+
+    Args:
+        scene: Scene of a browser.
+        name: Path of the frustum in the scene.
+        pose: The camera.
+        aspect: Width over height of its image.
+        scale: Size of the frustum [scene units].
+        color: 8-bit RGB of the lines.
+        image: Image on the far plane.
+    """
     return scene.add_camera_frustum(
         name,
         pose.fov,

@@ -1,7 +1,7 @@
-"""What the viewer can show of a scene."""
+"""The images that the viewer can show of a scene."""
 
 import dataclasses
-from typing import Literal, get_args
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -11,40 +11,78 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.rendering import render
+from warpgs.rendering import Layer, render
 from warpgs.visualize import depth_image, to_bytes
 
-LayerName = Literal["joint", "static", "dynamic", "depth", "alpha", "dynamic mask"]
-LAYERS: tuple[LayerName, ...] = get_args(LayerName)
+Image = UInt8[np.ndarray, "H W 3"]
 
-SEEN_ALPHA = 0.5
-"""A pixel has a colour in the depth layer where it is at least this opaque."""
+MIN_ALPHA = 0.5
+"""A pixel has a depth where it is at least this opaque."""
+
+
+def joint(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """All Gaussians."""
+    return to_bytes(render(splats, camera, settings=RenderSettings(antialias=antialias)).joint.image)
+
+
+def static(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """The static Gaussians alone."""
+    return _branch_image(render(splats, camera, settings=RenderSettings(branches=True, antialias=antialias)).static)
+
+
+def dynamic(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """The dynamic Gaussians alone."""
+    return _branch_image(render(splats, camera, settings=RenderSettings(branches=True, antialias=antialias)).dynamic)
+
+
+def depth(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """Inverse depth in colours: red is near, blue is far, black is empty."""
+    image = render(splats, camera, settings=RenderSettings(depth=True, antialias=antialias)).joint
+    assert image.depth is not None
+    visible = (image.alpha >= MIN_ALPHA) & (image.depth > 0)
+    return depth_image(torch.where(visible, 1.0 / image.depth, torch.nan).cpu().numpy())
+
+
+def alpha(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """Opacity, in grey."""
+    return _grey(render(splats, camera, settings=RenderSettings(antialias=antialias)).joint.alpha[..., None])
+
+
+def dynamic_mask(splats: Splats, camera: Camera, antialias: bool) -> Image:
+    """Blend weight of the dynamic Gaussians in the joint image, in grey: those hidden by static ones have none."""
+    assert splats.is_dynamic is not None
+    weights = dataclasses.replace(splats, colors=splats.is_dynamic.float()[:, None], sh=None, sh_degree=None)
+    return _grey(render(weights, camera, settings=RenderSettings(antialias=antialias)).joint.image)
+
+
+LAYERS: dict[str, Callable[[Splats, Camera, bool], Image]] = {
+    "joint": joint,
+    "static": static,
+    "dynamic": dynamic,
+    "depth": depth,
+    "alpha": alpha,
+    "dynamic mask": dynamic_mask,
+}
+"""Layers by name, in the order of the menu. To add one, write its function and add a line here."""
 
 
 @torch.no_grad()
-def picture(splats: Splats, camera: Camera, layer: LayerName, antialias: bool = False) -> UInt8[np.ndarray, "H W 3"]:
-    """An 8-bit RGB image of one layer.
+def render_layer(name: str, splats: Splats, camera: Camera, antialias: bool = False) -> Image:
+    """An 8-bit RGB image of a layer.
 
-    The dynamic mask is the share of each pixel that dynamic Gaussians have in the joint image: what static ones hide
-    is not in it.
+    Args:
+        name: Key of ``LAYERS``.
+        splats: The Gaussians at the time to show.
+        camera: The camera, on any device.
+        antialias: Whether opacities compensate for the low-pass filter.
     """
-    camera = camera.to(splats.means.device)
-    if layer == "dynamic mask":
-        assert splats.is_dynamic is not None
-        splats = dataclasses.replace(splats, colors=splats.is_dynamic.float()[:, None], sh=None, sh_degree=None)
-    branches = layer in ("static", "dynamic")
-    settings = RenderSettings(branches=branches, depth=layer == "depth", antialias=antialias)
-    rendering = render(splats, camera, settings=settings)
-    shown = {"static": rendering.static, "dynamic": rendering.dynamic}.get(layer, rendering.joint)
-    assert shown is not None
-    if layer == "depth":
-        assert shown.depth is not None
-        return depth_image(_inverse_depth(shown.depth, shown.alpha))
-    image = shown.alpha[..., None] if layer == "alpha" else shown.image
-    return to_bytes(image.expand(-1, -1, 3))
+    return LAYERS[name](splats, camera.to(splats.means.device), antialias)
 
 
-def _inverse_depth(depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Inverse depth, NaN where less than ``SEEN_ALPHA`` is opaque."""
-    seen = ((alpha >= SEEN_ALPHA) & (depth > 0)).cpu().numpy()
-    return 1.0 / np.where(seen, depth.cpu().numpy(), np.nan)
+def _branch_image(branch: Layer | None) -> Image:
+    assert branch is not None
+    return to_bytes(branch.image)
+
+
+def _grey(values: Float[Tensor, "H W 1"]) -> Image:
+    return to_bytes(values.expand(-1, -1, 3))

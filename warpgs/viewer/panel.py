@@ -1,4 +1,4 @@
-"""The controls beside the picture."""
+"""The controls beside the image."""
 
 from typing import Any
 
@@ -9,77 +9,83 @@ from .layers import LAYERS
 from .training_cameras import TrainingCameras
 
 PLAY, PAUSE = "Play", "Pause"
-CONTROLS = "Drag: orbit · right drag: pan · wheel: nearer, farther · W A S D Q E: fly"
-MOMENTS, SPEEDS, WIDTHS = (0.0, 1.0), (0.1, 4.0), (160, 1920)
-"""Ends of the sliders of time, speed and pixels."""
+HELP = "Drag: orbit · right drag: pan · wheel: zoom · W A S D Q E: fly"
+TIMES, SPEEDS, WIDTHS = (0.0, 1.0), (0.1, 4.0), (160, 1920)
+"""Ranges of the sliders of time, speed and image width [px]."""
 
-MARKED = "\\`*_{}[]()#+!|<>&~"
-"""Characters that mean something in Markdown or HTML."""
+SPECIAL = "\\`*_{}[]()#+!|<>&~"
+"""Characters with a meaning in Markdown or HTML."""
 
 
 class Panel:
-    """One browser's controls; what they do is said in ``session`` and ``path_editor``."""
+    """The controls of one browser; ``session`` and ``path_editor`` implement what they do."""
 
     def __init__(self, gui: viser.GuiApi, training: TrainingCameras | None, width: int) -> None:
         self.status = gui.add_markdown("starting")
         with gui.add_folder("Time"):
-            self.time = gui.add_slider("time", *MOMENTS, 0.001, 0.0)
+            self.time = gui.add_slider("time", *TIMES, 0.001, 0.0)
             self.play = gui.add_button(PLAY)
-            self.speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: all of the time in 5 seconds")
-        with gui.add_folder("Picture"):
-            self.layer = gui.add_dropdown("layer", LAYERS, initial_value=LAYERS[0])
-            self.residual = gui.add_checkbox(
-                "residual", True, hint="Off: static Gaussians without MLP_app, as w⁰ alone"
-            )
-            hint = "At rest; fewer while something moves and the machine can't keep up"
-            self.width = gui.add_slider("pixels", *WIDTHS, 80, width, hint=hint)
+            self.speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: the whole scene in 5 seconds")
+        with gui.add_folder("Image"):
+            self.layer = gui.add_dropdown("layer", tuple(LAYERS), initial_value=next(iter(LAYERS)))
+            hint = "Off: static Gaussians have their own colours, without the appearance network"
+            self.residual = gui.add_checkbox("appearance", True, hint=hint)
+            hint = "Width at rest; while something changes, as much as the machine can render in time"
+            self.width = gui.add_slider("width [px]", *WIDTHS, 80, width, hint=hint)
         if training is not None:
             self._add_training(gui, training)
         with gui.add_folder("Camera path"):
             self.path_name = gui.add_text("name", "path", hint="Saved in the run folder as paths/NAME.json")
-            self.add_keyframe = gui.add_button("Add keyframe", hint="This view at this time")
-            self.remove_keyframe = gui.add_button("Remove last")
+            self.add_keyframe = gui.add_button("Add keyframe", hint="The current camera and time")
+            self.remove_keyframe = gui.add_button("Remove last keyframe")
             self.save_path = gui.add_button("Save path")
             self.path_note = gui.add_markdown("no keyframes")
-        gui.add_markdown(CONTROLS)
+        gui.add_markdown(HELP)
 
-    # A browser may send any number, whatever the ends of its sliders are.
-
-    @property
-    def moment(self) -> float:
-        """In [0, 1]."""
-        return _within(self.time.value, MOMENTS)
+    # A browser may send any value, so each is checked again here.
 
     @property
-    def pace(self) -> float:
-        """Speed of time."""
-        return _within(self.speed.value, SPEEDS)
+    def current_time(self) -> float:
+        """Time to show, in [0, 1]."""
+        return _clamped(self.time.value, TIMES)
 
     @property
-    def across(self) -> int:
-        """Width of the picture at rest [px]."""
-        return int(_within(self.width.value, WIDTHS))
+    def current_speed(self) -> float:
+        """Speed of playback."""
+        return _clamped(self.speed.value, SPEEDS)
+
+    @property
+    def current_width(self) -> int:
+        """Width of the image at rest [px]."""
+        return int(_clamped(self.width.value, WIDTHS))
+
+    @property
+    def current_layer(self) -> str:
+        """Name of the layer to show, a key of ``LAYERS``."""
+        name = self.layer.value
+        return name if isinstance(name, str) and name in LAYERS else next(iter(LAYERS))
 
     def _add_training(self, gui: viser.GuiApi, training: TrainingCameras) -> None:
-        count, first = len(training.views), training.picture(0)
+        count, first = len(training.views), training.thumbnail(0)
         with gui.add_folder("Training cameras"):
-            self.show_cameras = gui.add_checkbox("show", False, hint="Click on one to look through it")
-            self.view = gui.add_slider("view", 1, max(2, count), 1, 1, disabled=count < 2)
+            self.show_cameras = gui.add_checkbox("show in the scene", False, hint="Click a camera to look through it")
+            self.view = gui.add_slider("camera", 1, max(2, count), 1, 1, disabled=count < 2)
             self.snap = gui.add_button("Look through it")
-            self.truth = gui.add_image(np.zeros((1, 1, 3), np.uint8) if first is None else first, label="its picture")
+            image = np.zeros((1, 1, 3), np.uint8) if first is None else first
+            self.truth = gui.add_image(image, label="training image")
 
 
-def _within(value: int | float, ends: tuple[int | float, int | float]) -> float:
-    """A number between two ends; the first of what is no number."""
-    low, high = ends
+def _clamped(value: int | float, bounds: tuple[int | float, int | float]) -> float:
+    """A number within bounds; the lower bound for NaN."""
+    low, high = bounds
     return float(min(value, high)) if value >= low else float(low)
 
 
-def put(control: Any, value: Any) -> None:
-    """Sets a control's value, which viser declares in a way that mypy takes for read-only."""
+def set_value(control: Any, value: Any) -> None:
+    """Sets the value of a control; viser declares it in a way that mypy takes for read-only."""
     control.value = value
 
 
-def plain(text: str) -> str:
-    """A text as the panel shows it, on one line, without what Markdown or HTML would read into it."""
-    return "".join(f"\\{c}" if c in MARKED else c for c in " ".join(text.split()))
+def escape(text: str) -> str:
+    """A text on one line, with all characters escaped that mean something in Markdown or HTML."""
+    return "".join(f"\\{c}" if c in SPECIAL else c for c in " ".join(text.split()))

@@ -7,67 +7,68 @@ from pathlib import Path
 import viser
 
 from warpgs.cameras import Camera
+from warpgs.video import keyframes
 
-from . import keyframes
 from .frustums import ORANGE, add_frustum
-from .panel import Panel, plain
+from .panel import Panel, escape
 from .pose import camera_of, pose_of
 
 MAX_KEYFRAMES = 1000
 
 
 class PathEditor:
-    """Adds, removes and saves keyframes as the panel's buttons say.
+    """Adds, removes and saves keyframes with the buttons of a panel.
 
     Args:
-        scene: Where keyframes are drawn.
-        panel: Whose buttons they are.
+        scene: Scene of the browser, which shows the keyframes.
+        panel: Panel of the browser.
         run: Run folder to save into.
-        look: The camera as it is now.
-        scale: Size to draw keyframes at [scene units].
+        current_camera: Returns the camera of the browser.
+        scale: Size of the keyframes in the scene [scene units].
     """
 
     def __init__(
-        self, scene: viser.SceneApi, panel: Panel, run: Path, look: Callable[[], Camera], scale: float
+        self, scene: viser.SceneApi, panel: Panel, run: Path, current_camera: Callable[[], Camera], scale: float
     ) -> None:
-        self._scene, self._panel, self._run, self._look, self._scale = scene, panel, run, look, scale
-        self._changing = threading.Lock()  # every click comes on a thread of its own
+        self._scene, self._panel, self._run, self._scale = scene, panel, run, scale
+        self._current_camera = current_camera
+        self._lock = threading.Lock()  # each click is handled on its own thread
         self.cameras: list[Camera] = []
         panel.add_keyframe.on_click(lambda _: self._add())
         panel.remove_keyframe.on_click(lambda _: self._remove())
         panel.save_path.on_click(lambda _: self._save())
 
     def _add(self) -> None:
-        seen = self._look()
-        pose = pose_of(seen)
-        even = (max(2, seen.width & ~1), max(2, seen.height & ~1))  # video codecs want even sizes
-        with self._changing:
+        camera = self._current_camera()
+        pose = pose_of(camera)
+        even = (max(2, camera.width & ~1), max(2, camera.height & ~1))  # video codecs need even sizes
+        with self._lock:
             if len(self.cameras) >= MAX_KEYFRAMES:
                 self._panel.path_note.content = f"a path has at most {MAX_KEYFRAMES} keyframes"
                 return
-            size = self.cameras[0].size if self.cameras else even  # a film has one
-            self.cameras.append(camera_of(pose, size, seen.time))
-            add_frustum(self._scene, self._name(), pose, size[0] / size[1], self._scale, ORANGE)
+            size = self.cameras[0].size if self.cameras else even  # all frames of a video have one size
+            self.cameras.append(camera_of(pose, size, camera.time))
+            add_frustum(self._scene, self._last_name(), pose, size[0] / size[1], self._scale, ORANGE)
             self._panel.path_note.content = self._count()
 
     def _remove(self) -> None:
-        with self._changing:
+        with self._lock:
             if self.cameras:
-                self._scene.remove_by_name(self._name())
+                self._scene.remove_by_name(self._last_name())
                 self.cameras.pop()
             self._panel.path_note.content = self._count()
 
     def _save(self) -> None:
         try:
-            with self._changing:  # two clicks would have one name
+            with self._lock:  # otherwise two clicks could choose the same file
                 path = keyframes.path_of(self._run, self._panel.path_name.value)
                 keyframes.write_path(path, self.cameras)
         except (ValueError, OSError) as error:
-            self._panel.path_note.content = plain(str(error))
+            self._panel.path_note.content = escape(str(error))
         else:
-            self._panel.path_note.content = plain(f"{self._count()} saved as {path}")
+            self._panel.path_note.content = escape(f"{self._count()} saved as {path}")
 
-    def _name(self) -> str:
+    def _last_name(self) -> str:
         return f"/keyframes/{len(self.cameras)}"
 
     def _count(self) -> str:

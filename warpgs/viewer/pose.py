@@ -1,4 +1,4 @@
-"""Cameras of the browser (orientation, position, vertical field of view) and ours."""
+"""Conversion between cameras and browser poses (orientation, position, vertical field of view)."""
 
 import math
 from typing import NamedTuple
@@ -13,11 +13,11 @@ Vector = tuple[float, ...]
 
 
 class Pose(NamedTuple):
-    """A camera as the browser has it; OpenCV axes, like ours.
+    """The pose of a browser's camera, with OpenCV axes.
 
     Attributes:
-        wxyz: Rotation from the camera to the world.
-        position: Centre in the world.
+        wxyz: Quaternion of the rotation from the camera to the world.
+        position: Centre of the camera [scene units].
         fov: Vertical field of view [rad].
     """
 
@@ -27,14 +27,19 @@ class Pose(NamedTuple):
 
 
 def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
-    """The camera of a pose for an image of ``size`` (width, height), principal point in the middle.
+    """The camera of a pose, with the principal point in the middle of the image.
+
+    Args:
+        pose: The pose.
+        size: (width, height) of the image [px].
+        time: Time in [0, 1].
 
     Raises:
         ValueError: If the pose is not finite, its rotation is zero or its field of view is not in (0, π).
     """
     w, x, y, z = pose.wxyz
     if not all(map(math.isfinite, (*pose.wxyz, *pose.position))) or not any(pose.wxyz) or not 0 < pose.fov < math.pi:
-        raise ValueError(f"the browser's camera can't be used: {pose}")
+        raise ValueError(f"the browser sent an invalid camera: {pose}")
     world_to_camera = Rotation.from_quat([x, y, z, w]).as_matrix().T
     viewmat = np.eye(4)
     viewmat[:3, :3] = world_to_camera
@@ -46,7 +51,7 @@ def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
 
 
 def pose_of(camera: Camera) -> Pose:
-    """The pose of a camera; a principal point away from the middle is lost, the browser has none."""
+    """The pose of a camera; its principal point is lost, because a browser has none."""
     camera = camera.to("cpu")
     x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3].double().numpy().T).as_quat().tolist()
     fov = 2.0 * math.atan2(0.5 * camera.height, float(camera.K[1, 1]))

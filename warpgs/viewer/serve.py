@@ -2,9 +2,10 @@
 
 import importlib.util
 import os
-import sys
 import threading
 import warnings
+from collections.abc import Callable
+from contextlib import suppress
 
 from warpgs.errors import one_line
 
@@ -13,43 +14,48 @@ from .source import Source, open_source
 from .training_cameras import TrainingCameras
 
 NICENESS = 10
-"""Of a viewer beside a trainer on the CPU: training has priority."""
+"""Niceness of a viewer of a run in training on the CPU: the trainer has priority."""
 
 
-def serve(options: View) -> None:
+def serve(options: View, report: Callable[[str], None], warn: Callable[[str], None]) -> None:
     """Serves a run until Ctrl-C.
+
+    Args:
+        options: Options of the command.
+        report: Shows a line of output.
+        warn: Shows a warning.
 
     Raises:
         ImportError: If viser is not installed.
         ValueError: If the run cannot be shown.
-        OSError: If the address cannot be listened on.
+        OSError: If the server cannot listen on the address.
     """
     if importlib.util.find_spec("viser") is None:
         raise ImportError("the viewer needs viser: pip install 'warpgs[viewer]'")
     from .server import Viewer, check_address
 
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has left
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
     check_address(options.host, options.port)
     source = open_source(options.run_folder, options.device, options.while_training)
     if options.while_training and source.device.type == "cpu" and hasattr(os, "nice"):
         os.nice(NICENESS)
-    with Viewer(source, training_cameras(source), options.host, options.port) as viewer:
+    with Viewer(source, training_cameras(source, warn), options.host, options.port) as viewer:
         host = f"[{options.host}]" if ":" in options.host else options.host
-        print(f"{options.run_folder}: http://{host}:{viewer.port} (Ctrl-C ends it)", flush=True)
+        report(f"{options.run_folder}: http://{host}:{viewer.port} (press Ctrl-C to stop)")
         _wait()
+    report("")
 
 
-def training_cameras(source: Source) -> TrainingCameras | None:
-    """The training cameras of a run; None, and a line that says so, if its capture cannot be read."""
+def training_cameras(source: Source, warn: Callable[[str], None]) -> TrainingCameras | None:
+    """The training cameras of a run; None, with a warning, if its capture cannot be read."""
     try:
         return TrainingCameras(source.run.open_capture())
     except (ValueError, OSError) as error:
-        print(f"without training cameras: {one_line(error)}", file=sys.stderr)
+        warn(f"without training cameras: {one_line(error)}")
         return None
 
 
 def _wait() -> None:
-    try:
+    """Waits for Ctrl-C."""
+    with suppress(KeyboardInterrupt):
         threading.Event().wait()
-    except KeyboardInterrupt:
-        print()

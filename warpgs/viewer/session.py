@@ -1,4 +1,4 @@
-"""One browser: its camera, its controls and the thread that renders for it."""
+"""One browser: its camera, its controls, and the thread that renders for it."""
 
 import threading
 import time
@@ -8,66 +8,50 @@ from typing import NamedTuple
 
 import numpy as np
 import viser
-from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
-from warpgs.model.splats import Splats
-from warpgs.runs.trained import TrainedScene
-from warpgs.visualize import to_bytes
 
+from .adaptive_resolution import AdaptiveResolution
+from .browser_camera import set_camera, through_training_camera
 from .clock import Clock
 from .frustums import BLUE, add_frustum
-from .layers import LayerName, picture
-from .looks import aim, look_through
-from .pace import Pace
-from .panel import PAUSE, PLAY, Panel, plain, put
+from .panel import PAUSE, PLAY, Panel, escape, set_value
 from .path_editor import PathEditor
 from .pose import Pose, camera_of
+from .renderer import Renderer, RenderRequest
 from .source import Source
 from .training_cameras import TrainingCameras
 
 REST_SECONDS = 0.2
-"""After this long without a change, the picture is refined."""
+"""Time without a change after which the image is refined [s]."""
 
 IDLE_SECONDS = 0.5
-"""Between looks for a newer checkpoint, where nothing else happens."""
+"""Interval between checks for a newer checkpoint while nothing else happens [s]."""
 
 STATUS_SECONDS = 0.3
-"""Between changes of the status: no more often than a person reads."""
+"""Minimum interval between updates of the status [s]."""
 
 QUALITY, QUALITY_AT_REST = 80, 92
-"""Of JPEG."""
+"""JPEG quality while something changes, and at rest."""
 
 RATE_SECONDS = 2.0
-"""Pictures of the last seconds that count for frames a second; at rest it is what the last one would allow."""
+"""Interval over which images are counted for the FPS [s]; at rest, the FPS are estimated from the last image."""
 
 MAX_CANVAS = (4096, 2160)
-"""Width and height to draw for [px]."""
+"""Maximum width and height of a canvas to render for [px]."""
 
 MAX_ASPECT = 4
-"""Height over width of a keyframe, at most."""
+"""Maximum height over width of a keyframe."""
 
 KEYFRAME_SCALE = 0.1
-"""Size to draw keyframes at where there are no training cameras [scene units]."""
+"""Size of keyframes in a scene without training cameras [scene units]."""
 
 
-class RenderRequest(NamedTuple):
-    """Everything that a picture depends on, but its resolution."""
+class Shown(NamedTuple):
+    """The image that the browser shows, and the scale of its sides."""
 
-    scene: TrainedScene
-    pose: Pose
-    canvas: tuple[int, int]
-    across: int
-    layer: LayerName
-    residual: bool
-    moment: float
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) of the whole picture: no larger than the canvas, nor wider than ``across``."""
-        width, height = self.canvas
-        across = min(width, self.across)
-        return across, max(1, round(height * across / width))
+    request: RenderRequest
+    scale: float
 
 
 class Session:
@@ -75,10 +59,10 @@ class Session:
 
     Args:
         client: The browser.
-        source: What is shown.
-        training: Cameras to snap to, if there are any.
-        rendering: Held while rendering: one picture at a time, whoever it is for.
-        width: Pixels across at rest, to begin with.
+        source: The scene to show.
+        training: The training cameras, if there are any.
+        rendering: Lock of ``Renderer``.
+        width: Initial width of the image at rest [px].
     """
 
     def __init__(
@@ -89,36 +73,35 @@ class Session:
         rendering: threading.Lock,
         width: int,
     ) -> None:
-        self._client, self._source, self._training, self._rendering = client, source, training, rendering
-        self._pace, self._clock = Pace(), Clock()
+        self._client, self._source, self._training = client, source, training
+        self._renderer, self._resolution, self._clock = Renderer(rendering), AdaptiveResolution(), Clock()
         self._stopped, self._wake = threading.Event(), threading.Event()
-        self._changing = threading.Lock()  # every event of the panel comes on a thread of its own
-        self._wished: RenderRequest | None = None
-        self._changed = 0.0
-        self._shown: tuple[RenderRequest, float] | None = None
-        self._splats: tuple[RenderRequest, Splats] | None = None
+        self._lock = threading.Lock()  # each event of the panel is handled on its own thread
+        self._requested: RenderRequest | None = None
+        self._changed_at = 0.0
+        self._shown: Shown | None = None
         self._sent: deque[float] = deque(maxlen=200)
         self._cost = ("", 0.0)
         self._note = self._problem = ""
-        self._said_at = 0.0
+        self._status_at = 0.0
         self.panel = Panel(client.gui, training, width)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
-        self.path = PathEditor(client.scene, self.panel, source.run.folder, self._look, scale)
+        self.path = PathEditor(client.scene, self.panel, source.run.folder, self._camera, scale)
         self._connect()
         if training is not None:
-            put(self.panel.view, len(training.views) // 2 + 1)  # which snaps
+            set_value(self.panel.view, len(training.views) // 2 + 1)  # its handler calls _snap
         self._thread = threading.Thread(target=self._run, name=f"viewer-{client.client_id}", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends the thread, after the picture that it is at."""
+        """Ends the thread after the current image."""
         self._stopped.set()
         self._wake.set()
 
     def join(self) -> None:
         self._thread.join()
 
-    # What the controls do ---------------------------------------------------------------------------------------------
+    # Handlers of the controls -----------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
         panel, training = self.panel, self._training
@@ -132,143 +115,129 @@ class Session:
             panel.show_cameras.on_update(lambda _: self._show_cameras(training))
 
     def _toggle(self) -> None:
-        with self._changing:
+        with self._lock:
             self._clock.toggle()
             self.panel.play.label = PAUSE if self._clock.playing else PLAY
         self._wake.set()
 
     def _snap(self, training: TrainingCameras) -> None:
-        """Looks through the training camera that the slider is at, at its time."""
-        with self._changing:
-            number = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
-            view, camera = training.views[number], self._client.camera
+        """Looks through the training camera that the slider selects, at its time."""
+        with self._lock:
+            index = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+            view, camera = training.views[index], self._client.camera
             width, height = self._canvas()
             with self._client.atomic():
-                aim(camera, look_through(training, number, width / height))
+                set_camera(camera, through_training_camera(training, index, width / height))
                 camera.wxyz = np.array(view.pose.wxyz)
-            put(self.panel.time, view.time)
-            image = training.picture(number)
-            self._note = f"the picture of {view.name} can't be read" if image is None else ""
+            set_value(self.panel.time, view.time)
+            image = training.thumbnail(index)
+            self._note = f"the image of {view.name} cannot be read" if image is None else ""
             if image is not None:
                 self.panel.truth.image = image
         self._wake.set()
 
     def _show_cameras(self, training: TrainingCameras) -> None:
-        """Draws training cameras into the scene, or takes them away, as the panel says by now."""
-        with self._changing:
-            for number in training.spread():
+        """Adds the training cameras to the scene or removes them, as the checkbox is set by now."""
+        with self._lock:
+            for index in training.frustums():
                 if not self.panel.show_cameras.value:
                     break
-                view, image = training.views[number], training.picture(number)
-                name, scale = f"/training/{number}", training.frustum_scale
+                view, image = training.views[index], training.thumbnail(index)
+                name, scale = f"/training/{index}", training.frustum_scale
                 frustum = add_frustum(self._client.scene, name, view.pose, view.aspect, scale, BLUE, image)
-                frustum.on_click(partial(self._look_through, training, number))
+                frustum.on_click(partial(self._look_through, training, index))
             if not self.panel.show_cameras.value:
                 self._client.scene.remove_by_name("/training")
 
-    def _look_through(self, training: TrainingCameras, number: int, _: object) -> None:
-        if self.panel.view.value == number + 1:
+    def _look_through(self, training: TrainingCameras, index: int, _: object) -> None:
+        if self.panel.view.value == index + 1:
             self._snap(training)
         else:
-            put(self.panel.view, number + 1)  # which snaps
+            set_value(self.panel.view, index + 1)  # its handler calls _snap
 
     # Rendering --------------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         while not self._stopped.is_set():
             try:
-                wait = self._turn()
+                wait = self._update_image()
             except (ValueError, RuntimeError) as error:  # out of memory is a RuntimeError
                 self._problem, wait = str(error), IDLE_SECONDS
-            self._say()
+            self._update_status()
             if wait and self._wake.wait(wait):
                 self._wake.clear()
 
-    def _turn(self) -> float:
-        """Draws a picture if there is a better one than what is shown; returns how long there will be none [s]."""
+    def _update_image(self) -> float:
+        """Renders an image if it would be better than the one shown; returns how long to wait for the next [s]."""
         now = time.monotonic()
         panel = self.panel
         if self._clock.playing:
-            put(panel.time, self._clock.advance(panel.moment, panel.pace, now))
-        wish = self._wish()
-        if wish is None:
+            set_value(panel.time, self._clock.advance(panel.current_time, panel.current_speed, now))
+        request = self._request()
+        if request is None:
             return IDLE_SECONDS
-        if wish != self._wished:
-            self._wished, self._changed = wish, now
-        shown = self._shown[1] if self._shown is not None and self._shown[0] == wish else 0.0
-        rest = self._changed + REST_SECONDS - now
-        width, height = wish.size
-        scale = self._pace.while_moving(width * height) if rest > 0 or not shown else Pace.refined(shown)
+        if request != self._requested:
+            self._requested, self._changed_at = request, now
+        shown = self._shown.scale if self._shown is not None and self._shown.request == request else 0.0
+        until_rest = self._changed_at + REST_SECONDS - now
+        if until_rest > 0 or not shown:
+            scale = self._resolution.interactive_scale(request.size[0] * request.size[1])
+        else:
+            scale = self._resolution.refined(shown)
         if scale > shown:
-            self._draw(wish, scale, (max(1, round(width * scale)), max(1, round(height * scale))))
+            self._render(request, scale)
             return 0.0
-        return rest if rest > 0 and shown < 1 else IDLE_SECONDS
+        return until_rest if until_rest > 0 and shown < 1 else IDLE_SECONDS
 
-    def _wish(self) -> RenderRequest | None:
+    def _request(self) -> RenderRequest | None:
+        """The image that the camera and the controls ask for; None without a scene."""
         scene, panel = self._source.current(), self.panel
         if scene is None:
             return None
-        looks = (panel.layer.value, bool(panel.residual.value), panel.moment)
-        return RenderRequest(scene, self._pose(), self._canvas(), panel.across, *looks)
+        controls = (panel.current_width, panel.current_layer, bool(panel.residual.value), panel.current_time)
+        return RenderRequest(scene, self._pose(), self._canvas(), *controls)
 
-    def _draw(self, wish: RenderRequest, scale: float, size: tuple[int, int]) -> None:
-        replays = scale == 1 and wish.layer == "joint" and wish.residual and wish.scene.uses_graphs
-        is_first = replays and not wish.scene.is_captured(size)
-        with self._rendering:
-            start = time.perf_counter()
-            camera = camera_of(wish.pose, size, wish.moment)
-            image = self._replayed(wish, camera) if replays else self._rendered(wish, camera)
-            drawn = time.perf_counter()
+    def _render(self, request: RenderRequest, scale: float) -> None:
+        """Renders an image and sends it to the browser."""
+        rendered = self._renderer.render(request, scale)
+        start = time.perf_counter() - rendered.seconds  # without waiting for the images of other browsers
         quality = QUALITY_AT_REST if scale == 1 else QUALITY
-        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
+        self._client.scene.set_background_image(rendered.image, format="jpeg", jpeg_quality=quality)
         now = time.perf_counter()
-        if not is_first:  # the recording takes longer than any picture after it
-            self._pace.took(size[0] * size[1], now - start)
-        self._shown, self._problem = (wish, scale), ""
+        width, height = request.size_at(scale)
+        if not rendered.is_warm_up:
+            self._resolution.add(width * height, now - start)
+        self._shown, self._problem = Shown(request, scale), ""
         self._sent.append(now)
-        self._cost = (f"{size[0]} × {size[1]} rendered in {(drawn - start) * 1e3:.1f} ms", 1.0 / (now - start))
-
-    def _replayed(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
-        """A whole joint picture on CUDA, faster than its kernels could be launched."""
-        return to_bytes(wish.scene.play(camera.to(wish.scene.device)))
-
-    def _rendered(self, wish: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
-        return picture(self._splats_of(wish), camera, wish.layer, wish.scene.config.antialias)
-
-    def _splats_of(self, wish: RenderRequest) -> Splats:
-        """The scene at the moment; the last one is kept, so that the networks rest while only the camera moves."""
-        kept = self._splats
-        if kept is None or any(getattr(kept[0], n) != getattr(wish, n) for n in ("scene", "moment", "residual")):
-            kept = self._splats = (wish, wish.scene.splats(wish.moment, wish.residual))
-        return kept[1]
+        self._cost = (f"{width} × {height} rendered in {rendered.seconds * 1e3:.1f} ms", 1.0 / (now - start))
 
     def _pose(self) -> Pose:
         camera = self._client.camera
         return Pose(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov))
 
     def _canvas(self) -> tuple[int, int]:
-        """Size of the canvas, no larger than any screen: the browser may claim what it likes."""
+        """(width, height) of the canvas, scaled down to ``MAX_CANVAS``: a browser may send any size."""
         camera = self._client.camera
         width, height = max(1, camera.image_width), max(1, camera.image_height)
         factor = min(1.0, MAX_CANVAS[0] / width, MAX_CANVAS[1] / height)
         return max(1, round(width * factor)), max(1, round(height * factor))
 
-    def _look(self) -> Camera:
-        """What is seen, as wide as the slider says: the browser changes the size of its canvas as it likes."""
+    def _camera(self) -> Camera:
+        """The current camera for a keyframe, with the width of the slider: the size of the canvas may change."""
         width, height = self._canvas()
-        across = self.panel.across
+        across = self.panel.current_width
         high = min(max(1, round(height * across / width)), MAX_ASPECT * across)
-        return camera_of(self._pose(), (across, high), self.panel.moment)
+        return camera_of(self._pose(), (across, high), self.panel.current_time)
 
-    def _say(self) -> None:
-        """Shows counts, speed and what is wrong."""
+    def _update_status(self) -> None:
+        """Shows problems, numbers of Gaussians, the iteration and the speed."""
         now = time.perf_counter()
-        if now - self._said_at < STATUS_SECONDS:
+        if now - self._status_at < STATUS_SECONDS:
             return
-        self._said_at = now
-        lines = [plain(line) for line in (self._problem, self._note, self._source.note) if line]
+        self._status_at = now
+        lines = [escape(line) for line in (self._problem, self._note, self._source.note) if line]
         if self._shown is not None:
-            trained = self._shown[0].scene
+            trained = self._shown.request.scene
             static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
             recent = sum(now - sent < RATE_SECONDS for sent in self._sent)
             cost, rate = self._cost

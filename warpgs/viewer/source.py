@@ -1,4 +1,4 @@
-"""Where the scene comes from: the newest checkpoint of a run folder."""
+"""The scene to show: the newest checkpoint of a run folder."""
 
 import threading
 import time
@@ -10,32 +10,32 @@ from warpgs.errors import one_line
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
 
-LOOK_EVERY = 2.0
-"""Seconds between looks for a newer checkpoint, while somebody watches."""
+POLL_SECONDS = 2.0
+"""Interval between checks for a newer checkpoint while a browser is connected [s]."""
 
 
 class Source:
-    """The scene of a run, loaded again when there is a newer checkpoint.
+    """The scene of a run, reloaded when there is a newer checkpoint.
 
     Args:
         run: The run, opened on the device to render on.
-        follow: Whether to look for newer checkpoints. Nothing is read then before the first call of ``current`` and
-            without calls, so that a viewer without browsers does not slow down training.
+        follow: Whether to follow newer checkpoints. They are read only in calls of ``current``, so that a viewer
+            without browsers does not slow down training.
 
     Attributes:
         run: The run.
-        note: Why there is no (newer) scene; empty if nothing is wrong.
+        note: Why there is no (newer) scene; empty if there is one.
 
     Raises:
-        ValueError: Without ``follow``, if the run has no checkpoint that can be read.
+        ValueError: Without ``follow``, if the run has no valid checkpoint.
     """
 
     def __init__(self, run: Run, follow: bool = False) -> None:
         self.run, self.follow = run, follow
         self.note = ""
         self._lock = threading.Lock()
-        self._seen: tuple[Path, int] | None = None
-        self._looked = -LOOK_EVERY
+        self._loaded: tuple[Path, int] | None = None
+        self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
 
     @property
@@ -43,25 +43,25 @@ class Source:
         return self.run.device
 
     def current(self) -> TrainedScene | None:
-        """The newest scene; the one before it while the newest can't be read, None before the first."""
+        """The newest scene; the one before it if the newest cannot be read; None before the first checkpoint."""
         with self._lock:
-            if self.follow and time.monotonic() - self._looked >= LOOK_EVERY:
-                self._looked = time.monotonic()
-                self._follow()
+            if self.follow and time.monotonic() - self._checked >= POLL_SECONDS:
+                self._checked = time.monotonic()
+                self._reload()
             return self._scene
 
-    def _follow(self) -> None:
+    def _reload(self) -> None:
         try:
             newest = self.run.newest_checkpoint()
             if newest is None:
                 self.note = "waiting for the first checkpoint"
                 return
-            seen = (newest, newest.stat().st_mtime_ns)
-            if seen != self._seen:
+            file = (newest, newest.stat().st_mtime_ns)
+            if file != self._loaded:
                 self._scene = self.run.trained_scene()
-                self._seen, self.note = seen, ""
+                self._loaded, self.note = file, ""
         except FileNotFoundError:
-            return  # the trainer deleted it for a newer one: next time
+            return  # the trainer has replaced it by a newer one, which the next check finds
         except (ValueError, OSError) as error:
             self.note = one_line(error)
 
@@ -72,7 +72,7 @@ def open_source(folder: Path, device: Device | None, follow: bool) -> Source:
     Args:
         folder: Run folder.
         device: Device to render on; CUDA if None and there is a GPU.
-        follow: Whether to look for newer checkpoints.
+        follow: Whether to follow newer checkpoints.
 
     Raises:
         ValueError: If the folder is not a run folder, is damaged, has no checkpoint, or there is no such device.

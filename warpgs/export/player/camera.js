@@ -1,9 +1,9 @@
-// Cameras: {rotation: rows of the world-to-camera rotation, position}. OpenCV axes: x right, y down, z forward.
+// A camera is {rotation: rows of the world-to-camera rotation, position}. OpenCV axes: x right, y down, z forward.
 'use strict';
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const plus = (a, b, s) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
+const addScaled = (a, b, s) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-const unit = (a) => { const n = Math.hypot(...a) || 1; return a.map((v) => v / n); };
+const normalized = (a) => { const n = Math.hypot(...a) || 1; return a.map((v) => v / n); };
 
 function cameraOf(viewmat) {
   const rotation = viewmat.slice(0, 3).map((row) => row.slice(0, 3)), t = viewmat.slice(0, 3).map((row) => row[3]);
@@ -11,20 +11,21 @@ function cameraOf(viewmat) {
   return {rotation, position};
 }
 
-function between(a, b, share) {
-  // Good for cameras that are close to one another: rows are mixed and made a rotation again.
-  const mixed = (p, q) => p.map((v, k) => v * (1 - share) + q[k] * share);
-  const z = unit(mixed(a.rotation[2], b.rotation[2])), x = unit(cross(mixed(a.rotation[1], b.rotation[1]), z));
-  return {rotation: [x, cross(z, x), z], position: mixed(a.position, b.position)};
+function interpolated(a, b, fraction) {
+  // For cameras that are close to each other: interpolates the rows and makes them orthonormal again.
+  const lerp = (p, q) => p.map((v, k) => v * (1 - fraction) + q[k] * fraction);
+  const z = normalized(lerp(a.rotation[2], b.rotation[2])), x = normalized(cross(lerp(a.rotation[1], b.rotation[1]), z));
+  return {rotation: [x, cross(z, x), z], position: lerp(a.position, b.position)};
 }
 
-function turned(vector, axis, angle) {
+function rotated(vector, axis, angle) {
+  // Rodrigues' formula.
   const c = Math.cos(angle), s = Math.sin(angle), along = dot(axis, vector) * (1 - c);
-  return plus(plus(vector.map((v) => v * c), cross(axis, vector), s), axis, along);
+  return addScaled(addScaled(vector.map((v) => v * c), cross(axis, vector), s), axis, along);
 }
 
 class Orbit {
-  // A camera that turns around a point in front of it, about the first view's upward direction.
+  // A camera that orbits a pivot in front of it, about the upward direction of the first view.
   constructor(first, distance) {
     this.first = first;
     this.firstDistance = distance;
@@ -39,25 +40,25 @@ class Orbit {
   set(camera, distance = this.distance) {
     this.rotation = camera.rotation;
     this.distance = distance;
-    this.pivot = plus(camera.position, camera.rotation[2], distance);
+    this.pivot = addScaled(camera.position, camera.rotation[2], distance);
   }
 
   get camera() {
-    return {rotation: this.rotation, position: plus(this.pivot, this.rotation[2], -this.distance)};
+    return {rotation: this.rotation, position: addScaled(this.pivot, this.rotation[2], -this.distance)};
   }
 
-  turn(right, down) {
+  rotate(right, down) {
     const slope = dot(this.rotation[2], this.up), tilt = Math.asin(Math.max(-1, Math.min(1, slope)));
-    const pitch = Math.max(-1.5, Math.min(1.5, tilt + down)) - tilt; // never over the pole
-    const pitched = this.rotation.map((row) => turned(row, this.rotation[0], pitch));
-    this.rotation = pitched.map((row) => turned(row, this.up, right));
+    const pitch = Math.max(-1.5, Math.min(1.5, tilt + down)) - tilt; // stops before the pole
+    const pitched = this.rotation.map((row) => rotated(row, this.rotation[0], pitch));
+    this.rotation = pitched.map((row) => rotated(row, this.up, right));
   }
 
-  shift(right, down) {
-    this.pivot = plus(plus(this.pivot, this.rotation[0], -right * this.distance), this.rotation[1], -down * this.distance);
+  pan(right, down) {
+    this.pivot = addScaled(addScaled(this.pivot, this.rotation[0], -right * this.distance), this.rotation[1], -down * this.distance);
   }
 
-  approach(factor) {
+  zoom(factor) {
     this.distance = Math.max(1e-3, this.distance * factor);
   }
 }

@@ -1,7 +1,7 @@
 const element = (id) => document.getElementById(id);
 const SCENE = JSON.parse(element('scene').textContent);
 const START = SCENE.start, NAMES = ['static', 'dynamic'], BRANCHES = NAMES.map((name) => SCENE.branches[name]);
-const WIDTH = 2048; // texels a row
+const WIDTH = 2048; // texels per row
 const lastKey = SCENE.keys - 1;
 
 function fail(text) {
@@ -10,15 +10,15 @@ function fail(text) {
   throw new Error(text);
 }
 
-// Numbers ------------------------------------------------------------------------------------------------------------
+// Data ---------------------------------------------------------------------------------------------------------------
 
-async function unpacked(name, array, Kind) {
+async function unpacked(name, array, TypedArray) {
   const text = atob(element(`${name}-${array}`).textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   element(`${name}-${array}`).remove();
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
-  const size = Kind.BYTES_PER_ELEMENT, count = planes.length / size, values = new Kind(count);
+  const size = TypedArray.BYTES_PER_ELEMENT, count = planes.length / size, values = new TypedArray(count);
   for (let p = 0; p < size; p++) for (let i = 0; i < count; i++) values[i] |= planes[p * count + i] << (8 * p);
   const shape = SCENE.branches[name].shapes[array], frame = shape[1] * shape[2];
   for (let i = frame; i < count; i++) values[i] += values[i - frame]; // wraps around
@@ -26,7 +26,7 @@ async function unpacked(name, array, Kind) {
 }
 
 function meansOf(geometry, {shapes, means}) {
-  // One Float32Array a key time, for the sorter.
+  // One Float32Array per key time, for the sorter.
   const [keys, count] = shapes.geometry, [low, high] = means, step = low.map((v, k) => (high[k] - v) / 2097151);
   return Array.from({length: keys}, (_, key) => {
     const out = new Float32Array(3 * count);
@@ -41,7 +41,7 @@ function meansOf(geometry, {shapes, means}) {
 }
 
 function layersOfRest(rest, [count, bases]) {
-  // Texels (R, G, B, unused), a layer a coefficient.
+  // Texels (R, G, B, unused), one layer per coefficient.
   const out = new Uint8Array(bases * count * 4);
   for (let i = 0; i < count; i++) for (let k = 0; k < bases; k++) for (let c = 0; c < 3; c++) {
     out[(k * count + i) * 4 + c] = rest[(i * bases + k) * 3 + c];
@@ -53,12 +53,12 @@ function layersOfRest(rest, [count, bases]) {
 
 const canvas = element('canvas');
 const gl = canvas.getContext('webgl2', {alpha: false, antialias: false, preserveDrawingBuffer: true})
-  || fail('This page needs WebGL2, which this browser does not have or has turned off.');
+  || fail('This page needs WebGL2, which this browser does not support or has disabled.');
 
 function compiled() {
   const program = gl.createProgram();
-  for (const [kind, id] of [[gl.VERTEX_SHADER, 'vertex-shader'], [gl.FRAGMENT_SHADER, 'fragment-shader']]) {
-    const shader = gl.createShader(kind);
+  for (const [type, id] of [[gl.VERTEX_SHADER, 'vertex-shader'], [gl.FRAGMENT_SHADER, 'fragment-shader']]) {
+    const shader = gl.createShader(type);
     gl.shaderSource(shader, element(id).textContent.trim());
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) fail(`${id}: ${gl.getShaderInfoLog(shader)}`);
@@ -75,19 +75,19 @@ const uniform = (name) => gl.getUniformLocation(program, name);
 gl.useProgram(program);
 
 function texture(unit, name, values, count, layers, isInteger) {
-  const [inside, outside, kind] = isInteger
+  const [internalFormat, format, type] = isInteger
     ? [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT] : [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
   const height = Math.max(1, Math.ceil(count / WIDTH));
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
-  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, inside, WIDTH, height, Math.max(1, layers));
+  gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, internalFormat, WIDTH, height, Math.max(1, layers));
   for (const end of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
     gl.texParameteri(gl.TEXTURE_2D_ARRAY, end, gl.NEAREST);
   }
   const whole = new values.constructor(WIDTH * height * 4);
   for (let layer = 0; layer < layers; layer++) {
     whole.set(values.subarray(layer * count * 4, (layer + 1) * count * 4));
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, WIDTH, height, 1, outside, kind, whole);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer, WIDTH, height, 1, format, type, whole);
   }
   gl.uniform1i(uniform(name), unit);
 }
@@ -95,18 +95,18 @@ function texture(unit, name, values, count, layers, isInteger) {
 async function upload() {
   const means = [];
   for (const [branch, name] of NAMES.entries()) {
-    const facts = BRANCHES[branch], {shapes} = facts, count = shapes.geometry[1];
+    const metadata = BRANCHES[branch], {shapes} = metadata, count = shapes.geometry[1];
     const geometry = await unpacked(name, 'geometry', Uint32Array);
-    means.push(meansOf(geometry, facts));
+    means.push(meansOf(geometry, metadata));
     texture(branch, `${name}Geometry`, geometry, count, shapes.geometry[0], true);
     texture(2 + branch, `${name}Colors`, await unpacked(name, 'colors', Uint8Array), count, shapes.colors[0], false);
     const rest = layersOfRest(await unpacked(name, 'rest', Uint8Array), shapes.rest);
     texture(4 + branch, `${name}Rest`, rest, count, shapes.rest[1], false);
-    gl.uniform3fv(uniform(`lowest[${branch}]`), facts.means[0]);
-    gl.uniform3fv(uniform(`span[${branch}]`), facts.means[1].map((v, k) => v - facts.means[0][k]));
-    gl.uniform2fv(uniform(`sizes[${branch}]`), facts.log_scales);
-    gl.uniform2fv(uniform(`colors[${branch}]`), facts.colors);
-    gl.uniform2fv(uniform(`rests[${branch}]`), facts.rest);
+    gl.uniform3fv(uniform(`lowest[${branch}]`), metadata.means[0]);
+    gl.uniform3fv(uniform(`span[${branch}]`), metadata.means[1].map((v, k) => v - metadata.means[0][k]));
+    gl.uniform2fv(uniform(`sizes[${branch}]`), metadata.log_scales);
+    gl.uniform2fv(uniform(`colors[${branch}]`), metadata.colors);
+    gl.uniform2fv(uniform(`rests[${branch}]`), metadata.rest);
     gl.uniform1i(uniform(`restBases[${branch}]`), shapes.rest[1]);
   }
   gl.uniform1i(uniform('lastKey'), lastKey);
@@ -114,23 +114,23 @@ async function upload() {
   return means;
 }
 
-// What is shown ------------------------------------------------------------------------------------------------------
+// Playback -----------------------------------------------------------------------------------------------------------
 
-const wanted = new URLSearchParams(location.hash.slice(1)); // e.g. #time=0.5&play=0&layers=dynamic
-const state = {time: 0, playing: wanted.get('play') !== '0', sorting: false, count: 0, changed: true};
+const options = new URLSearchParams(location.hash.slice(1)); // e.g. #time=0.5&play=0&layers=dynamic
+const state = {time: 0, playing: options.get('play') !== '0', sorting: false, count: 0, changed: true};
 const orbit = new Orbit(cameraOf(START.viewmat), START.pivot);
 const track = START.track.map(cameraOf);
 const numberOf = (value) => Number.isFinite(parseFloat(value)) ? Math.min(1, Math.max(0, parseFloat(value))) : 0;
-state.time = numberOf(wanted.get('time'));
-if (wanted.has('layers')) for (const name of NAMES) element(name).checked = wanted.get('layers').includes(name);
-if (wanted.get('controls') === '0') element('controls').hidden = true;
-element('follow').checked = wanted.get('follow') === '1' && track.length > 0;
+state.time = numberOf(options.get('time'));
+if (options.has('layers')) for (const name of NAMES) element(name).checked = options.get('layers').includes(name);
+if (options.get('controls') === '0') element('controls').hidden = true;
+element('follow').checked = options.get('follow') === '1' && track.length > 0;
 element('follow-label').hidden = track.length === 0;
 
 function currentCamera() {
   if (element('follow').checked) {
-    const place = state.time * (track.length - 1), before = Math.min(Math.floor(place), track.length - 1);
-    orbit.set(between(track[before], track[Math.min(before + 1, track.length - 1)], place - before));
+    const position = state.time * (track.length - 1), before = Math.min(Math.floor(position), track.length - 1);
+    orbit.set(interpolated(track[before], track[Math.min(before + 1, track.length - 1)], position - before));
   }
   return orbit.camera;
 }
@@ -143,7 +143,7 @@ function resized() {
   state.changed = true;
 }
 
-function draw(camera, position) {
+function render(camera, position) {
   const [width, height] = START.size, [fx, fy, cx, cy] = START.intrinsics;
   const zoom = Math.min(canvas.width / width, canvas.height / height);
   const r = camera.rotation, t = r.map((row) => -dot(row, camera.position));
@@ -166,21 +166,21 @@ worker.onmessage = ({data}) => {
   gl.bufferData(gl.ARRAY_BUFFER, data.order, gl.DYNAMIC_DRAW);
   state.count = data.order.length;
   state.sorting = false;
-  state.answered = true;
-  state.drawn = false;
+  state.sorted = true;
+  state.rendered = false;
   element('message').textContent = '';
 };
 
 let before = performance.now(), sortedFor = '';
 function frame(now) {
-  const passed = Math.min(0.1, (now - before) / 1000);
+  const elapsed = Math.min(0.1, (now - before) / 1000);
   before = now;
   if (state.playing && lastKey > 0) {
-    state.time = (state.time + passed * Number(element('speed').value) / START.seconds) % 1;
+    state.time = (state.time + elapsed * Number(element('speed').value) / START.seconds) % 1;
     state.changed = true;
   }
   resized();
-  if (state.changed || !state.drawn) {
+  if (state.changed || !state.rendered) {
     const camera = currentCamera(), position = state.time * lastKey, z = camera.rotation[2];
     const shown = NAMES.map((name) => element(name).checked), key = JSON.stringify([camera, position, shown]);
     if (!state.sorting && key !== sortedFor) {
@@ -188,10 +188,10 @@ function frame(now) {
       sortedFor = key;
       worker.postMessage({view: [...z, -dot(z, camera.position)], position, shown});
     }
-    draw(camera, position);
+    render(camera, position);
     state.changed = key !== sortedFor;
-    state.drawn = true;
-    if (state.answered) document.body.dataset.state = state.sorting || state.changed ? 'playing' : 'settled';
+    state.rendered = true;
+    if (state.sorted) document.body.dataset.state = state.sorting || state.changed ? 'playing' : 'settled';
     element('time').value = state.time;
     element('clock').textContent = `${(state.time * START.seconds).toFixed(2)} / ${START.seconds.toFixed(1)} s`;
     element('play').textContent = state.playing ? 'pause' : 'play';
@@ -199,16 +199,16 @@ function frame(now) {
   requestAnimationFrame(frame);
 }
 
-// What a viewer does -------------------------------------------------------------------------------------------------
+// Controls -----------------------------------------------------------------------------------------------------------
 
-const touch = () => { state.changed = true; };
-const toggle = () => { state.playing = !state.playing; touch(); };
-const home = () => { element('follow').checked = false; orbit.reset(); touch(); };
+const update = () => { state.changed = true; };
+const toggle = () => { state.playing = !state.playing; update(); };
+const home = () => { element('follow').checked = false; orbit.reset(); update(); };
 const pointers = new Map();
 element('play').onclick = toggle;
 element('home').onclick = home;
-element('time').oninput = () => { state.playing = false; state.time = Number(element('time').value); touch(); };
-for (const id of [...NAMES, 'follow']) element(id).onchange = touch;
+element('time').oninput = () => { state.playing = false; state.time = Number(element('time').value); update(); };
+for (const id of [...NAMES, 'follow']) element(id).onchange = update;
 canvas.oncontextmenu = (event) => event.preventDefault();
 canvas.onpointerdown = (event) => {
   canvas.setPointerCapture(event.pointerId);
@@ -222,22 +222,22 @@ canvas.onpointermove = (event) => {
   const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
   element('follow').checked = false;
   if (other) {
-    const apart = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
-    orbit.approach(apart(last) / Math.max(1, apart([event.clientX, event.clientY])));
-    orbit.shift(right / 2, down / 2);
+    const distance = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+    orbit.zoom(distance(last) / Math.max(1, distance([event.clientX, event.clientY])));
+    orbit.pan(right / 2, down / 2);
   } else if (event.buttons & 2 || event.shiftKey) {
-    orbit.shift(right, down);
+    orbit.pan(right, down);
   } else {
-    orbit.turn(3 * right, -3 * down);
+    orbit.rotate(3 * right, -3 * down);
   }
   pointers.set(event.pointerId, [event.clientX, event.clientY]);
-  touch();
+  update();
 };
 canvas.addEventListener('wheel', (event) => {
   event.preventDefault();
   element('follow').checked = false;
-  orbit.approach(Math.exp(event.deltaY / 800));
-  touch();
+  orbit.zoom(Math.exp(event.deltaY / 800));
+  update();
 }, {passive: false});
 addEventListener('keydown', (event) => {
   if (event.target !== document.body && event.target !== canvas) return;
@@ -247,11 +247,11 @@ addEventListener('keydown', (event) => {
   else if (event.key === 'ArrowLeft' || event.key === 'ArrowRight') {
     state.playing = false;
     state.time = Math.min(1, Math.max(0, state.time + (event.key === 'ArrowLeft' ? -step : step)));
-    touch();
+    update();
   } else return;
   event.preventDefault();
 });
-canvas.addEventListener('webglcontextlost', () => fail('The graphics card was taken away; load the page again.'));
+canvas.addEventListener('webglcontextlost', () => fail('The graphics context was lost; reload the page.'));
 
 upload().then((means) => {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());

@@ -1,11 +1,11 @@
-// Worker: sorts the Gaussians that can be seen by depth, the farthest first.
-// It gets {means: [static, dynamic]} once, then {view, position, shown} as often as it answers.
+// Worker: sorts the Gaussians in front of the camera by depth, the farthest first.
+// It receives {means: [static, dynamic]} once, then {view, position, shown}, and answers each with {order, position}.
 'use strict';
 const BUCKETS = 65536, DYNAMIC = 0x80000000, NEAR = 0.01;
 let means, depths, rows;
 
 function meanDepths(frames, position, view, first, bit) {
-  // Depth of each mean between two key times; what is behind the camera is left out.
+  // Depth of each mean between two key times; Gaussians behind the camera are omitted.
   const before = Math.min(Math.floor(position), frames.length - 1);
   const a = frames[before], b = frames[Math.min(before + 1, frames.length - 1)];
   const u = a === b ? 0 : position - before, v = 1 - u;
@@ -27,7 +27,7 @@ function sorted(count) {
     nearest = Math.min(nearest, depths[i]);
     farthest = Math.max(farthest, depths[i]);
   }
-  // Buckets are even in 1 / depth: finer where things are near.
+  // Buckets are uniform in 1 / depth: finer close to the camera.
   const high = 1 / nearest, low = 1 / farthest, scale = high > low ? (BUCKETS - 1) / (high - low) : 0;
   const bucket = new Uint16Array(count), starts = new Uint32Array(BUCKETS + 1), order = new Uint32Array(count);
   for (let i = 0; i < count; i++) {

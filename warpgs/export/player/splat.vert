@@ -1,15 +1,15 @@
 #version 300 es
-// A Gaussian as a quad on the screen (EWA projection; the same formulas as warpgs/kernels/projection.py).
+// Renders a Gaussian as a quad on the screen (EWA projection, with the formulas of warpgs/kernels/projection.py).
 precision highp float;
 precision highp int;
 precision highp usampler2DArray;
 precision highp sampler2DArray;
 
-uniform usampler2DArray staticGeometry, dynamicGeometry; // a layer a key time
-uniform sampler2DArray staticColors, dynamicColors;      // a layer a key time
-uniform sampler2DArray staticRest, dynamicRest;          // a layer a coefficient
-uniform vec3 lowest[2], span[2];                         // of means; [0] static, [1] dynamic
-uniform vec2 sizes[2], colors[2], rests[2];              // lowest and highest
+uniform usampler2DArray staticGeometry, dynamicGeometry; // one layer per key time
+uniform sampler2DArray staticColors, dynamicColors;      // one layer per key time
+uniform sampler2DArray staticRest, dynamicRest;          // one layer per coefficient
+uniform vec3 lowest[2], span[2];                         // bounds of the means; [0] static, [1] dynamic
+uniform vec2 sizes[2], colors[2], rests[2];              // minimum and maximum
 uniform int restBases[2];
 uniform float position;    // time in keys
 uniform int lastKey;
@@ -18,9 +18,9 @@ uniform vec4 intrinsics;   // fx, fy, cx, cy [px]
 uniform vec2 viewport;     // [px]
 uniform bool compensate;
 
-in uint row;               // the highest bit tells dynamic ones
+in uint row;               // the highest bit marks dynamic Gaussians
 
-out vec2 place;            // in standard deviations
+out vec2 offset;           // from the centre, in standard deviations
 flat out vec4 color;
 
 const float LOW_PASS = 0.3, NEAR = 0.01, MARGIN = 0.3, WIDTH = 11.0;
@@ -36,7 +36,7 @@ vec4 rotation(uint word) {
   }
 }
 
-mat3 matrixOf(vec4 q) { // of (w, x, y, z)
+mat3 matrixOf(vec4 q) { // q = (w, x, y, z)
   float w = q.x, x = q.y, y = q.z, z = q.w;
   return mat3(
     1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
@@ -74,28 +74,28 @@ vec3 viewDependent(ivec2 texel, vec3 d, int branch) {
 }
 
 void main() {
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside, unless all goes well
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside of the image until the Gaussian is known to be visible
   int branch = int(row >> 31), index = int(row & 0x7fffffffu);
   ivec2 texel = ivec2(index & 2047, index >> int(WIDTH));
   int before = min(int(position), lastKey), after = min(before + 1, lastKey);
-  float share = position - float(before);
+  float fraction = position - float(before);
 
   vec3 world, scales;
-  vec4 turn, shade;
+  vec4 quat, shade;
   if (branch == 1) {
     uvec4 a = texelFetch(dynamicGeometry, ivec3(texel, before), 0);
     uvec4 b = texelFetch(dynamicGeometry, ivec3(texel, after), 0);
     vec4 qa = rotation(a.z), qb = rotation(b.z);
-    world = mix(mean(a, 1), mean(b, 1), share);
-    turn = normalize(mix(qa, dot(qa, qb) < 0.0 ? -qb : qb, share));
-    scales = exp(mix(logScales(a.w, 1), logScales(b.w, 1), share));
+    world = mix(mean(a, 1), mean(b, 1), fraction);
+    quat = normalize(mix(qa, dot(qa, qb) < 0.0 ? -qb : qb, fraction));
+    scales = exp(mix(logScales(a.w, 1), logScales(b.w, 1), fraction));
     shade = texelFetch(dynamicColors, ivec3(texel, 0), 0);
   } else {
     uvec4 a = texelFetch(staticGeometry, ivec3(texel, 0), 0);
     world = mean(a, 0);
-    turn = rotation(a.z);
+    quat = rotation(a.z);
     scales = exp(logScales(a.w, 0));
-    shade = mix(texelFetch(staticColors, ivec3(texel, before), 0), texelFetch(staticColors, ivec3(texel, after), 0), share);
+    shade = mix(texelFetch(staticColors, ivec3(texel, before), 0), texelFetch(staticColors, ivec3(texel, after), 0), fraction);
   }
 
   vec3 t = (view * vec4(world, 1.0)).xyz;
@@ -104,7 +104,7 @@ void main() {
   vec2 margin = MARGIN * 0.5 * viewport / focal;
   vec2 kept = clamp(slope, -center / focal - margin, (viewport - center) / focal + margin);
   mat3 toCamera = mat3(view);
-  mat3 spread = toCamera * matrixOf(turn) * mat3(scales.x, 0.0, 0.0, 0.0, scales.y, 0.0, 0.0, 0.0, scales.z);
+  mat3 spread = toCamera * matrixOf(quat) * mat3(scales.x, 0.0, 0.0, 0.0, scales.y, 0.0, 0.0, 0.0, scales.z);
   vec3 alongX = focal.x / t.z * (vec3(spread[0].x, spread[1].x, spread[2].x) - kept.x * vec3(spread[0].z, spread[1].z, spread[2].z));
   vec3 alongY = focal.y / t.z * (vec3(spread[0].y, spread[1].y, spread[2].y) - kept.y * vec3(spread[0].z, spread[1].z, spread[2].z));
   float a = dot(alongX, alongX), b = dot(alongX, alongY), c = dot(alongY, alongY);
@@ -126,6 +126,6 @@ void main() {
   vec3 origin = -transpose(toCamera) * view[3].xyz;
   vec3 own = mix(vec3(colors[branch].x), vec3(colors[branch].y), shade.rgb);
   color = vec4(max(own + viewDependent(texel, normalize(world - origin), branch), 0.0), opacity);
-  place = corner;
+  offset = corner;
   gl_Position = vec4(2.0 * pixel.x / viewport.x - 1.0, 1.0 - 2.0 * pixel.y / viewport.y, 0.0, 1.0);
 }

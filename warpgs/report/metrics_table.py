@@ -1,4 +1,4 @@
-"""Figures of runs, beside each other."""
+"""Rows of the tables that compare runs: metrics, and settings that differ."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -6,7 +6,7 @@ from typing import Any
 
 from warpgs.config import PRESETS, TrainConfig
 
-from .record import Record
+from .evaluated_run import EvaluatedRun
 
 HIGHER = {
     "psnr",
@@ -20,9 +20,9 @@ HIGHER = {
     "fps",
 }
 LOWER = {"lpips", "flicker", "train_seconds", "peak_bytes"}
-"""Figures of which more, or less, is better."""
+"""Metrics of which higher, or lower, values are better."""
 
-NAMES = {
+TITLES = {
     "psnr": "PSNR [dB]",
     "ssim": "SSIM",
     "lpips": "LPIPS",
@@ -32,33 +32,33 @@ NAMES = {
     "ssim_dynamic": "SSIM, dynamic region",
     "masked_psnr": "PSNR, co-visible [dB]",
     "masked_ssim": "SSIM, co-visible",
-    "fps": "frames a second",
-    "lpips_net": "network of LPIPS",
+    "fps": "FPS",
+    "lpips_net": "LPIPS network",
     "num_views": "views",
     "train_seconds": "training time [h:m:s]",
     "peak_bytes": "peak memory",
     "num_static": "static Gaussians",
     "num_dynamic": "dynamic Gaussians",
 }
-"""Figures in words; others are called as in metrics.json."""
+"""Titles of metrics; others keep their names in metrics.json."""
 
-OWN = {"out", "resume", "preset", "lpips"}
-"""Settings that say nothing of how a run was trained."""
+UNRELATED = {"out", "resume", "preset", "lpips"}
+"""Settings that do not affect training."""
 
 Row = tuple[str, list[Any], list[str]]
-"""Name, values, and the values in words."""
+"""Name, values, and formatted values."""
 
 
-def summary_rows(records: Sequence[Record]) -> Iterator[Row]:
-    """Every figure of metrics.json that a run has, in the order of the first run's."""
-    names = dict.fromkeys(name for record in records for name in record.metrics)
+def summary_rows(runs: Sequence[EvaluatedRun]) -> Iterator[Row]:
+    """One row per metric of metrics.json that any run has, in the order of the first run."""
+    names = dict.fromkeys(name for run in runs for name in run.metrics)
     for name in names:
-        values = [record.metrics.get(name) for record in records]
+        values = [run.metrics.get(name) for run in runs]
         if any(value is not None for value in values):
-            yield name, values, [in_words(name, value) for value in values]
-    speeds = [_speed(record.metrics) for record in records]
+            yield name, values, [formatted(name, value) for value in values]
+    speeds = [_speed(run.metrics) for run in runs]
     if any(speed is not None for speed in speeds):
-        yield "iterations a second", speeds, ["" if speed is None else f"{speed:.1f}" for speed in speeds]
+        yield "iterations per second", speeds, ["" if speed is None else f"{speed:.1f}" for speed in speeds]
 
 
 def _speed(metrics: dict[str, Any]) -> float | None:
@@ -68,8 +68,8 @@ def _speed(metrics: dict[str, Any]) -> float | None:
     return done / seconds
 
 
-def in_words(name: str, value: Any) -> str:
-    """A figure for people: times and sizes in units, numbers with as many digits as mean something."""
+def formatted(name: str, value: Any) -> str:
+    """A metric as text: times and sizes with units, numbers with their significant digits."""
     if value is None:
         return "not measured"
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -86,13 +86,13 @@ def in_words(name: str, value: Any) -> str:
 
 
 def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:
-    """Settings that differ between runs; of one run, those that are not its preset's."""
+    """Settings that differ between runs; for a single run, those that differ from its preset."""
     flat = [dict(_flat("", config)) for config in configs]
-    shown = list(flat)
+    rows = list(flat)
     if len(flat) == 1:
         flat.append(dict(_flat("", PRESETS[configs[0].preset])))
-    names = [name for name in flat[0] if name not in OWN and len({repr(values[name]) for values in flat}) > 1]
-    return [(name, [str(values[name]) for values in shown]) for name in names]
+    names = [name for name in flat[0] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
+    return [(name, [str(values[name]) for values in rows]) for name in names]
 
 
 def _flat(prefix: str, part: Any) -> Iterator[tuple[str, Any]]:

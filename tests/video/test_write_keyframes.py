@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.viewer import keyframes
+from warpgs.video import keyframes
 
 CAMERAS = [
     Camera(torch.eye(4) + 0.01 * k, torch.tensor([[50.0 + k, 0, 32], [0, 50, 24], [0, 0, 1]]), 64, 48, k / 2)
@@ -29,22 +29,22 @@ def test_keyframes_are_saved_exactly_and_in_order(path):
         assert (keyframe["width"], keyframe["height"], keyframe["time"]) == (*camera.size, camera.time)
 
 
-def test_the_file_has_the_agreed_fields(path):
+def test_the_file_has_the_expected_fields(path):
     first = json.loads(path.read_text())["keyframes"][0]
     assert set(first) == {"time", "viewmat", "K", "width", "height"}
 
 
-def test_a_path_goes_into_the_run_folder(tmp_path):
+def test_a_path_is_saved_in_the_run_folder(tmp_path):
     assert keyframes.path_of(tmp_path, "a b-c_1") == tmp_path / "paths" / "a b-c_1.json"
 
 
-def test_no_path_is_written_over_another(tmp_path, path):
+def test_a_path_never_overwrites_another(tmp_path, path):
     assert keyframes.path_of(tmp_path, "fly").name == "fly-2.json"
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", "a\\b", ".hidden", "a.json", "\0", "x" * 65, "a\n"])
-def test_a_name_that_could_lead_elsewhere_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="a path's name is of letters"):
+def test_a_name_that_could_lead_out_of_the_folder_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="the name of a path must have 1 to 64 letters"):
         keyframes.path_of(tmp_path, name)
 
 

@@ -1,0 +1,47 @@
+"""Formats whose files hold one time: one file per time and layer."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from warpgs.files import remove_numbered
+from warpgs.progress import progress
+from warpgs.video.camera_paths import evenly_spaced
+
+from .cloud import Cloud
+from .job import Job, Writer
+
+OPTIONS = ("time", "frames", "layers")
+
+
+def per_time(suffix: str, write_cloud: Callable[[Path, Cloud], int]) -> Writer:
+    """A format with one file per time and layer.
+
+    Args:
+        suffix: End of the file names, with its dot.
+        write_cloud: Writes a cloud and returns the size of the file [bytes].
+    """
+    return Writer(partial(_write, suffix, write_cloud), OPTIONS)
+
+
+def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], job: Job) -> str:
+    options, folder = job.options, job.folder
+    times = [options.time or 0.0] if options.frames is None else evenly_spaced(options.frames)
+    names = {"all": ["scene"], "apart": ["static", "dynamic"]}.get(options.layers, [options.layers])
+    if options.frames is not None:
+        for name in names:  # an earlier sequence may have been longer
+            remove_numbered(folder, partial(_numbered, name, suffix))
+    num_files, size, max_count = 0, 0, 0
+    for k, time in enumerate(progress(times, "exporting", options.quiet or len(times) == 1)):
+        cloud = job.clouds.at(time)
+        for name in names:
+            rows = cloud.finite if name == "scene" else cloud.finite & (cloud.is_dynamic == (name == "dynamic"))
+            file = name + suffix if options.frames is None else _numbered(name, suffix, k)
+            size += write_cloud(folder / file, cloud.select(rows))
+            num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
+    files = "1 file of" if num_files == 1 else f"{num_files} files of up to"
+    return f"{files} {max_count:,} Gaussians in {folder}, {size / 1e6:.1f} MB"
+
+
+def _numbered(name: str, suffix: str, number: int) -> str:
+    return f"{name}_{number:05d}{suffix}"

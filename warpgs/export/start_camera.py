@@ -1,0 +1,91 @@
+"""Cameras of an export: those of the run's capture, or default ones if the capture cannot be opened."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture
+from warpgs.video import camera_paths
+
+from .cloud import Cloud
+from .clouds import Clouds
+
+SIDES = ((0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))
+"""Sides that default cameras look from, as directions (x, z)."""
+
+NUM_SAMPLES = 24
+"""Number of cameras that decide which Gaussians are visible."""
+
+
+@dataclass(frozen=True)
+class StartView:
+    """How a page starts.
+
+    Attributes:
+        title: Title of the page.
+        size: (width, height) of the image that ``intrinsics`` refer to [px].
+        intrinsics: fx, fy, cx, cy [px].
+        viewmat: [4, 4] world to camera, of the first view.
+        pivot: Distance from the camera to the point that it orbits [scene units].
+        track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
+        seconds: Duration of the scene [s].
+        antialias: Whether opacities compensate for the low-pass filter.
+    """
+
+    title: str
+    size: tuple[int, int]
+    intrinsics: tuple[float, float, float, float]
+    viewmat: list[list[float]]
+    pivot: float
+    track: list[list[list[float]]]
+    seconds: float
+    antialias: bool
+
+
+def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
+    """Training cameras, evenly spaced in the order of time; without a capture, default cameras from four sides."""
+    if capture is not None:
+        names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+        chosen = camera_paths.evenly_spaced_indices(len(names), NUM_SAMPLES)
+        return [capture.cameras[names[k]] for k in chosen]
+    times = camera_paths.evenly_spaced(NUM_SAMPLES)
+    scene = camera_paths.BoundingSphere.around(_means(clouds.at(0.5)))
+    return [camera_paths.default_camera(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
+
+
+def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: float) -> StartView:
+    """The start view of a page: the middle evaluation view, else the middle training view, else a default camera.
+
+    Args:
+        clouds: The scene.
+        capture: Capture of the run, if there is one.
+        keys: Number of key times.
+        seconds: Duration of the scene [s].
+    """
+    cloud = clouds.at(0.5)
+    cloud = cloud.select(cloud.finite)
+    track: list[Camera] = []
+    camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
+    if capture is not None:
+        names = capture.val or capture.train
+        camera, track = capture.cameras[names[len(names) // 2]], camera_paths.training_path(capture, keys)
+    K = camera.K.tolist()
+    dynamic = cloud.select(cloud.is_dynamic) if cloud.is_dynamic.any() else cloud
+    config = clouds.scene.config
+    return StartView(
+        title=config.out.resolve().name if config.out else "scene",
+        size=camera.size,
+        intrinsics=(K[0][0], K[1][1], K[0][2], K[1][2]),
+        viewmat=camera.viewmat.tolist(),
+        pivot=camera_paths.focus(camera, _means(dynamic)),
+        track=[c.viewmat.tolist() for c in track],
+        seconds=seconds,
+        antialias=config.antialias,
+    )
+
+
+def _means(cloud: Cloud) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(cloud.means))

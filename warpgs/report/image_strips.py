@@ -1,0 +1,107 @@
+"""Ground truth, rendered image and error image of views."""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from warpgs import visualize
+from warpgs.progress import progress
+from warpgs.runs.run import Device, Run
+
+from .evaluated_run import EvaluatedRun
+
+MAX_WIDTH = 480
+"""Maximum width of an embedded image [px]."""
+
+QUALITY = 88
+"""JPEG quality."""
+
+PANELS = 5
+"""Panels of an image that the evaluation saves: truth, joint, static, dynamic, error."""
+
+
+class Strip(NamedTuple):
+    """Images of one view, as data URIs."""
+
+    truth: str
+    rendered: str
+    error: str
+
+
+class Strips(NamedTuple):
+    """Image strips of a run.
+
+    Attributes:
+        by_view: Strips by name of the view.
+        note: A note to show with them; may be empty.
+    """
+
+    by_view: dict[str, Strip]
+    note: str
+
+
+def saved_views(run: EvaluatedRun) -> set[str]:
+    """Names of the views of which the evaluation saved images in the run folder."""
+    return {view.name for view in run.views if _read_saved(run.folder, view.name) is not None}
+
+
+def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Device | None, quiet: bool) -> Strips:
+    """Strips of views, rendered from the newest checkpoint.
+
+    Args:
+        evaluated: The run.
+        names: Names of the views.
+        device: Device to render on; CUDA if None and there is a GPU.
+        quiet: Whether to hide the progress bar.
+
+    Raises:
+        ValueError: If the capture or the checkpoint cannot be read.
+        OSError: Likewise.
+    """
+    run = Run.open(evaluated.folder, device)
+    capture, scene = run.open_capture(quiet), run.trained_scene()
+    strips = {}
+    for name in progress(names, f"rendering {evaluated.label}", quiet):
+        if name not in capture.cameras:
+            raise ValueError(f"{capture.name} has no view {name}")
+        frame = capture.frame(name)
+        truth = frame.image.to(scene.device).float() / 255.0
+        image = scene.render(frame.camera.to(scene.device)).joint.image.clamp(0, 1)
+        images = visualize.to_bytes(truth), visualize.to_bytes(image), visualize.error_image(image, truth)
+        strips[name] = Strip(*map(data_uri, images))
+    measured, newest = evaluated.metrics.get("iterations"), scene.metadata.iteration
+    note = "" if measured == newest else f"the images are of iteration {newest}, the metrics of iteration {measured}"
+    return Strips(strips, note)
+
+
+def saved_strips(run: EvaluatedRun, names: Sequence[str], reason: str) -> Strips:
+    """Strips of those views of which the evaluation saved images; ``reason`` says why they are not rendered."""
+    strips = {name: strip for name in names if (strip := _read_saved(run.folder, name)) is not None}
+    return Strips(strips, f"only views whose images the evaluation saved: {reason}")
+
+
+def _read_saved(folder: Path, name: str) -> Strip | None:
+    root = (folder / "images").resolve()
+    path = (root / f"{name}.png").resolve()
+    if path.parent != root or not path.is_file():
+        return None
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None or image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:
+        return None
+    panels = np.split(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[visualize.CAPTION_HEIGHT :], PANELS, axis=1)
+    return Strip(*(data_uri(np.ascontiguousarray(panels[k])) for k in (0, 1, 4)))
+
+
+def data_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
+    """An RGB image as a data URI; scaled down to ``MAX_WIDTH``."""
+    height, width = image.shape[:2]
+    if width > MAX_WIDTH:
+        size = (MAX_WIDTH, max(1, round(height * MAX_WIDTH / width)))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"
