@@ -30,7 +30,7 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
         sys.stderr.write(f"{prog}: {one_line(error)}\n")
         return FAILED
     except KeyboardInterrupt as stop:
-        sys.stderr.write(f"{prog}: {stop or 'stopped'}\n")
+        sys.stderr.write(f"{prog}: {str(stop) or 'stopped'}\n")
         return INTERRUPTED
     except Exception as error:
         if not is_out_of_memory(error):
