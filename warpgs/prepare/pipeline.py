@@ -52,8 +52,7 @@ def prepare(
     check_options(source, root, options)
     plain = json.loads(json.dumps({"source": source, **asdict(options)}, default=lambda path: str(path.resolve())))
     journal = Journal(root, plain, force, log)
-    was_finished = journal.is_finished
-    if not was_finished:
+    if not (was_finished := journal.is_finished):
         with journal.explain_full_disk():
             _run_steps(source, options, journal)
     report = journal.report()
