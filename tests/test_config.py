@@ -1,10 +1,14 @@
 """Numbers out of range are refused by name before training starts."""
 
 import dataclasses
+import json
+import subprocess
+import sys
 
 import pytest
 
 from warpgs.config import PRESETS, TrainConfig, scaled, validate
+from warpgs.runs.config_file import NAME, read_config, write_config
 
 
 def changed(name, value, config=PRESETS["paper"]):
@@ -56,3 +60,17 @@ def test_a_schedule_with_only_pretraining_is_refused():
     schedule = dataclasses.replace(TrainConfig().schedule, stage1=0, stage2=0)
     with pytest.raises(ValueError, match="nothing to train"):
         validate(dataclasses.replace(TrainConfig(), schedule=schedule))
+
+
+def test_the_config_imports_neither_torch_nor_numpy():
+    program = "import sys; import warpgs.config; print({'torch', 'numpy'} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert run.stdout == "set()\n"
+
+
+def test_a_config_file_without_newer_fields_has_their_defaults(tmp_path):
+    write_config(tmp_path, TrainConfig())
+    values = json.loads((tmp_path / NAME).read_text())
+    assert values["model"].pop("deformation") == "mlp"
+    (tmp_path / NAME).write_text(json.dumps(values))
+    assert read_config(tmp_path).model.deformation == "mlp"

@@ -281,14 +281,14 @@ def test_real_weights_call_blur_farther_than_a_change_of_brightness_of_the_same_
 def test_training_with_a_wrong_folder_is_refused_before_any_work(tmp_path):
     config = dataclasses.replace(TrainConfig(), data=tmp_path / "capture", out=tmp_path / "run", lpips=tmp_path)
     with pytest.raises(ValueError, match="holds no weights of LPIPS"):
-        script.start(config)
+        script.make_trainer(config)
     assert not (tmp_path / "run").exists()
 
 
 def test_resuming_with_a_folder_that_is_gone_is_refused_before_any_work(tmp_path):
     weights = write(tmp_path / "weights", network("squeeze"))
     data = tiny.write(tmp_path / "cache")
-    run = script.start(dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights)).run
+    run = script.make_trainer(dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights)).run
     shutil.rmtree(weights)
     with pytest.raises(ValueError, match=f"{weights} holds no weights of LPIPS"):
-        script.start(command.parse(["--resume", str(run)]))
+        script.make_trainer(command.parse(["--resume", str(run)]))
