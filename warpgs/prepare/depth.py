@@ -1,7 +1,6 @@
 """Inverse depth of every frame of a capture: the methods that estimate it, and its files."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -15,30 +14,15 @@ from warpgs.files import write_png
 from .cameras import Cameras
 from .contact_sheet import choose_evenly, colored_depth, contact_sheet
 from .flow_depth import static_depth
+from .methods import DepthMethod, Planes
 from .posed_frames import PosedFrames, load_posed_frames
-from .weights import DEPTH_ANYTHING, Network, find_weights
+from .weights import DEPTH_ANYTHING, find_weights
 
 MAX_SIDE = 512
 """Longest side of the images that depth is estimated on [px]; smaller images are not enlarged."""
 
 MAX_HALF = 1e3
 """Maximum of the stored inverse depth, relative to its median: half floats end at 65504."""
-
-Planes = Sequence[Float[np.ndarray, "H W"]]
-
-
-@dataclass(frozen=True)
-class DepthMethod:
-    """A method that estimates depth.
-
-    Attributes:
-        estimate: Inverse depth of the frames in any unit, [H, W] each and NaN where unknown, from the frames, their
-            dynamic masks, the folder of the network's weights (None without a network), and whether to be quiet.
-        network: The network that it needs.
-    """
-
-    estimate: Callable[[PosedFrames, Iterable[Bool[np.ndarray, "H W"]], Path | None, bool], Planes]
-    network: Network | None = None
 
 
 def _flow(frames: PosedFrames, dynamic: Iterable[Bool[np.ndarray, "H W"]], weights: Path | None, quiet: bool) -> Planes:
@@ -59,7 +43,7 @@ DEPTHS: dict[str, DepthMethod | None] = {
     "anything": DepthMethod(_anything, DEPTH_ANYTHING),
     "none": None,
 }
-"""Values of ``--depth``. A new method is a file of its own and a line here."""
+"""Values of ``--depth``. A new method is a new file and a line here."""
 
 
 def add_depth(root: Path, cameras: Cameras, method: DepthMethod, weights: Path | None, quiet: bool) -> str:

@@ -11,7 +11,7 @@ Pair = tuple[int, int]
 
 
 class Flows:
-    """Optical flow (DIS, Kroeger et al. 2016) between frames of one size. Threads may share it.
+    """Optical flow (DIS, Kroeger et al. 2016) between frames of one size. It is thread-safe.
 
     The flow between two frames is needed only while one of them is processed; it is computed once and kept until
     ``release`` was called for both.

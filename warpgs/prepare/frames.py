@@ -25,7 +25,7 @@ MIN_LONGEST_SIDE = 64
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 INDEX = "frames.json"
-"""File beside the frames that lists them."""
+"""Index of the frames in their folder."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Frames:
         return [frame.name for frame in self.taken]
 
     def megabytes(self, bytes_per_pixel: int) -> int:
-        """Disk space for so many bytes per pixel of all frames, rounded up."""
+        """Disk space for this number of bytes per pixel of all frames, rounded up [MB]."""
         return len(self.taken) * self.width * self.height * bytes_per_pixel // 1_000_000 + 1
 
 

@@ -122,7 +122,7 @@ class Journal:
 
     @contextmanager
     def explain_full_disk(self) -> Iterator[None]:
-        """Turns the errors of a full disk into one that tells the user how to continue."""
+        """Turns the errors of a full disk into an error that explains how to continue."""
         try:
             yield
         except OSError as error:

@@ -1,6 +1,6 @@
 """Dynamic masks: the methods that find what moves, and the files that a preparation keeps the masks in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,37 +13,24 @@ from warpgs.data.lens import undistort
 from warpgs.files import read_json, write_json, write_png
 
 from .cameras import Cameras
+from .methods import DynamicMasks, Masker
 from .motion_masks import find_dynamic
 from .posed_frames import PosedFrames, load_posed_frames
-from .weights import SAM2, Network, find_weights
+from .weights import SAM2, find_weights
 
 WORKING_SIDE = 512
 """Longest side of the images that motion is found on [px]. Smaller images are enlarged, because superpixels and
 outlines have sizes in pixels (hand video at 256×192: intersection over union 0.33, enlarged 0.79)."""
 
 INDEX = "masks.json"
-"""File beside the masks with ``dynamic_fraction`` and ``undistorted``."""
+"""Index of the masks in their folder, with ``dynamic_fraction`` and ``undistorted``."""
 
 
-@dataclass(frozen=True)
-class Masker:
-    """A method that finds what moves.
-
-    Attributes:
-        find: Dynamic masks [H, W] of the frames, from the frames, the folder of the network's weights (None without a
-            network), and whether to be quiet.
-        network: The network that it needs.
-    """
-
-    find: Callable[[PosedFrames, Path | None, bool], Sequence[Bool[np.ndarray, "H W"]]]
-    network: Network | None = None
-
-
-def _motion(frames: PosedFrames, weights: Path | None, quiet: bool) -> Sequence[Bool[np.ndarray, "H W"]]:
+def _motion(frames: PosedFrames, weights: Path | None, quiet: bool) -> DynamicMasks:
     return find_dynamic(frames, quiet)
 
 
-def _sam2(frames: PosedFrames, weights: Path | None, quiet: bool) -> Sequence[Bool[np.ndarray, "H W"]]:
+def _sam2(frames: PosedFrames, weights: Path | None, quiet: bool) -> DynamicMasks:
     from .sam2 import track  # imports torch
 
     assert weights is not None
@@ -55,7 +42,7 @@ MASKERS: dict[str, Masker | None] = {
     "sam2": Masker(_sam2, SAM2),
     "none": None,
 }
-"""Values of ``--masks`` apart from a folder. A new method is a file of its own and a line here."""
+"""Values of ``--masks`` apart from a folder. A new method is a new file and a line here."""
 
 
 @dataclass(frozen=True)

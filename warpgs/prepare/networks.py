@@ -31,7 +31,7 @@ def load(network: Network, folder: Path) -> Any:
         model, info = model_class.from_pretrained(
             folder, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
-    except Exception as error:  # safetensors raises exceptions of its own
+    except Exception as error:  # safetensors raises its own exceptions
         raise ValueError(f"{folder}: the weights of {network.title} cannot be read: {error}") from error
     if missing := info["missing_keys"]:
         raise ValueError(

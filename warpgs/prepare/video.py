@@ -18,7 +18,7 @@ DEFAULT_FRAMES = 150
 """Number of frames taken from a video if neither a rate nor a number is given."""
 
 MIN_DECODED_FRACTION = 0.95
-"""Fraction of a video's nominal frames below which the user is told that it ends early."""
+"""Fraction of a video's nominal frames below which a note says that it ends early."""
 
 MAX_COUNTED = 1_000_000
 """Frames after which counting stops."""
