@@ -88,7 +88,7 @@ def make_composite_bwd(
     scalars, integers, colors, features_vector = state_types(C, P)
     sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
 
-    # Without the grid-stride loop that Warp would add; docs/design/registers.md lists the kernels that this makes faster.
+    # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,

@@ -24,7 +24,7 @@ NUM_BRANCH_IMAGES = 3
 """Joint, static only, dynamic only."""
 
 CUDA_PIXELS = (1, 2)
-"""Columns and rows of the pixels that a lane composites on CUDA; docs/design/lane-groups.md compares the alternatives."""
+"""Columns and rows of the pixels that a lane composites on CUDA (alternatives: docs/design/lane-groups.md)."""
 
 SMALL_IMAGE_CUDA_PIXELS = (1, 1)
 """As ``CUDA_PIXELS``, for small images, which would otherwise have too few lanes to keep a GPU busy."""
