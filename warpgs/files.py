@@ -68,7 +68,7 @@ def write_json(path: Path, values: Any) -> None:
     Raises:
         OSError: If the file cannot be written; the message names it.
     """
-    write_text(path, json.dumps(_finite(values), indent=2, default=str) + "\n")
+    write_text(path, json.dumps(_finite(values), indent=2) + "\n")
 
 
 def _finite(values: Any) -> Any:

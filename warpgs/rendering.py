@@ -14,7 +14,7 @@ from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
 from .ops.projection import Geometry, View, record_projection
 from .ops.rows import Rows
-from .ops.sh import record_sh
+from .ops.sh import degree_of, record_sh
 from .ops.tiles import record_tiles
 from .runtime.checks import check_same_device, check_tensor
 from .runtime.replay import differentiable_with_replay
@@ -125,7 +125,7 @@ def _render(splats: Splats, camera: Camera, background: Tensor | None, settings:
     """Radii and a flat ``Composite``, differentiable, from a recording if possible."""
     degree = None if splats.sh is None else splats.sh_degree
     if degree is None and splats.sh is not None:
-        degree = round(splats.sh.shape[1] ** 0.5) - 1
+        degree = degree_of(splats.sh.shape[1])
     request = _Request(camera.size, splats.num_channels, settings, degree)
     branch = None if splats.is_dynamic is None or not settings.branches else splats.is_dynamic.view(torch.uint8)
     appearance = splats.colors if splats.sh is None else splats.sh

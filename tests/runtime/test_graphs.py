@@ -38,7 +38,7 @@ def run(cache, key, work, times):
 
 
 def test_the_first_runs_are_eager(captures):
-    cache, work = GraphCache(2), Work()
+    cache, work = GraphCache(2, repeatable=False), Work()
     for number in range(1, WARM_UPS + 1):
         (count,) = cache.run("key", work)
         assert count == number
@@ -47,7 +47,7 @@ def test_the_first_runs_are_eager(captures):
 
 
 def test_one_capture_per_key_is_replayed(captures):
-    cache, first, second = GraphCache(2), Work(), Work()
+    cache, first, second = GraphCache(2, repeatable=False), Work(), Work()
     run(cache, "first", first, WARM_UPS + 3)
     assert len(captures) == 1
     assert cache.is_captured("first")
@@ -58,24 +58,29 @@ def test_one_capture_per_key_is_replayed(captures):
     assert (first.count, second.count) == (WARM_UPS + 5, WARM_UPS + 3)
 
 
-def test_replays_return_the_same_tensors(captures):
-    cache = GraphCache(1)
-    produced = []
+def test_replays_return_the_same_tensors(monkeypatch):
+    def record(work, _stream=None, _pool=None):
+        work()
+        return lambda: None  # a graph does not run Python
 
-    def work():
-        produced.append(torch.ones(2))
-        return produced[0], produced[-1]
+    monkeypatch.setattr(graphs, "record", record)
+    cache = GraphCache(1, repeatable=False)
+    run(cache, "key", lambda: (torch.ones(2),), WARM_UPS)
+    first, second = (cache.run("key", lambda: (torch.ones(2),)) for _ in range(2))
+    assert first[0] is second[0]
 
-    run(cache, "key", work, WARM_UPS + 1)
-    captures.clear()
-    cache._graphs["key"].replay = lambda: None  # a graph does not run Python
-    first, second = cache.run("key", work), cache.run("key", work)
-    assert all(a is b for a, b in zip(first, second, strict=True))
-    assert not captures
+
+def test_repeatable_work_is_captured_in_its_first_run(monkeypatch):
+    captured = []
+    monkeypatch.setattr(graphs, "capture", lambda work: captured.append(work) or work)
+    cache, work = GraphCache(1, repeatable=True), Work()
+    run(cache, "key", work, 3)
+    assert cache.is_captured("key")
+    assert len(captured) == 1
 
 
 def test_a_key_is_captured_again_after_invalidation_without_warm_up(captures):
-    cache, work = GraphCache(2), Work()
+    cache, work = GraphCache(2, repeatable=False), Work()
     run(cache, "key", work, WARM_UPS + 1)
     cache.invalidate()
     assert not cache.is_captured("key")
@@ -85,7 +90,7 @@ def test_a_key_is_captured_again_after_invalidation_without_warm_up(captures):
 
 
 def test_the_oldest_graph_is_dropped(captures):
-    cache, work = GraphCache(2), Work()
+    cache, work = GraphCache(2, repeatable=False), Work()
     for key in ("oldest", "middle", "newest"):
         run(cache, key, work, WARM_UPS + 1)
     assert [cache.is_captured(key) for key in ("oldest", "middle", "newest")] == [False, True, True]
@@ -98,7 +103,7 @@ def test_a_capture_that_fails_is_not_kept(captures, monkeypatch):
     def record(_work, _stream, _pool):
         raise RuntimeError("the capture failed")
 
-    cache, work = GraphCache(1), Work()
+    cache, work = GraphCache(1, repeatable=False), Work()
     run(cache, "key", work, WARM_UPS)
     with monkeypatch.context() as patched:
         patched.setattr(graphs, "record", record)

@@ -1,6 +1,7 @@
 """Training on the GPU: replayed steps equal eager ones, and half precision loses little."""
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -64,6 +65,21 @@ def test_a_played_frame_equals_the_rendered_one(data, tmp_path):
     cameras = [trainer.capture.cameras[name].to("cuda") for name in trainer.capture.train[:3]]
     for camera in cameras:
         assert relative_error(scene.play(camera), scene.render(camera).joint.image) < 1e-5
+        assert scene.is_captured(camera.size)
+
+
+def test_a_frame_is_captured_on_whatever_thread_plays_it_first(data, tmp_path):
+    trainer = trainer_on_cuda(data, tmp_path / "run")
+    tiny.train(trainer)
+    metadata = Metadata(iteration=tiny.LENGTH, use_deformation=True, use_appearance=True, sh_degree=1)
+    scene = TrainedScene(trainer.scene, trainer.config, metadata)
+    camera = trainer.capture.cameras[trainer.capture.train[0]].to("cuda")
+    small = dataclasses.replace(camera, width=camera.width // 2)
+    scene.play(small)
+    with ThreadPoolExecutor(1) as other:
+        for seen in (small, camera):
+            assert relative_error(other.submit(scene.play, seen).result(), scene.render(seen).joint.image) < 1e-5
+            assert scene.is_captured(seen.size)
 
 
 @pytest.mark.parametrize("opacity", [False, True])

@@ -8,9 +8,11 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.config import TrainConfig
 from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.training import command
@@ -132,6 +134,11 @@ def stopped(data, tmp_path):
 
 
 @pytest.mark.parametrize("kept", [0, 4, 100, -1])
+def test_a_resumed_run_keeps_its_device_unless_another_is_given(stopped, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # the default of a new run would be CUDA
+    assert script.make_trainer(TrainConfig(resume=stopped)).config.device == "cpu"
+
+
 def test_a_truncated_newest_checkpoint_is_refused_by_name(stopped, kept):
     newest = checkpoint.list_checkpoints(stopped)[-1]
     newest.write_bytes(newest.read_bytes()[:kept])

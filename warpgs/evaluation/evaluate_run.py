@@ -14,6 +14,7 @@ from warpgs.progress import progress
 from warpgs.rendering import Rendering
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
+from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.video.mp4 import Video
 
 from .evaluate import Evaluation, evaluate, write_views
@@ -54,7 +55,7 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     network = find(lpips or run.config.lpips)
-    chosen = {round(k * (len(capture.val) - 1) / max(1, NUM_IMAGES - 1)) for k in range(NUM_IMAGES)}
+    chosen = set(evenly_spaced_indices(len(capture.val), NUM_IMAGES))
 
     def save_image(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
         if index in chosen:

@@ -1,6 +1,6 @@
 """Activation of the raw Gaussians of both branches, with the outputs of the networks applied (kernels/activation.py).
 
-Geometry and colours are separate ops, so that the appearance network can ctx while geometry is activated and binned.
+Geometry and colours are separate ops, so that the appearance network can run while geometry is activated and binned.
 """
 
 from collections.abc import Sequence

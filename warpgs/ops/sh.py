@@ -17,10 +17,15 @@ def num_bases(degree: int) -> int:
     return (degree + 1) ** 2
 
 
+def degree_of(num: int) -> int:
+    """Highest degree of ``num`` basis functions, the inverse of ``num_bases``."""
+    return round(num**0.5) - 1
+
+
 def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) -> int:
     """Raises ``ValueError`` unless ``sh`` [N, bases, 3] has at least ``degree``; returns the degree to use."""
     check_tensor("sh", sh, ("N", "bases", 3), sizes)
-    available = round(sh.shape[1] ** 0.5) - 1
+    available = degree_of(sh.shape[1])
     if num_bases(available) != sh.shape[1] or not 0 <= available <= MAX_DEGREE:
         raise ValueError(f"sh must have shape [N, bases, 3] with 1, 4, 9 or 16 bases, got {list(sh.shape)}")
     if degree is None:

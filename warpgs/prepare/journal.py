@@ -19,6 +19,9 @@ OUTPUTS = (
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
+VERSION = 2
+"""Version of the intermediate files; an unfinished preparation of another version starts afresh."""
+
 STATE = "state.json"
 """File in the work folder with the options, the finished steps, and the notes."""
 
@@ -71,6 +74,8 @@ class Journal:
                 f"{self.root} exists and was not made by prepare: choose another folder, or replace the capture in it "
                 "with --force"
             ) from error
+        if state.get("version") != VERSION and "finished" not in done:
+            return {}, []  # the intermediate files of an earlier version differ
         changed = [key for key in self._options if begun.get(key) != self._options[key]]
         if changed and "capture" in done:
             raise ValueError(
@@ -160,4 +165,6 @@ class Journal:
         return read_json(self.root / REPORT)
 
     def _save(self) -> None:
-        write_json(self.work / STATE, {"options": self._options, "done": self._done, "notes": self.notes})
+        write_json(
+            self.work / STATE, {"version": VERSION, "options": self._options, "done": self._done, "notes": self.notes}
+        )

@@ -21,6 +21,9 @@ MAX_WIDTH = 480
 QUALITY = 88
 """JPEG quality."""
 
+IMAGE_FOLDERS = ("images", "pictures")
+"""Folders of a run with images of its evaluation; warpgs 0.1.0 wrote the second one."""
+
 PANELS = 5
 """Panels of an image that the evaluation saves: truth, joint, static, dynamic, error."""
 
@@ -86,9 +89,10 @@ def saved_strips(run: EvaluatedRun, names: Sequence[str], reason: str) -> Strips
 
 
 def _read_saved(folder: Path, name: str) -> Strip | None:
-    root = (folder / "images").resolve()
-    path = (root / f"{name}.png").resolve()
-    if path.parent != root or not path.is_file():
+    roots = [(folder / part).resolve() for part in IMAGE_FOLDERS]
+    paths = [(root / f"{name}.png").resolve() for root in roots]
+    path = next((p for p, root in zip(paths, roots, strict=True) if p.parent == root and p.is_file()), None)
+    if path is None:
         return None
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None or image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:

@@ -39,7 +39,7 @@ class TrainedScene:
 
     def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:
         self.scene, self.config, self.metadata = scene, config, metadata
-        self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS)
+        self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
 
     @property

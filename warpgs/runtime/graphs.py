@@ -1,7 +1,6 @@
 """CUDA graphs: work that is recorded once and replayed with a single launch."""
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -14,14 +13,7 @@ WARM_UPS = 3
 """Eager runs before a capture: they compile kernels, allocate scratch memory and learn the number of intersections."""
 
 Key = TypeVar("Key", bound=Hashable)
-
-
-@dataclass
-class _Captured:
-    """A graph and the tensors that its replays fill."""
-
-    replay: Callable[[], None] | None = None
-    outputs: tuple[Tensor, ...] = ()
+Replay = Callable[[], tuple[Tensor, ...]]
 
 
 class GraphCache(Generic[Key]):
@@ -32,13 +24,16 @@ class GraphCache(Generic[Key]):
 
     Args:
         max_graphs: Maximum number of graphs; the oldest one is dropped for a new one.
+        repeatable: Whether the work may be repeated without an effect, as a frame may. Its first run then warms up and
+            captures at once, on the calling thread, which is the one that learns the number of intersections. Work that
+            must not be repeated, such as a training step, is eager in its first ``WARM_UPS`` runs instead.
         shared_memory: Device on which all graphs share one memory pool and one stream, so that a new graph reuses the
             memory of the one before it; for ``max_graphs`` = 1. None: each graph has its own memory.
     """
 
-    def __init__(self, max_graphs: int, shared_memory: torch.device | None = None) -> None:
-        self._max_graphs = max_graphs
-        self._graphs: dict[Key, _Captured] = {}
+    def __init__(self, max_graphs: int, repeatable: bool, shared_memory: torch.device | None = None) -> None:
+        self._max_graphs, self._repeatable = max_graphs, repeatable
+        self._replays: dict[Key, Replay] = {}
         self._stale: set[Key] = set()
         self._runs: dict[Key, int] = {}
         self._pool = torch.cuda.graph_pool_handle() if shared_memory is not None else None
@@ -46,14 +41,14 @@ class GraphCache(Generic[Key]):
 
     def is_captured(self, key: Key) -> bool:
         """Whether the next run of this key is a replay."""
-        return key in self._graphs and key not in self._stale
+        return key in self._replays and key not in self._stale
 
     def invalidate(self) -> None:
         """Makes the next run of every key capture again, because tensors that the work reads were replaced.
 
         The old graphs stay in memory until then, and the new captures reuse that memory.
         """
-        self._stale.update(self._graphs)
+        self._stale.update(self._replays)
 
     def run(self, key: Key, work: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
         """Runs the work, eagerly or as a replay.
@@ -65,35 +60,28 @@ class GraphCache(Generic[Key]):
         Returns:
             The results of ``work``; replays return the same tensors every time, with new values.
         """
-        if self.is_captured(key):
-            captured = self._graphs[key]
-        elif self._runs.get(key, 0) < WARM_UPS:
-            self._runs[key] = self._runs.get(key, 0) + 1
-            return work()
-        else:
-            captured = self._capture(key, work)
-        assert captured.replay is not None
-        captured.replay()
-        return captured.outputs
+        if not self.is_captured(key):
+            if not self._repeatable and self._runs.get(key, 0) < WARM_UPS:
+                self._runs[key] = self._runs.get(key, 0) + 1
+                return work()
+            if self._pool is None:
+                self._drop_oldest(self._max_graphs - 1)
+            # A capture with shared memory takes over that of the old graph, which must live until then.
+            replay = capture(work) if self._repeatable else _record_outputs(work, self._stream, self._pool)
+            self._replays.pop(key, None)
+            self._replays[key] = replay
+            self._stale.discard(key)
+            self._drop_oldest(self._max_graphs)
+        return self._replays[key]()
 
-    def _capture(self, key: Key, work: Callable[[], tuple[Tensor, ...]]) -> _Captured:
-        captured = _Captured()
-
-        def fill_outputs() -> None:
-            captured.outputs = work()
-
-        captured.replay = record(fill_outputs, self._stream, self._pool)
-        self._graphs.pop(key, None)  # only now, because the capture reuses its memory
-        self._graphs[key] = captured
-        self._stale.discard(key)
-        while len(self._graphs) > self._max_graphs:
-            dropped = next(iter(self._graphs))
-            del self._graphs[dropped]
-            self._stale.discard(dropped)
-        return captured
+    def _drop_oldest(self, max_graphs: int) -> None:
+        while len(self._replays) > max_graphs:
+            key = next(iter(self._replays))
+            del self._replays[key]
+            self._stale.discard(key)
 
 
-def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor, ...]]:
+def capture(step: Callable[[], tuple[Tensor, ...]]) -> Replay:
     """Captures ``step`` in a CUDA graph and returns a function that replays it.
 
     The replay runs on torch's current stream and returns the same tensors every time, with new values. The graph holds
@@ -108,18 +96,25 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Callable[[], tuple[Tensor
     Args:
         step: Runs on the current CUDA device without reading anything back from it.
     """
-    outputs: tuple[Tensor, ...] = ()
-
-    def work() -> None:
-        nonlocal outputs
-        outputs = step()
-
     stream = torch.cuda.Stream(priority=PRIORITY)
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
         for _ in range(WARM_UPS):
-            work()
-    replay = record(work, stream)
+            step()
+    return _record_outputs(step, stream)
+
+
+def _record_outputs(
+    work: Callable[[], tuple[Tensor, ...]], stream: torch.cuda.Stream | None, pool: Any | None = None
+) -> Replay:
+    """Records ``work`` and returns a function that replays it and returns its results."""
+    outputs: tuple[Tensor, ...] = ()
+
+    def fill_outputs() -> None:
+        nonlocal outputs
+        outputs = work()
+
+    replay = record(fill_outputs, stream, pool)
 
     def replay_outputs() -> tuple[Tensor, ...]:
         replay()

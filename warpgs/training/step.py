@@ -90,7 +90,7 @@ class Step:
         self.optimizer = optim.make_optimizer(scene, self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
         if config.graph and views.resident and device.type == "cuda":
-            self._graphs = GraphCache(max_graphs=1, shared_memory=device)
+            self._graphs = GraphCache(max_graphs=1, repeatable=False, shared_memory=device)
         self.reset_statistics()
 
     def reset_statistics(self) -> None:

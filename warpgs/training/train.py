@@ -9,6 +9,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
+from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_capture
 
 from .interrupt import Interrupt
@@ -106,7 +107,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     """
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
-        run = Run.open(config.resume, config.device)
+        run = Run.open(config.resume, config.device or read_config(config.resume).device)
         locate(run.config.lpips)
         capture = check_capture(run.open_capture(quiet), run.config, log)
         trainer = Trainer(run.config, capture, run.folder)
