@@ -133,12 +133,12 @@ def stopped(data, tmp_path):
     return trainer.run
 
 
-@pytest.mark.parametrize("kept", [0, 4, 100, -1])
 def test_a_resumed_run_keeps_its_device_unless_another_is_given(stopped, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # the default of a new run would be CUDA
     assert script.make_trainer(TrainConfig(resume=stopped)).config.device == "cpu"
 
 
+@pytest.mark.parametrize("kept", [0, 4, 100, -1])
 def test_a_truncated_newest_checkpoint_is_refused_by_name(stopped, kept):
     newest = checkpoint.list_checkpoints(stopped)[-1]
     newest.write_bytes(newest.read_bytes()[:kept])
