@@ -18,7 +18,7 @@ from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.video.mp4 import Video
 
 from .evaluate import Evaluation, evaluate, write_views
-from .lpips import find, locate
+from .lpips import find
 
 NUM_IMAGES = 6
 """Evaluation views to save as images, spread over the capture."""
@@ -51,10 +51,9 @@ def evaluate_run(
         OSError: If a file cannot be written.
     """
     run = Run.open(folder, device)
-    locate(lpips or run.config.lpips)  # before the time-consuming parts
+    network = find(lpips or run.config.lpips)  # first, because opening a capture can take a minute
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
-    network = find(lpips or run.config.lpips)
     chosen = set(evenly_spaced_indices(len(capture.val), NUM_IMAGES))
 
     def save_image(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:

@@ -107,7 +107,8 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     """
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
-        run = Run.open(config.resume, config.device or read_config(config.resume).device)
+        saved = read_config(config.resume)
+        run = Run(config.resume, dataclasses.replace(saved, device=choose_device(config.device or saved.device)))
         locate(run.config.lpips)
         capture = check_capture(run.open_capture(quiet), run.config, log)
         trainer = Trainer(run.config, capture, run.folder)
