@@ -316,3 +316,7 @@ def test_a_dataset_is_added_by_one_entry(tmp_path, monkeypatch):
 def test_a_folder_that_no_loader_recognizes_is_read_as_the_fallback(tmp_path):
     assert recognize(tmp_path) == loaders.FALLBACK
     assert loaders.FALLBACK in LOADERS
+
+
+def test_a_capture_is_opened_by_a_string_as_well(root):
+    assert load_capture(str(root)).train == load_capture(root).train

@@ -42,7 +42,7 @@ FALLBACK = "hypernerf"
 
 
 def load_capture(
-    root: Path,
+    root: Path | str,
     dataset: str | None = None,
     *,
     factor: int | None = None,
@@ -67,6 +67,7 @@ def load_capture(
         raise ValueError(f"factor must be at least 1, got {factor}")
     perturbation = perturbation or MaskPerturbation()
     check_perturbation(perturbation)
+    root = Path(root)
     loader = LOADERS[dataset or recognize(root)]
     return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
 
