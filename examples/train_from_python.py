@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 import warpgs
-from warpgs.config import PRESETS
+from warpgs.presets import PRESETS
 
 
 def main() -> None:

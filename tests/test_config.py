@@ -4,11 +4,14 @@ import dataclasses
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from warpgs.config import PRESETS, TrainConfig, scaled, validate
+from warpgs.config import TrainConfig, scaled, validate
+from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
+from warpgs.training.command import parse
 
 
 def changed(name, value, config=PRESETS["paper"]):
@@ -74,3 +77,13 @@ def test_a_config_file_without_newer_fields_has_their_defaults(tmp_path):
     assert values["model"].pop("deformation") == "mlp"
     (tmp_path / NAME).write_text(json.dumps(values))
     assert read_config(tmp_path).model.deformation == "mlp"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "preset"),
+    [([], "quick"), (["--data", "capture"], "best"), (["--data", "capture", "--preset", "paper"], "paper")],
+)
+def test_the_default_preset_depends_on_whether_there_is_a_capture(arguments, preset):
+    config = parse(arguments)
+    assert config == dataclasses.replace(PRESETS[preset], data=Path("capture") if arguments else None)
+    assert config.preset == preset

@@ -79,6 +79,10 @@ class ModelConfig:
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
     """Number of units per hidden layer."""
+    appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = None
+    """Number of hidden layers of the appearance network; that of both networks if None."""
+    appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
+    """Number of units per hidden layer of the appearance network; that of both networks if None."""
     skip: int = 4
     """Hidden layer after which the encoding is concatenated again."""
     deformation: str = "mlp"
@@ -120,6 +124,13 @@ class LossConfig:
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
     """Final λ_depth; it decays exponentially."""
+    depth_tolerance: float = 0.0
+    """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
+    by 1 + (error / tolerance)². If 0, all views have the same weight (paper)."""
+    mask_margin: Annotated[float, Bounds(max=1)] = 0.0
+    """Half width of the band along the borders of masks in which the dynamic image is not compared, as a fraction of
+    the image's larger side; 0 in the paper. Masks are a few pixels off, and the rim of background inside them would be
+    learned as moving."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +171,9 @@ class DensifyConfig:
     """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
+    min_pixels: int = 8
+    """Minimum number of training pixels per Gaussian: more Gaussians than these are not needed to fit all views, and
+    short captures would be memorized."""
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
 
@@ -230,9 +244,10 @@ class TrainConfig:
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
     """Run folder to continue from its newest checkpoint."""
-    preset: Literal["paper", "fast", "quick"] = "paper"
-    """Defaults of everything below: paper (72k iterations), fast (one GPU, minutes), quick (two CPU cores, minutes).
-    The default is paper for a capture and quick for the built-in scene."""
+    preset: Literal["paper", "best", "fast", "patient", "quick"] = "paper"
+    """Defaults of everything below: best (one GPU, minutes), paper (72k iterations, closer to the paper), fast (one
+    GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). The default is best for a
+    capture and quick for the built-in scene."""
     iterations: Annotated[int | None, Bounds(min=3)] = None
     """Total iterations; every schedule is rescaled to it."""
     device: Literal["cuda", "cpu"] | None = None
@@ -247,6 +262,8 @@ class TrainConfig:
     """Appearance network of the static Gaussians, from ``schedule.appearance_from`` on."""
     stage2: bool = True
     """Joint optimization; without it, its iterations are added to stage I."""
+    stage1_joint: bool = False
+    """Whether stage I compares the joint image, too. In the paper only stage II does."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
     static_geometry: bool = False
@@ -271,54 +288,6 @@ class TrainConfig:
     """Maximum memory for training views on the device [bytes]; larger captures are read from disk on demand."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS, for the evaluation at the end."""
-
-
-PRESETS: dict[str, TrainConfig] = {
-    "paper": TrainConfig(),
-    "fast": TrainConfig(
-        preset="fast",
-        schedule=Schedule(
-            pretrain=1_000,
-            stage1=4_000,
-            stage2=10_000,
-            realign_at=500,
-            densify_from=300,
-            densify_until=3_500,
-            reset_every=2_500,
-            prune_every=2_000,
-            deform_from=500,
-            warmup=500,
-            noise_until=3_500,
-            sh_degree_every=500,
-        ),
-        checkpoint_every=2_500,
-    ),
-    "quick": TrainConfig(
-        preset="quick",
-        model=ModelConfig(
-            position_bands=6, time_bands=4, depth=3, width=64, skip=2, max_static_points=4_000, dynamic_points=1_500
-        ),
-        loss=LossConfig(ssim=0.0),
-        optim=OptimConfig(means=3.2e-4, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
-        densify=DensifyConfig(gradient=4e-4, max_gaussians=10_000),
-        schedule=Schedule(
-            pretrain=200,
-            stage1=1_000,
-            stage2=1_000,
-            realign_at=100,
-            densify_from=100,
-            densify_until=700,
-            reset_every=10_000,
-            prune_every=500,
-            deform_from=50,
-            warmup=100,
-            noise_until=400,
-            sh_degree_every=400,
-        ),
-        checkpoint_every=500,
-    ),
-}
-"""Defaults by name."""
 
 
 def validate(config: TrainConfig) -> None:

@@ -236,3 +236,10 @@ def test_an_empty_scene_loads_the_state_of_another():
     other = SplitScene.empty(NUM_STATIC, NUM_DYNAMIC, model())
     other.load_state_dict(scene.state_dict())
     assert not differing(named(scene.splats(TIME)), named(other.splats(TIME)))
+
+
+def test_the_appearance_network_has_the_size_of_both_networks_unless_it_has_its_own():
+    assert make_scene().appearance.trunk.sizes[:-1] == make_scene().deformation.trunk.sizes[:-1]
+    scene = make_scene(appearance_depth=2, appearance_width=16)
+    assert [rows for rows, _ in scene.appearance.trunk.sizes] == [16, 16, 3]
+    assert [rows for rows, _ in scene.deformation.trunk.sizes] == [8, 8, 8, 10]

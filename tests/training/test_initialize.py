@@ -356,3 +356,54 @@ def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
     scene = initialize.initial_scene(config, capture, generator())
     for gaussians in (scene.static, scene.dynamic, dynamic_gaussians(capture, ALIGNMENT, config)):
         assert gaussians.sh.shape[1] == (degree + 1) ** 2
+
+
+# Trust in depth ------------------------------------------------------------------------------------------------------
+
+
+def aligned(factor, signal=1.0):
+    """The alignment of views whose inverse depth is the true one times ``signal``, times random numbers in 1 ± factor.
+
+    What ``signal`` leaves out is a constant.
+    """
+    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 4), torch.arange(1, WIDTH, 5)).T
+    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
+    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
+    noise = 1.0 + factor * (2.0 * torch.rand(len(row), generator=generator(4)) - 1.0)
+    inverse_depth[row, column] = (signal / depth + 0.4 * (1.0 - signal)) * noise
+    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
+    return initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30))
+
+
+def test_exact_depth_is_trusted_whatever_the_tolerance():
+    depth = aligned(0.0)
+    assert (depth.errors < 2e-3).all()  # depth is stored in half precision
+    assert error(depth.alignments, torch.tensor([[1.0, 0.0]] * 3)) < 2e-2
+    assert (depth.trust(0.03) > 0.99).all()
+
+
+def test_trust_is_a_half_at_the_tolerance():
+    depth = aligned(0.1)
+    tolerance = depth.errors[0].item()
+    assert 0.02 < tolerance < 0.1
+    assert error(depth.trust(tolerance), torch.full((3,), 0.5)) < 1e-6
+    assert error(depth.trust(tolerance / 3.0), torch.full((3,), 0.1)) < 1e-6
+
+
+def test_without_a_tolerance_every_aligned_view_is_trusted():
+    assert torch.equal(aligned(0.1).trust(0.0), torch.ones(3))
+
+
+def test_depth_that_is_noise_is_neither_aligned_nor_trusted():
+    depth = aligned(0.5, signal=0.0)
+    assert depth.alignments.isnan().all()
+    assert torch.equal(depth.trust(0.03), torch.zeros(3))
+    assert torch.equal(depth.trust(0.0), torch.zeros(3))
+
+
+def test_a_view_whose_depth_is_refused_stays_so_when_depth_is_aligned_to_the_rendering():
+    capture = make_capture(random_points(9), inverse_depth=constant_depth())
+    scene = initialize.initial_scene(CONFIG, capture, generator())
+    views = Views(capture, torch.device("cpu"), 1 << 30)
+    refused = torch.full((3, 2), torch.nan)
+    assert initialize.align_to_rendering(refused, views, scene, 0).isnan().all()

@@ -17,7 +17,7 @@ from warpgs.training.loss_terms import TERMS
 from warpgs.training.losses import LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import Sample, Step
-from warpgs.training.views import Views
+from warpgs.training.views import Views, mask_border
 
 HEIGHT, WIDTH = 21, 18
 BLACK = torch.zeros(3)
@@ -247,7 +247,7 @@ def make_gaussians(chosen):
     return Gaussians(*(value[chosen].contiguous() for value in values))
 
 
-def prepared(stage, loss=LOSS, at=0, **options):
+def prepared(stage, loss=LOSS, at=0, trust=1.0, **options):
     """A scene, the plan of an iteration of a stage, by default of the first, and a step that trains the scene."""
     frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
     capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
@@ -256,13 +256,13 @@ def prepared(stage, loss=LOSS, at=0, **options):
     scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
     plan = Protocol(config, has_depth=True).at(STAGES[stage] + at)
     assert plan.phase.stage == stage
-    views = Views(capture, torch.device("cpu"), 1 << 30)
-    return scene, plan, Step(config, scene, views, ALIGNMENTS, capture.extent)
+    views = Views(capture, torch.device("cpu"), 1 << 30, loss.mask_margin)
+    return scene, plan, Step(config, scene, views, ALIGNMENTS, torch.tensor([trust]), capture.extent)
 
 
-def terms_of(stage, loss=LOSS):
+def terms_of(stage, loss=LOSS, **options):
     """The weighted terms of the first iteration of a stage, and the rendering that they compare."""
-    scene, plan, step = prepared(stage, loss)
+    scene, plan, step = prepared(stage, loss, **options)
     phase = plan.phase
     with torch.no_grad():
         splats = scene.splats(torch.zeros(1), phase.use_deformation, phase.use_appearance, phase.sh_degree)
@@ -317,6 +317,44 @@ def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_sampled_backgrou
     image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
     truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
     assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
+
+
+def test_along_the_borders_of_the_mask_the_dynamic_loss_is_that_of_its_own_image():
+    border = mask_border(MASK, 1)
+    loss = dynamic_loss(IMAGE, TRUTH, MASK, 0.2, PURPLE, border)
+    truth = torch.where(border[..., None], IMAGE, torch.where(MASK[..., None], PURPLE, TRUTH))
+    assert error(loss, compared(IMAGE, truth, 0.2)) < 1e-6
+    assert not gradient(dynamic_loss, IMAGE, TRUTH, MASK, 0.0, PURPLE, border)[border].any()
+    assert gradient(dynamic_loss, IMAGE, TRUTH, MASK, 0.0, PURPLE, border)[~border].any(1).all()
+
+
+def test_the_dynamic_term_leaves_out_the_margin_of_the_mask():
+    margin = 1.6 / max(VIEW_MASK.shape)
+    terms, rendering = terms_of("stage1", dataclasses.replace(LOSS, mask_margin=margin))
+    dynamic = rendering.dynamic
+    image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
+    truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
+    truth = torch.where(mask_border(VIEW_MASK, 2)[..., None], image, truth)
+    assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
+
+
+def test_the_config_compares_the_joint_image_in_stage_1_already():
+    terms, rendering = terms_of("stage1", stage1_joint=True)
+    assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
+    assert terms_of("stage1")[0]["joint"] == 0.0
+    assert terms_of("pretrain", stage1_joint=True)[0]["joint"] == 0.0
+
+
+def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
+    _, plan, step = prepared("stage1")
+    step(plan, Sample(0, 0.0, PURPLE))
+    whole = step.take_means().terms
+    _, plan, step = prepared("stage1", trust=0.25)
+    step(plan, Sample(0, 0.0, PURPLE))
+    part = step.take_means().terms
+    for name in ("depth", "depth_dynamic"):
+        assert part[name] == pytest.approx(0.25 * whole[name], rel=1e-6)
+    assert part["static"] == whole["static"]
 
 
 def test_the_joint_term_compares_the_joint_image_with_the_whole_ground_truth():

@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from warpgs.config import PRESETS, DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig, scaled
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig, scaled
+from warpgs.presets import PRESETS
 from warpgs.training.loss_terms import TERMS
 from warpgs.training.schedule import Phase, Protocol
 

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -48,6 +49,10 @@ def test_a_run_ends_with_a_summary_of_its_metrics(finished):
     assert run.returncode == 0, run.stderr
     assert "PSNR" in run.stdout
     assert "LPIPS not measured" in run.stdout
+
+
+def test_a_run_says_how_far_its_depth_can_be_trusted(finished):
+    assert re.search(r"depth differs from the sparse points by 0\.\d% \(median\)", finished[0].stdout)
 
 
 def test_a_run_that_is_being_trained_cannot_be_resumed(finished):

@@ -9,7 +9,7 @@ from tests import tiny
 from tests.data.captures import ids_of, write_capture
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
-from warpgs.training.views import Views
+from warpgs.training.views import Views, mask_border
 
 CPU = torch.device("cpu")
 PLENTY = 1 << 30
@@ -25,7 +25,7 @@ def capture(request, tmp_path_factory):
 def views_of(capture, resident_bytes=PLENTY):
     if capture.frame(capture.train[0]).static_mask is None:
         capture = capture.assuming("static")
-    return Views(capture, CPU, resident_bytes)
+    return Views(capture, CPU, resident_bytes, mask_margin=0.05)
 
 
 def without(capture, **changes):
@@ -38,7 +38,7 @@ def without(capture, **changes):
 
 
 def assert_same(a, b):
-    for name in ("time", "image", "static_mask", "inverse_depth"):
+    for name in ("time", "image", "static_mask", "mask_border", "inverse_depth"):
         left, right = getattr(a, name), getattr(b, name)
         assert left.dtype == right.dtype
         assert torch.equal(left.nan_to_num(-1.0), right.nan_to_num(-1.0)), name
@@ -122,3 +122,30 @@ def test_frames_of_different_sizes_are_read_on_demand(tmp_path):
     assert not views.resident
     assert views[2].image.shape == (10, 20, 3)
     assert views[1].image.shape == (24, 40, 3)
+
+
+def test_the_border_of_a_mask_is_where_both_regions_are_near():
+    mask = torch.ones(7, 9, dtype=torch.bool)
+    mask[2:5, 4:] = False
+    border = torch.zeros(7, 9, dtype=torch.bool)
+    border[1:6, 3:] = True
+    border[3, 5:] = False
+    assert torch.equal(mask_border(mask, 1), border)
+    assert torch.equal(mask_border(~mask, 1), border)
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_a_mask_of_one_region_has_no_border(value):
+    assert not mask_border(torch.full((7, 9), value), 3).any()
+
+
+def test_without_a_margin_there_is_no_border():
+    assert not mask_border(torch.rand(7, 9) > 0.5, 0).any()
+
+
+def test_the_margin_is_relative_to_the_larger_side(tmp_path):
+    capture = load_capture(write_capture(tmp_path))
+    view = Views(capture, CPU, PLENTY, mask_margin=2.4 / 40)[0]
+    assert view.static_mask.shape == (24, 40)
+    assert torch.equal(view.mask_border, mask_border(view.static_mask, 2))
+    assert view.mask_border.any()

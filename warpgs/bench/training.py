@@ -10,12 +10,12 @@ from typing import Any
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.config import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.evaluation.evaluate import frame_rate
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
+from warpgs.presets import PRESETS
 from warpgs.runs.run import Run
 from warpgs.runtime.graphs import WARM_UPS
 from warpgs.training.point_cloud import scene_box
@@ -101,7 +101,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     protocol = Protocol(config, has_depth=True)
     result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
     for stage in (protocol.stage1, protocol.stage2):
-        step = Step(config, scene, views, alignments, capture.extent)
+        step = Step(config, scene, views, alignments, torch.ones(NUM_VIEWS, device=device), capture.extent)
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     if device == "cuda":

@@ -55,6 +55,28 @@ def align_to_points(
     return fit_scale_offset(values[known], 1.0 / z[known])
 
 
+def relative_errors(
+    inverse_depth: Float[Tensor, "H W"],
+    static: Tensor,
+    camera: Camera,
+    points: Float[Tensor, "P 3"],
+    alignment: Float[Tensor, "2"],
+) -> Float[Tensor, "2"]:
+    """Median relative errors of inverse depth at the visible sparse points in the static region.
+
+    Returns:
+        [2]: that of aligned inverse depth, and, for comparison, that of the points' median everywhere. Infinite if
+        there are no points, or if the alignment is NaN.
+    """
+    row, column, z, inside = camera.project(points)
+    aligned = alignment[0] * inverse_depth[row, column] + alignment[1]
+    known = inside & static[row, column] & aligned.isfinite()
+    if not bool(known.any()):
+        return z.new_full((2,), torch.inf)
+    aligned, z = aligned[known], z[known]
+    return torch.stack([(aligned * z - 1.0).abs().median(), ((1.0 / z).median() * z - 1.0).abs().median()])
+
+
 def align_to_rendering(
     inverse_depth: Float[Tensor, "H W"],
     static: Tensor,

@@ -1,5 +1,7 @@
 """The appearance network of the static Gaussians (paper Eq. 8)."""
 
+import dataclasses
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -15,6 +17,8 @@ class AppearanceField(nn.Module):
         super().__init__()
         self.changes_opacity = config.appearance_opacity
         self.bases = (config.appearance_degree + 1) ** 2
+        depth, width = config.appearance_depth or config.depth, config.appearance_width or config.width
+        config = dataclasses.replace(config, depth=depth, width=width)
         self.trunk = Trunk(config, center, half_size, outputs=3 * self.bases + int(self.changes_opacity))
 
     def forward(

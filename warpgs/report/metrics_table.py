@@ -4,7 +4,8 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from warpgs.config import PRESETS, TrainConfig
+from warpgs.config import TrainConfig
+from warpgs.presets import PRESETS
 
 from .evaluated_run import EvaluatedRun
 

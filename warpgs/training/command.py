@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import tyro
 
-from warpgs.config import PRESETS, TrainConfig
+from warpgs.config import TrainConfig
 from warpgs.errors import run_command
+from warpgs.presets import PRESETS
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
@@ -20,7 +21,7 @@ UNFIT = 1
 def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     """The config of a command line: the defaults of a preset, changed by options.
 
-    The default preset is ``quick`` for the built-in scene and ``paper`` for captures.
+    The default preset is ``quick`` for the built-in scene and ``best`` for captures.
 
     Raises:
         ValueError: If a run is resumed with other options.
@@ -32,7 +33,7 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     first.add_argument("--preset", choices=list(PRESETS))
     first.add_argument("--data")
     known, _ = first.parse_known_args(list(arguments))
-    preset = known.preset or ("paper" if known.data else "quick")
+    preset = known.preset or ("best" if known.data else "quick")
     return tyro.cli(TrainConfig, default=PRESETS[preset], args=list(arguments), prog=prog)
 
 

@@ -1,6 +1,7 @@
 """The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -37,6 +38,10 @@ MAX_POINTS_PER_IMAGE = 2_000
 
 PIXELS_PER_CHUNK = 8_192
 """Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
+
+MAX_DEPTH_ERROR = 0.6
+"""Error of aligned depth at the sparse points, relative to that of the same depth everywhere, above which a view's
+depth is not used. That of a depth network is about 0.15, that of noise about 1."""
 
 MAX_SCALE_FRACTION = 0.5
 """Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
@@ -156,21 +161,44 @@ def _depth_before_points(view: View, points: Float[Tensor, "P 3"], generator: to
     return depth
 
 
-def align_to_points(capture: Capture, views: Views) -> Float[Tensor, "T 2"]:
-    """Scale and offset of each view's inverse depth against the sparse points; NaN where they cannot be determined."""
+class DepthAlignment(NamedTuple):
+    """Alignment of each view's inverse depth to the sparse points.
+
+    Attributes:
+        alignments: [T, 2] scale and offset; NaN where they cannot be determined, and where aligned depth is so wrong
+            that it is not used.
+        errors: [T] median relative error of aligned depth at the points; infinite where not aligned.
+    """
+
+    alignments: Float[Tensor, "T 2"]
+    errors: Float[Tensor, " T"]
+
+    def trust(self, tolerance: float) -> Float[Tensor, " T"]:
+        """Factor of each view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``."""
+        aligned = self.errors.isfinite()
+        return torch.where(aligned, 1.0 / (1.0 + (self.errors / tolerance) ** 2), 0.0) if tolerance else aligned.float()
+
+
+def align_to_points(capture: Capture, views: Views) -> DepthAlignment:
+    """Aligns each view's inverse depth to the sparse points."""
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
+    errors = torch.full((len(views),), torch.inf, device=views.device)
     points = capture.points.to(views.device)
     for index in range(len(views)):
         view = views[index]
-        alignments[index] = depth_alignment.align_to_points(view.inverse_depth, view.static_mask, view.camera, points)
-    return alignments
+        sources = (view.inverse_depth, view.static_mask, view.camera, points)
+        alignment = depth_alignment.align_to_points(*sources)
+        error, constant_error = depth_alignment.relative_errors(*sources, alignment)
+        if error <= MAX_DEPTH_ERROR * constant_error < torch.inf:
+            alignments[index], errors[index] = alignment, error
+    return DepthAlignment(alignments, errors)
 
 
 @torch.no_grad()
 def align_to_rendering(
     alignments: Float[Tensor, "T 2"], views: Views, scene: SplitScene, sh_degree: int, antialias: bool = False
 ) -> Float[Tensor, "T 2"]:
-    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
+    """Scale and offset of the views that are aligned already, against the rendered depth where it determines them."""
     splats = scene.static_splats(sh_degree)
     settings = RenderSettings(depth=True, antialias=antialias)
     found = alignments.clone()
@@ -181,4 +209,4 @@ def align_to_rendering(
         found[index] = depth_alignment.align_to_rendering(
             view.inverse_depth, view.static_mask, layer.depth, layer.alpha
         )
-    return torch.where(found.isfinite(), found, alignments)
+    return torch.where(found.isfinite() & alignments.isfinite(), found, alignments)

@@ -20,10 +20,11 @@ def static(inputs: LossInputs) -> Float[Tensor, ""]:
 
 
 def dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The dynamic image against the masked ground truth (Eq. 12)."""
+    """The dynamic image against the masked ground truth (Eq. 12), except along the borders of the mask."""
     view, layer = inputs.view, inputs.rendering.dynamic
     assert layer is not None
-    return losses.dynamic_loss(layer.image, view.image, view.static_mask, inputs.config.ssim, inputs.backgrounds[2])
+    background, border = inputs.backgrounds[2], view.mask_border if inputs.config.mask_margin else None
+    return losses.dynamic_loss(layer.image, view.image, view.static_mask, inputs.config.ssim, background, border)
 
 
 def joint(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -37,7 +38,8 @@ def depth(inputs: LossInputs) -> Float[Tensor, ""]:
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
-    return depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, view.static_mask)
+    error = depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, view.static_mask)
+    return error * inputs.depth_trust
 
 
 def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -46,7 +48,8 @@ def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
-    return depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, ~view.static_mask)
+    error = depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, ~view.static_mask)
+    return error * inputs.depth_trust
 
 
 TERMS: dict[str, LossTerm] = {
@@ -62,7 +65,7 @@ TERMS: dict[str, LossTerm] = {
     ),
     "joint": LossTerm(
         joint,
-        is_active=lambda phase, config: phase.stage == "stage2",
+        is_active=lambda phase, config: phase.with_joint,
         weight=lambda plan, config: config.joint,
     ),
     "depth": LossTerm(

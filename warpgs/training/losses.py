@@ -26,6 +26,7 @@ class LossInputs(NamedTuple):
         rendering: Joint, static and dynamic image; with depth where ``Phase.with_depth``.
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
+        depth_trust: Factor of the view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``.
     """
 
     config: LossConfig
@@ -34,6 +35,7 @@ class LossInputs(NamedTuple):
     rendering: Rendering
     backgrounds: Float[Tensor, "3 3"]
     alignment: Float[Tensor, "2"] | None
+    depth_trust: Float[Tensor, ""]
 
 
 class LossTerm(NamedTuple):
@@ -73,9 +75,14 @@ def dynamic_loss(
     static: Bool[Tensor, "H W"],
     ssim_weight: float,
     background: Float[Tensor, "3"],
+    border: Bool[Tensor, "H W"] | None = None,
 ) -> Float[Tensor, ""]:
     """Paper Eq. 12: the dynamic image, rendered over ``background``, against the ground truth masked by 1 − M.
 
-    Only the ground truth is masked: where M = 1 the dynamic image has to show its background.
+    Only the ground truth is masked: where M = 1 the dynamic image has to show its background. In the ``border`` of the
+    mask the image is compared with itself, so that a mask that is a few pixels off teaches it nothing there.
     """
-    return image_loss(image, torch.where(static[..., None], background, truth), ssim_weight)
+    masked = torch.where(static[..., None], background, truth)
+    if border is not None:
+        masked = torch.where(border[..., None], image.detach(), masked)
+    return image_loss(image, masked, ssim_weight)

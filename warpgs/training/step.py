@@ -63,6 +63,7 @@ class Step:
         scene: What is trained; on the device of the views.
         views: Training views.
         alignments: [T, 2] scale and offset of each view's inverse depth; may be changed in place.
+        depth_trust: [T] factor of the depth errors of each view.
         extent: Extent of the capture [scene units].
 
     Attributes:
@@ -77,11 +78,12 @@ class Step:
         scene: SplitScene,
         views: Views,
         alignments: Float[Tensor, "T 2"],
+        depth_trust: Float[Tensor, " T"],
         extent: float,
     ) -> None:
         self.config, self.scene, self.views, self.extent = config, scene, views, extent
         device = views.device
-        self.alignments = alignments
+        self.alignments, self._depth_trust = alignments, depth_trust
         self._index = torch.zeros(1, dtype=torch.int64, device=device)
         sums = (*TERMS, "psnr", "iterations")
         self._inputs = StepInputs(sums, optim.GROUPS, device)
@@ -136,8 +138,9 @@ class Step:
         settings = RenderSettings(branches=True, depth=phase.with_depth, antialias=self.config.antialias, replay=False)
         rendering = render(splats, view.camera, self._inputs.backgrounds, settings)
         alignment = self.alignments.index_select(0, self._index)[0] if phase.with_depth else None
+        trust = self._depth_trust.index_select(0, self._index)[0]
         config, backgrounds = self.config.loss, self._inputs.backgrounds
-        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment)
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
         # The weights are the gradients of the weighted sum, whose value is not needed.
         torch.autograd.backward(list(terms.values()), [self._inputs.scale[name] for name in terms])

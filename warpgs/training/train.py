@@ -88,9 +88,14 @@ def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
     log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {trainer.run}")
+    if num_aligned:
+        error = trainer.depth_errors[trainer.depth_errors.isfinite()].median().item()
+        tolerance = trainer.config.loss.depth_tolerance
+        weight = f", its weight is {1.0 / (1.0 + (error / tolerance) ** 2):.2f}" if tolerance else ""
+        log(f"depth differs from the sparse points by {100 * error:.1f}% (median){weight}")
     if num_aligned < num_views:
         reason = "" if num_aligned else NO_DEPTH
-        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+        log(f"depth agrees with the sparse points in {num_aligned} of {num_views} views{reason}")
 
 
 def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:

@@ -44,6 +44,7 @@ class Trainer:
         scene: What is trained.
         iteration: Iterations done.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
+        depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
         seconds: Training time of earlier sessions of this run [s].
 
     Raises:
@@ -54,12 +55,14 @@ class Trainer:
         self.config, self.run = config, run
         self.capture = capture.assuming(config.assume)
         self.device = torch.device(config.device or "cpu")
-        self.views = Views(self.capture, self.device, config.resident_bytes)
+        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
         self._earlier_peak = 0
-        self.alignments = initialize.align_to_points(self.capture, self.views)
+        depth = initialize.align_to_points(self.capture, self.views)
+        self.alignments, self.depth_errors = depth
+        self._depth_trust = depth.trust(config.loss.depth_tolerance)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.protocol = Protocol(config, has_depth=self.num_aligned > 0)
         self._order: tuple[int, int, list[int]] = (-1, 0, [])
@@ -68,7 +71,7 @@ class Trainer:
     def _set_scene(self, scene: SplitScene) -> None:
         """Replaces the scene, with a new optimizer."""
         self.scene = scene.to(self.device)
-        self.step = Step(self.config, self.scene, self.views, self.alignments, self.capture.extent)
+        self.step = Step(self.config, self.scene, self.views, self.alignments, self._depth_trust, self.capture.extent)
 
     # The algorithm ----------------------------------------------------------------------------------------------------
 
@@ -129,7 +132,8 @@ class Trainer:
         config, branches = self.config.densify, (self.scene.static, self.scene.dynamic)
         means = self.step.statistics.mean().split([len(gaussians) for gaussians in branches])
         generator = self._generator("densify")
-        capacity = config.max_gaussians - sum(len(gaussians) for gaussians in branches)
+        most = min(config.max_gaussians, self.views.num_pixels // max(1, config.min_pixels))
+        capacity = most - sum(len(gaussians) for gaussians in branches)
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]
         for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
             part = capacity * count // max(1, sum(candidates))

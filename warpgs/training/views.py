@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
@@ -18,6 +19,7 @@ class View(NamedTuple):
         time: [1] time in [0, 1].
         image: [H, W, 3] ground truth in [0, 1].
         static_mask: [H, W] M of the paper, true where static.
+        mask_border: [H, W] true within the margin of a border of the mask.
         inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
     """
 
@@ -25,7 +27,17 @@ class View(NamedTuple):
     time: Float[Tensor, "1"]
     image: Float[Tensor, "H W 3"]
     static_mask: Bool[Tensor, "H W"]
+    mask_border: Bool[Tensor, "H W"]
     inverse_depth: Float[Tensor, "H W"]
+
+
+def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
+    """True in pixels that have both static and dynamic pixels within ``margin`` columns and rows."""
+    if margin == 0:
+        return torch.zeros_like(static_mask)
+    values = torch.stack([static_mask, ~static_mask])[None].float()
+    static, dynamic = max_pool2d(values, 2 * margin + 1, stride=1, padding=margin)[0].bool()
+    return static & dynamic
 
 
 class _Stored(NamedTuple):
@@ -36,6 +48,7 @@ class _Stored(NamedTuple):
     time: Tensor
     image: Tensor
     static_mask: Tensor
+    mask_border: Tensor
     inverse_depth: Tensor
 
 
@@ -50,20 +63,23 @@ class Views:
         capture: Source of the frames.
         device: Device of the views.
         resident_bytes: Maximum memory for views on the device [bytes].
+        mask_margin: Half width of the borders of masks, as a fraction of the image's larger side.
 
     Attributes:
         resident: Whether all views are on the device.
+        num_pixels: Number of pixels of all views.
 
     Raises:
         ValueError: If a frame has no mask; the message names it.
     """
 
-    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int) -> None:
-        self.device = device
+    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int, mask_margin: float = 0.0) -> None:
+        self.device, self._mask_margin = device, mask_margin
         self._capture = capture
         first = self._store(capture.frame(capture.train[0]))
-        sizes = {capture.cameras[name].size for name in capture.train}
-        self.resident = len(sizes) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
+        sizes = [capture.cameras[name].size for name in capture.train]
+        self.num_pixels = sum(width * height for width, height in sizes)
+        self.resident = len(set(sizes)) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
         if self.resident:
             stored = [self._store(capture.frame(name)) for name in capture.train]
             self._all = _Stored(*(torch.stack(tensors).to(device) for tensors in zip(*stored, strict=True)))
@@ -88,6 +104,7 @@ class Views:
             stored.time,
             stored.image.float() / 255.0,
             stored.static_mask,
+            stored.mask_border,
             stored.inverse_depth.float(),
         )
 
@@ -100,4 +117,5 @@ class Views:
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
         time = torch.tensor([camera.time])
-        return _Stored(camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())
+        border = mask_border(frame.static_mask, round(self._mask_margin * max(size)))
+        return _Stored(camera.viewmat, camera.K, time, frame.image, frame.static_mask, border, depth.half())
