@@ -1,7 +1,7 @@
 """Trains SplitGaussian from Python; without ``--data`` on the built-in scene, a small ray-traced room.
 
 python examples/train_from_python.py --iterations 300
-python examples/train_from_python.py --data nerfds/as --preset fast --iterations 10000
+python examples/train_from_python.py --data nerfds/as --preset best --iterations 10000
 """
 
 import argparse
