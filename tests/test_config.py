@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from warpgs.config import TrainConfig, scaled, validate
+from warpgs.config import ModelConfig, TrainConfig, fitted_bands, scaled, validate
 from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
@@ -87,3 +87,18 @@ def test_the_default_preset_depends_on_whether_there_is_a_capture(arguments, pre
     config = parse(arguments)
     assert config == dataclasses.replace(PRESETS[preset], data=Path("capture") if arguments else None)
     assert config.preset == preset
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "bands"), [(75, 6), (65, 6), (64, 5), (12, 3), (3, 1), (2, 1), (1, 1), (10_000, 10)]
+)
+def test_frequencies_of_time_are_those_that_the_frames_determine(num_frames, bands):
+    """The highest one has a period of at least 4 frames: 2 (T − 1) / 2ᵏ ≥ 4."""
+    model = ModelConfig(time_bands=10, min_period=4.0)
+    assert fitted_bands(model, num_frames) == bands
+    assert bands == 1 or 2 * (num_frames - 1) / 2 ** (bands - 1) >= 4.0
+
+
+def test_without_a_minimum_period_all_frequencies_are_used():
+    assert fitted_bands(ModelConfig(time_bands=10), 3) == 10
+    assert fitted_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0

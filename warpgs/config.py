@@ -75,6 +75,9 @@ class ModelConfig:
     """Number of frequencies L in the encoding of positions (paper Eq. 6)."""
     time_bands: Annotated[int, Bounds(max=64)] = 10
     """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
+    min_period: float = 0.0
+    """Minimum period of these frequencies, in training frames; higher frequencies are left out. Frames do not determine
+    them, so the networks would memorize the times of the training frames. 0 in the paper: none are left out."""
     depth: Annotated[int, Bounds(min=1, max=64)] = 8
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
@@ -316,6 +319,17 @@ def _check_bounds(prefix: str, config: Any) -> None:
         elif isinstance(value, int | float):
             bounds = (data for data in getattr(hint, "__metadata__", ()) if isinstance(data, Bounds))
             next(bounds, Bounds()).check(prefix + name, value)
+
+
+def fitted_bands(model: ModelConfig, num_frames: int) -> int:
+    """Number of frequencies of time for a capture, at most ``model.time_bands``; see ``ModelConfig.min_period``.
+
+    Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
+    """
+    if model.min_period == 0 or model.time_bands == 0:
+        return model.time_bands
+    periods = 2.0 * max(1, num_frames - 1) / model.min_period
+    return min(model.time_bands, max(1, 1 + math.floor(math.log2(periods)) if periods >= 1 else 1))
 
 
 def scaled(config: TrainConfig) -> TrainConfig:

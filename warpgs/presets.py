@@ -10,7 +10,9 @@ PRESETS: dict[str, TrainConfig] = {
         static_geometry=True,
         static_appearance=True,
         antialias=True,
-        model=ModelConfig(position_bands=6, time_bands=6, appearance_depth=4, appearance_width=128, sh_degree=3),
+        model=ModelConfig(
+            position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
+        ),
         loss=LossConfig(dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
         optim=OptimConfig(means=1.7e-3),
         densify=DensifyConfig(gradient=3e-4),

@@ -133,6 +133,17 @@ def stopped(data, tmp_path):
     return trainer.run
 
 
+def test_a_run_of_few_frames_has_few_frequencies_of_time_and_can_be_resumed(data, tmp_path):
+    model = dataclasses.replace(tiny.MODEL, time_bands=8, min_period=4.0)
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", model=model)
+    lines = []
+    trainer = script.make_trainer(config, lines.append)
+    assert "6 frames determine 2 of the 8 frequencies of time" in lines
+    assert trainer.config.model.time_bands == trainer.scene.deformation.trunk.bands[1] == 2
+    trainer.save()
+    assert script.make_trainer(TrainConfig(resume=trainer.run)).config == trainer.config
+
+
 def test_a_resumed_run_keeps_its_device_unless_another_is_given(stopped, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)  # the default of a new run would be CUDA
     assert script.make_trainer(TrainConfig(resume=stopped)).config.device == "cpu"

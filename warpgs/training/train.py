@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from warpgs.config import TrainConfig, scaled
+from warpgs.config import TrainConfig, fitted_bands, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.evaluation.evaluate_run import evaluate_run
@@ -122,6 +122,10 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
     locate(config.lpips)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
+    bands = fitted_bands(config.model, len(capture.train))
+    if bands < config.model.time_bands:
+        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     trainer = Trainer(config, capture, new_folder(config, capture))
     Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
     return trainer
