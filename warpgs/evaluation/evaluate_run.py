@@ -17,8 +17,9 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.video.mp4 import Video
 
-from .evaluate import Evaluation, evaluate, write_views
+from .evaluate import evaluate, write_views
 from .lpips import find
+from .motion import jitter
 
 NUM_IMAGES = 6
 """Evaluation views to save as images, spread over the capture."""
@@ -61,11 +62,12 @@ def evaluate_run(
             write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
 
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, quiet)
-    counts = {"num_static": len(scene.scene.static), "num_dynamic": len(scene.scene.dynamic)}
-    write_json(folder / "metrics.json", {**evaluation.summary(), **_training(scene), **counts, "commit": commit()})
+    times = [capture.cameras[name].time for name in capture.train]
+    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), **_training(scene)}
+    write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
-    return _summary(evaluation, counts)
+    return _summary(values)
 
 
 def _training(scene: TrainedScene) -> dict[str, Any]:
@@ -74,6 +76,8 @@ def _training(scene: TrainedScene) -> dict[str, Any]:
         "iterations": metadata.iteration,
         "train_seconds": metadata.train_seconds,
         "peak_bytes": metadata.peak_bytes,
+        "num_static": len(scene.scene.static),
+        "num_dynamic": len(scene.scene.dynamic),
     }
 
 
@@ -90,24 +94,22 @@ def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool)
             video.add(visualize.to_bytes(torch.cat(images, 1)))
 
 
-def _summary(evaluation: Evaluation, counts: dict[str, int]) -> str:
-    values = evaluation.summary()
-
+def _summary(values: dict[str, Any]) -> str:
     def show(name: str, digits: int) -> str:
         value = values[name]
         return "not measured" if value is None else f"{value:.{digits}f}"
 
-    last_line = f"{counts['num_static']:,} static and {counts['num_dynamic']:,} dynamic Gaussians"
-    if not evaluation.views:
+    last_line = f"{values['num_static']:,} static and {values['num_dynamic']:,} dynamic Gaussians"
+    motion = f"flicker {show('flicker', 5)}, jitter {show('jitter', 3)}, {show('fps', 1)} FPS"
+    if not values["num_views"]:
         quality = "the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"
-        return f"{quality}\nflicker {show('flicker', 5)}, {show('fps', 1)} FPS\n{last_line}"
-    lpips = f"LPIPS ({evaluation.lpips_net}) {show('lpips', 4)}"
-    if evaluation.lpips_net is None:
+        return f"{quality}\n{motion}\n{last_line}"
+    lpips = f"LPIPS ({values['lpips_net']}) {show('lpips', 4)}"
+    if values["lpips_net"] is None:
         lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
     lines = [
         f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
-        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, "
-        f"flicker {show('flicker', 5)}, {show('fps', 1)} FPS",
+        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, {motion}",
         last_line,
     ]
     if values["masked_psnr"] is not None:

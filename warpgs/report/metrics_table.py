@@ -20,7 +20,7 @@ HIGHER = {
     "masked_ssim",
     "fps",
 }
-LOWER = {"lpips", "flicker", "train_seconds", "peak_bytes"}
+LOWER = {"lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
 """Metrics of which higher, or lower, values are better."""
 
 TITLES = {
