@@ -87,7 +87,7 @@ class ModelConfig:
     appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
     """Number of units per hidden layer of the appearance network; that of both networks if None."""
     skip: int = 4
-    """Hidden layer after which the encoding is concatenated again."""
+    """Hidden layer after which the encoding is concatenated again; nowhere if it is the last one or beyond."""
     deformation: str = "mlp"
     """Deformation model of the dynamic Gaussians (a key of FIELDS in warpgs/model/fields.py)."""
     sh_degree: int = 1
@@ -118,6 +118,8 @@ class LossConfig:
     """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
     joint: float = 1.0
     """Weight of the joint image against the whole ground truth, in stage II."""
+    stage1_joint: bool = False
+    """Whether stage I compares the joint image, too."""
     dynamic_background: Literal["black", "random"] = "random"
     """Background of the dynamic image: black (paper), or a random colour per iteration, so that black Gaussians cannot
     hide in front of it."""
@@ -129,7 +131,8 @@ class LossConfig:
     """Final λ_depth; it decays exponentially."""
     depth_tolerance: float = 0.0
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
-    by 1 + (error / tolerance)². If 0, all views have the same weight (paper)."""
+    by 1 + (error / tolerance)², and depth that is hardly better than a constant is not used. If 0, all views have the
+    same weight (paper)."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along the borders of masks in which the dynamic image is not compared, as a fraction of
     the image's larger side; 0 in the paper. Masks are a few pixels off, and the rim of background inside them would be
@@ -174,9 +177,8 @@ class DensifyConfig:
     """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
-    min_pixels: int = 8
-    """Minimum number of training pixels per Gaussian: more Gaussians than these are not needed to fit all views, and
-    short captures would be memorized."""
+    min_pixels: int = 0
+    """Minimum number of training pixels per Gaussian: densification stops where there are fewer. 0: no limit."""
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
 
@@ -249,8 +251,8 @@ class TrainConfig:
     """Run folder to continue from its newest checkpoint."""
     preset: Literal["paper", "best", "fast", "patient", "quick"] = "paper"
     """Defaults of everything below: best (one GPU, minutes), paper (72k iterations, closer to the paper), fast (one
-    GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). The default is best for a
-    capture and quick for the built-in scene."""
+    GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). On the command line the
+    default is best for a capture and quick for the built-in scene."""
     iterations: Annotated[int | None, Bounds(min=3)] = None
     """Total iterations; every schedule is rescaled to it."""
     device: Literal["cuda", "cpu"] | None = None
@@ -265,14 +267,14 @@ class TrainConfig:
     """Appearance network of the static Gaussians, from ``schedule.appearance_from`` on."""
     stage2: bool = True
     """Joint optimization; without it, its iterations are added to stage I."""
-    stage1_joint: bool = False
-    """Whether stage I compares the joint image, too. In the paper only stage II does."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
     static_geometry: bool = False
     """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
     static_appearance: bool = False
     """Whether stage II still optimizes w⁰, the appearance to which residuals are added."""
+    exposure: bool = False
+    """Divide jumps of exposure and white balance between frames out of the training images."""
     antialias: bool = False
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     graph: bool = True
@@ -322,14 +324,16 @@ def _check_bounds(prefix: str, config: Any) -> None:
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:
-    """Number of frequencies of time for a capture, at most ``model.time_bands``; see ``ModelConfig.min_period``.
+    """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
+
+    See ``ModelConfig.min_period``.
 
     Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
     """
     if model.min_period == 0 or model.time_bands == 0:
         return model.time_bands
-    periods = 2.0 * max(1, num_frames - 1) / model.min_period
-    return min(model.time_bands, max(1, 1 + math.floor(math.log2(periods)) if periods >= 1 else 1))
+    periods = 2.0 * (num_frames - 1) / model.min_period
+    return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))
 
 
 def scaled(config: TrainConfig) -> TrainConfig:

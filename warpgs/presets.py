@@ -6,16 +6,16 @@ from .config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedul
 
 BEST = TrainConfig(
     preset="best",
-    stage1_joint=True,
     static_geometry=True,
     static_appearance=True,
+    exposure=True,
     antialias=True,
     model=ModelConfig(
         position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
     ),
-    loss=LossConfig(dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
+    loss=LossConfig(stage1_joint=True, dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
     optim=OptimConfig(means=1.7e-3),
-    densify=DensifyConfig(gradient=3e-4),
+    densify=DensifyConfig(gradient=3e-4, min_pixels=8),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
@@ -69,7 +69,7 @@ PATIENT = dataclasses.replace(
     ),
     loss=dataclasses.replace(BEST.loss, ssim=0.0),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
-    densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000),
+    densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8),
     schedule=Schedule(
         pretrain=300,
         stage1=2_400,
@@ -101,7 +101,7 @@ QUICK = dataclasses.replace(
         max_static_points=4_000,
         dynamic_points=1_500,
     ),
-    densify=DensifyConfig(gradient=4e-4, max_gaussians=10_000),
+    densify=DensifyConfig(gradient=4e-4, max_gaussians=10_000, min_pixels=8),
     schedule=Schedule(
         pretrain=200,
         stage1=1_000,
@@ -116,7 +116,6 @@ QUICK = dataclasses.replace(
         noise_until=400,
         sh_degree_every=400,
     ),
-    checkpoint_every=500,
 )
 
 PRESETS = {"paper": TrainConfig(), "best": BEST, "fast": FAST, "patient": PATIENT, "quick": QUICK}

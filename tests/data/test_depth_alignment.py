@@ -6,7 +6,14 @@ import torch
 from scipy.optimize import linprog
 
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera, relative_error
-from warpgs.data.depth_alignment import align_to_points, align_to_rendering, fit_scale_offset, metric_depth
+from warpgs.data.depth_alignment import (
+    align_to_points,
+    align_to_rendering,
+    fit_scale_offset,
+    is_unusable,
+    metric_depth,
+    relative_errors,
+)
 
 CAMERA = make_camera()
 SCALE, OFFSET = 1.7, 0.2
@@ -230,3 +237,49 @@ def test_unknown_inverse_depth_stays_unknown():
 
 def test_all_depth_of_a_frame_that_is_not_aligned_is_unknown():
     assert metric_depth(random_inverse_depth(), torch.full((2,), torch.nan)).isnan().all()
+
+
+# Errors at points ----------------------------------------------------------------------------------------------------
+
+
+def test_errors_are_those_of_aligned_depth_and_of_a_constant():
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+    wrong = 1.1 * torch.tensor([SCALE, OFFSET])
+    found = relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, wrong)
+    z = CAMERA.project(points)[2]
+    assert error(found[0], torch.tensor(0.1)) < 1e-4
+    assert error(found[1], ((1.0 / z).median() * z - 1.0).abs().median()) < 1e-5
+    assert error(relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, ALIGNMENT)[0], torch.tensor(0.0)) < 1e-4
+
+
+def test_errors_of_points_in_dynamic_regions_do_not_count():
+    inverse_depth = random_inverse_depth()
+    static = EVERYWHERE.clone()
+    static[:, :25] = False
+    points = points_behind(inverse_depth, range(2, 30, 3), range(27, 45, 4))
+    wrong = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 25, 5))
+    found = relative_errors(inverse_depth, static, CAMERA, torch.cat([points, wrong]), ALIGNMENT)
+    assert found[0] < 1e-4
+
+
+@pytest.mark.parametrize("alignment", [ALIGNMENT, torch.full((2,), torch.nan)])
+def test_errors_are_infinite_without_points_or_alignment(alignment):
+    inverse_depth = random_inverse_depth()
+    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))[: 0 if alignment.isfinite().all() else None]
+    assert relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, alignment).isinf().all()
+
+
+@pytest.mark.parametrize(
+    ("depth_error", "constant_error", "unusable"),
+    [
+        (0.055, 0.4, False),  # a depth network
+        (0.38, 0.4, True),  # noise
+        (0.02, 0.03, False),  # a shallow scene: hardly better than a constant, and still exact
+        (0.15, 0.3, False),
+        (0.3, 0.6, False),
+        (torch.inf, torch.inf, False),  # unknown
+    ],
+)
+def test_depth_is_unusable_if_it_is_wrong_and_hardly_better_than_a_constant(depth_error, constant_error, unusable):
+    assert bool(is_unusable(torch.tensor([depth_error, constant_error]))) == unusable

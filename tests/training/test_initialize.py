@@ -376,34 +376,35 @@ def aligned(factor, signal=1.0):
 
 
 def test_exact_depth_is_trusted_whatever_the_tolerance():
-    depth = aligned(0.0)
-    assert (depth.errors < 2e-3).all()  # depth is stored in half precision
-    assert error(depth.alignments, torch.tensor([[1.0, 0.0]] * 3)) < 2e-2
-    assert (depth.trust(0.03) > 0.99).all()
+    found = aligned(0.0)
+    assert (found.errors[:, 0] < 2e-3).all()  # depth is stored in half precision
+    assert error(found.alignments, torch.tensor([[1.0, 0.0]] * 3)) < 2e-2
+    assert (found.trust(0.03) > 0.99).all()
 
 
 def test_trust_is_a_half_at_the_tolerance():
-    depth = aligned(0.1)
-    tolerance = depth.errors[0].item()
+    found = aligned(0.1)
+    tolerance = found.errors[0, 0].item()
     assert 0.02 < tolerance < 0.1
-    assert error(depth.trust(tolerance), torch.full((3,), 0.5)) < 1e-6
-    assert error(depth.trust(tolerance / 3.0), torch.full((3,), 0.1)) < 1e-6
+    assert error(found.trust(tolerance), torch.full((3,), 0.5)) < 1e-6
+    assert error(found.trust(tolerance / 3.0), torch.full((3,), 0.1)) < 1e-6
 
 
-def test_without_a_tolerance_every_aligned_view_is_trusted():
+def test_depth_that_is_noise_is_not_trusted():
+    assert torch.equal(aligned(0.5, signal=0.0).trust(0.03), torch.zeros(3))
+
+
+def test_without_a_tolerance_every_view_is_trusted():
     assert torch.equal(aligned(0.1).trust(0.0), torch.ones(3))
+    assert torch.equal(aligned(0.5, signal=0.0).trust(0.0), torch.ones(3))
 
 
-def test_depth_that_is_noise_is_neither_aligned_nor_trusted():
-    depth = aligned(0.5, signal=0.0)
-    assert depth.alignments.isnan().all()
-    assert torch.equal(depth.trust(0.03), torch.zeros(3))
-    assert torch.equal(depth.trust(0.0), torch.zeros(3))
+def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
+    errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
+    trust = initialize.DepthAlignment(torch.ones(4, 2), errors).trust(0.03)
+    assert error(trust, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
-def test_a_view_whose_depth_is_refused_stays_so_when_depth_is_aligned_to_the_rendering():
-    capture = make_capture(random_points(9), inverse_depth=constant_depth())
-    scene = initialize.initial_scene(CONFIG, capture, generator())
-    views = Views(capture, torch.device("cpu"), 1 << 30)
-    refused = torch.full((3, 2), torch.nan)
-    assert initialize.align_to_rendering(refused, views, scene, 0).isnan().all()
+def test_without_points_nothing_is_refused():
+    found = initialize.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf))
+    assert torch.equal(found.trust(0.03), torch.ones(2))

@@ -260,9 +260,9 @@ def prepared(stage, loss=LOSS, at=0, trust=1.0, **options):
     return scene, plan, Step(config, scene, views, ALIGNMENTS, torch.tensor([trust]), capture.extent)
 
 
-def terms_of(stage, loss=LOSS, **options):
+def terms_of(stage, loss=LOSS):
     """The weighted terms of the first iteration of a stage, and the rendering that they compare."""
-    scene, plan, step = prepared(stage, loss, **options)
+    scene, plan, step = prepared(stage, loss)
     phase = plan.phase
     with torch.no_grad():
         splats = scene.splats(torch.zeros(1), phase.use_deformation, phase.use_appearance, phase.sh_degree)
@@ -339,10 +339,11 @@ def test_the_dynamic_term_leaves_out_the_margin_of_the_mask():
 
 
 def test_the_config_compares_the_joint_image_in_stage_1_already():
-    terms, rendering = terms_of("stage1", stage1_joint=True)
+    loss = dataclasses.replace(LOSS, stage1_joint=True)
+    terms, rendering = terms_of("stage1", loss)
     assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
     assert terms_of("stage1")[0]["joint"] == 0.0
-    assert terms_of("pretrain", stage1_joint=True)[0]["joint"] == 0.0
+    assert terms_of("pretrain", loss)[0]["joint"] == 0.0
 
 
 def test_depth_terms_are_multiplied_by_the_trust_in_the_view():

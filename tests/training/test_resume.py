@@ -14,6 +14,7 @@ from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
 from warpgs.evaluation import evaluate_run
+from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.training import command
 from warpgs.training import train as script
@@ -131,6 +132,23 @@ def stopped(data, tmp_path):
     trainer = script.make_trainer(config)
     tiny.train(trainer, tiny.StopWhen(lambda: trainer.iteration >= 10))
     return trainer.run
+
+
+def test_a_run_with_the_options_for_captures_resumes_bit_by_bit(data, tmp_path):
+    """Margins, trust in depth and exposure are computed anew from the capture."""
+    model, loss = dataclasses.replace(tiny.MODEL, appearance_depth=1, appearance_width=4), PRESETS["best"].loss
+    densify = dataclasses.replace(tiny.CONFIG.densify, min_pixels=40)
+    options = {"antialias": True, "exposure": True, "static_geometry": True, "static_appearance": True}
+    config = dataclasses.replace(tiny.CONFIG, model=model, loss=loss, densify=densify, **options)
+    whole = tiny.trainer(data, tmp_path / "whole", config)
+    tiny.train(whole)
+    first = tiny.trainer(data, tmp_path / "parts", config)
+    tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 12))
+    second = tiny.trainer(data, tmp_path / "parts", config)
+    second.restore_newest()
+    assert second.iteration == 12
+    tiny.train(second)
+    assert tiny.differences(tiny.state(tmp_path / "whole"), tiny.state(tmp_path / "parts")) == []
 
 
 def test_a_run_of_few_frames_has_few_frequencies_of_time_and_can_be_resumed(data, tmp_path):

@@ -52,7 +52,9 @@ def test_a_run_ends_with_a_summary_of_its_metrics(finished):
 
 
 def test_a_run_says_how_far_its_depth_can_be_trusted(finished):
-    assert re.search(r"depth differs from the sparse points by 0\.\d% \(median\)", finished[0].stdout)
+    assert re.search(
+        r"depth is off by 0\.\d% at the sparse points, its weight is 1\.00 \(medians\)", finished[0].stdout
+    )
 
 
 def test_a_run_that_is_being_trained_cannot_be_resumed(finished):

@@ -139,8 +139,19 @@ def test_a_mask_of_one_region_has_no_border(value):
     assert not mask_border(torch.full((7, 9), value), 3).any()
 
 
-def test_without_a_margin_there_is_no_border():
-    assert not mask_border(torch.rand(7, 9) > 0.5, 0).any()
+def test_without_a_margin_there_is_no_border(capture):
+    bare = capture.assuming("static")
+    assert Views(bare, CPU, PLENTY)[0].mask_border is None
+    assert Views(bare, CPU, 0)[0].mask_border is None
+
+
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_gains_divide_images(capture, resident_bytes):
+    bare = capture.assuming("static")
+    gains = torch.rand(len(bare.train), 3) + 0.5
+    views, plain = Views(bare, CPU, resident_bytes, gains=gains), Views(bare, CPU, resident_bytes)
+    for index in range(len(views)):
+        assert torch.equal(views[index].image, plain[index].image / gains[index])
 
 
 def test_the_margin_is_relative_to_the_larger_side(tmp_path):

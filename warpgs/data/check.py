@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import torch
 from warpgs.cameras import Camera
 
 from .capture import MIN_EXTENT, Capture, Frame
-from .depth_alignment import align_to_points
+from .depth_alignment import align_to_points, is_unusable, relative_errors
 from .loaders import load_capture, recognize
 from .motion_check import motion_between
 
@@ -35,9 +34,6 @@ MAX_FRACTION_AT_CAMERAS = 0.01
 
 MAX_DYNAMIC_FRACTION = 0.4
 """Mean fraction of dynamic pixels; masks with more are rarely correct."""
-
-MAX_DEPTH_ERROR = 0.25
-"""Maximum median relative error of aligned depth at the points."""
 
 MAX_EPIPOLAR_DISTANCE = 3.0
 """Maximum median distance of static pixels from their epipolar lines [px]; more means that cameras and images do not
@@ -226,7 +222,7 @@ def _depth(capture: Capture) -> Iterator[Finding]:
     """Aligns the depth of the sampled frames to the points and measures its error."""
     if len(capture.points) == 0:
         return
-    errors, failed, count = [], 0, 0
+    errors, failed, unusable, count = [], 0, 0, 0
     for name in _sampled(capture.train, SAMPLES):
         frame = capture.frame(name)
         if frame.inverse_depth is None:
@@ -234,21 +230,21 @@ def _depth(capture: Capture) -> Iterator[Finding]:
         count += 1
         everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
         static = everywhere if frame.static_mask is None else frame.static_mask
-        a, b = align_to_points(frame.inverse_depth, static, frame.camera, capture.points).tolist()
-        row, column, z, inside = frame.camera.project(capture.points)
-        aligned = a * frame.inverse_depth[row, column] + b
-        known = inside & aligned.isfinite() & static[row, column]
-        if not math.isfinite(a) or not bool(known.any()):
+        sources = (frame.inverse_depth, static, frame.camera, capture.points)
+        found = relative_errors(*sources, align_to_points(*sources))
+        if not bool(found.isfinite().all()):
             failed += 1
             continue
-        errors.append(float((aligned[known] * z[known] - 1.0).abs().median()))
+        errors.append(float(found[0]))
+        unusable += int(is_unusable(found))
     if failed:
         text = f"the depth of {failed} of {count} frames cannot be aligned to the points"
         yield Finding("warning", "depth", f"{text}: it must be inverse depth, larger is closer")
     if errors:
         median = float(np.median(errors))
-        level: Level = "warning" if median > MAX_DEPTH_ERROR else "note"
-        yield Finding(level, "depth", f"aligned depth is {median:.1%} off at the points (median)")
+        yield Finding("note", "depth", f"aligned depth is {median:.1%} off at the points (median)")
+    if unusable:
+        yield Finding("warning", "depth", f"the depth of {unusable} of {count} frames is hardly better than a constant")
 
 
 def _motion(capture: Capture) -> Iterator[Finding]:

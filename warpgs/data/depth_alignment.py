@@ -1,11 +1,15 @@
 """Alignment of monocular depth: a scale and an offset of inverse depth per frame (paper, Sec. DAP)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.kernels.constants import MIN_INVERSE_DEPTH
+
+MAX_ERROR, MAX_ERROR_OF_CONSTANT = 0.1, 0.6
+"""Depth is unusable if its relative error exceeds both the first, and the second times that of a constant depth. The
+error of a depth network is about 0.05, 0.15 times that of a constant; that of noise is about that of a constant."""
 
 REWEIGHTINGS = 50
 """Iterations of reweighted least squares; enough to converge with 30 % outliers."""
@@ -75,6 +79,12 @@ def relative_errors(
         return z.new_full((2,), torch.inf)
     aligned, z = aligned[known], z[known]
     return torch.stack([(aligned * z - 1.0).abs().median(), ((1.0 / z).median() * z - 1.0).abs().median()])
+
+
+def is_unusable(errors: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:
+    """Whether depth of these ``relative_errors`` is hardly better than a constant; false where they are infinite."""
+    error, constant_error = errors.unbind(-1)
+    return error.isfinite() & (error > MAX_ERROR) & (error > MAX_ERROR_OF_CONSTANT * constant_error)
 
 
 def align_to_rendering(

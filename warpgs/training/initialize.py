@@ -39,10 +39,6 @@ MAX_POINTS_PER_IMAGE = 2_000
 PIXELS_PER_CHUNK = 8_192
 """Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
 
-MAX_DEPTH_ERROR = 0.6
-"""Error of aligned depth at the sparse points, relative to that of the same depth everywhere, above which a view's
-depth is not used. That of a depth network is about 0.15, that of noise about 1."""
-
 MAX_SCALE_FRACTION = 0.5
 """Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
 
@@ -165,32 +161,36 @@ class DepthAlignment(NamedTuple):
     """Alignment of each view's inverse depth to the sparse points.
 
     Attributes:
-        alignments: [T, 2] scale and offset; NaN where they cannot be determined, and where aligned depth is so wrong
-            that it is not used.
-        errors: [T] median relative error of aligned depth at the points; infinite where not aligned.
+        alignments: [T, 2] scale and offset; NaN where the points do not determine them.
+        errors: [T, 2] of aligned depth and of a constant depth; see ``depth_alignment.relative_errors``.
     """
 
     alignments: Float[Tensor, "T 2"]
-    errors: Float[Tensor, " T"]
+    errors: Float[Tensor, "T 2"]
 
     def trust(self, tolerance: float) -> Float[Tensor, " T"]:
-        """Factor of each view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``."""
-        aligned = self.errors.isfinite()
-        return torch.where(aligned, 1.0 / (1.0 + (self.errors / tolerance) ** 2), 0.0) if tolerance else aligned.float()
+        """Factor of each view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``.
+
+        It is 0 for depth that is not to be used. Views with too few points have the median of the others.
+        """
+        if tolerance == 0.0:
+            return torch.ones_like(self.errors[:, 0])
+        trust = 1.0 / (1.0 + (self.errors[:, 0] / tolerance) ** 2)
+        known, refused = self.errors[:, 0].isfinite(), depth_alignment.is_unusable(self.errors)
+        typical = trust[known].median() if bool(known.any()) else trust.new_tensor(1.0)
+        return torch.where(refused, 0.0, torch.where(known, trust, typical))
 
 
 def align_to_points(capture: Capture, views: Views) -> DepthAlignment:
     """Aligns each view's inverse depth to the sparse points."""
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
-    errors = torch.full((len(views),), torch.inf, device=views.device)
+    errors = torch.full((len(views), 2), torch.inf, device=views.device)
     points = capture.points.to(views.device)
     for index in range(len(views)):
         view = views[index]
         sources = (view.inverse_depth, view.static_mask, view.camera, points)
-        alignment = depth_alignment.align_to_points(*sources)
-        error, constant_error = depth_alignment.relative_errors(*sources, alignment)
-        if error <= MAX_DEPTH_ERROR * constant_error < torch.inf:
-            alignments[index], errors[index] = alignment, error
+        alignments[index] = depth_alignment.align_to_points(*sources)
+        errors[index] = depth_alignment.relative_errors(*sources, alignments[index])
     return DepthAlignment(alignments, errors)
 
 
@@ -198,7 +198,7 @@ def align_to_points(capture: Capture, views: Views) -> DepthAlignment:
 def align_to_rendering(
     alignments: Float[Tensor, "T 2"], views: Views, scene: SplitScene, sh_degree: int, antialias: bool = False
 ) -> Float[Tensor, "T 2"]:
-    """Scale and offset of the views that are aligned already, against the rendered depth where it determines them."""
+    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
     splats = scene.static_splats(sh_degree)
     settings = RenderSettings(depth=True, antialias=antialias)
     found = alignments.clone()
@@ -209,4 +209,4 @@ def align_to_rendering(
         found[index] = depth_alignment.align_to_rendering(
             view.inverse_depth, view.static_mask, layer.depth, layer.alpha
         )
-    return torch.where(found.isfinite() & alignments.isfinite(), found, alignments)
+    return torch.where(found.isfinite(), found, alignments)

@@ -23,8 +23,8 @@ def dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     """The dynamic image against the masked ground truth (Eq. 12), except along the borders of the mask."""
     view, layer = inputs.view, inputs.rendering.dynamic
     assert layer is not None
-    background, border = inputs.backgrounds[2], view.mask_border if inputs.config.mask_margin else None
-    return losses.dynamic_loss(layer.image, view.image, view.static_mask, inputs.config.ssim, background, border)
+    images = (layer.image, view.image, view.static_mask)
+    return losses.dynamic_loss(*images, inputs.config.ssim, inputs.backgrounds[2], view.mask_border)
 
 
 def joint(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -65,7 +65,7 @@ TERMS: dict[str, LossTerm] = {
     ),
     "joint": LossTerm(
         joint,
-        is_active=lambda phase, config: phase.with_joint,
+        is_active=lambda phase, config: phase.stage == "stage2" or (config.stage1_joint and phase.stage == "stage1"),
         weight=lambda plan, config: config.joint,
     ),
     "depth": LossTerm(

@@ -80,7 +80,8 @@ def dynamic_loss(
     """Paper Eq. 12: the dynamic image, rendered over ``background``, against the ground truth masked by 1 − M.
 
     Only the ground truth is masked: where M = 1 the dynamic image has to show its background. In the ``border`` of the
-    mask the image is compared with itself, so that a mask that is a few pixels off teaches it nothing there.
+    mask, which may be a few pixels off, the image is compared with itself: L1 is 0 there, and SSIM near it is closer
+    to 1.
     """
     masked = torch.where(static[..., None], background, truth)
     if border is not None:

@@ -38,7 +38,6 @@ class Phase:
         use_deformation: Whether the deformation network is in use.
         use_appearance: Whether the appearance network is in use.
         sh_degree: Maximum degree of spherical harmonics in use.
-        with_joint: Whether the joint image is compared.
         with_depth: Whether depth is rendered and compared.
     """
 
@@ -46,7 +45,6 @@ class Phase:
     use_deformation: bool
     use_appearance: bool
     sh_degree: int
-    with_joint: bool
     with_depth: bool
 
 
@@ -110,13 +108,11 @@ class Protocol:
     def phase_at(self, iteration: int) -> Phase:
         """Everything that the training step of an iteration branches on."""
         config, in_stage1 = self.config, iteration - self.stage1.start
-        stage = self.stage_at(iteration).name
         return Phase(
-            stage=stage,
+            stage=self.stage_at(iteration).name,
             use_deformation=in_stage1 >= self._network_starts["deformation"],
             use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
-            with_joint=stage == "stage2" or (stage == "stage1" and config.stage1_joint),
             with_depth=self.has_depth and config.dap and config.loss.depth > 0.0,
         )
 

@@ -88,14 +88,19 @@ def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
     log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {trainer.run}")
-    if num_aligned:
-        error = trainer.depth_errors[trainer.depth_errors.isfinite()].median().item()
-        tolerance = trainer.config.loss.depth_tolerance
-        weight = f", its weight is {1.0 / (1.0 + (error / tolerance) ** 2):.2f}" if tolerance else ""
-        log(f"depth differs from the sparse points by {100 * error:.1f}% (median){weight}")
-    if num_aligned < num_views:
+    if jumps := int((trainer.gains != 1.0).any(1).sum()):
+        low, high = trainer.gains.min().item(), trainer.gains.max().item()
+        log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")
+    refused = int((trainer.depth_trust == 0).sum())
+    if num_aligned and trainer.protocol.phase_at(0).with_depth:
+        used = trainer.depth_trust > 0
+        error, trust = trainer.depth_errors[used].median().item(), trainer.depth_trust[used].median().item()
+        log(f"depth is off by {error:.1%} at the sparse points, its weight is {trust:.2f} (medians)")
+    if refused:
+        log(f"depth of {refused} of {num_views} views is hardly better than a constant and is not used")
+    if num_aligned < num_views - refused:
         reason = "" if num_aligned else NO_DEPTH
-        log(f"depth agrees with the sparse points in {num_aligned} of {num_views} views{reason}")
+        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
 
 
 def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:

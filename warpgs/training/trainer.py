@@ -9,6 +9,7 @@ import torch
 
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
+from warpgs.data.exposure import exposure_gains
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 
@@ -43,8 +44,10 @@ class Trainer:
         capture: The capture, with the masks that ``config.assume`` implies.
         scene: What is trained.
         iteration: Iterations done.
+        gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
+        depth_trust: [T] factor of each view's depth errors, in [0, 1]; 0 = the depth is not used.
         seconds: Training time of earlier sessions of this run [s].
 
     Raises:
@@ -55,14 +58,15 @@ class Trainer:
         self.config, self.run = config, run
         self.capture = capture.assuming(config.assume)
         self.device = torch.device(config.device or "cpu")
-        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin)
+        self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
+        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, self.gains)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
         self._earlier_peak = 0
-        depth = initialize.align_to_points(self.capture, self.views)
-        self.alignments, self.depth_errors = depth
-        self._depth_trust = depth.trust(config.loss.depth_tolerance)
+        found = initialize.align_to_points(self.capture, self.views)
+        self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
+        self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.protocol = Protocol(config, has_depth=self.num_aligned > 0)
         self._order: tuple[int, int, list[int]] = (-1, 0, [])
@@ -71,7 +75,7 @@ class Trainer:
     def _set_scene(self, scene: SplitScene) -> None:
         """Replaces the scene, with a new optimizer."""
         self.scene = scene.to(self.device)
-        self.step = Step(self.config, self.scene, self.views, self.alignments, self._depth_trust, self.capture.extent)
+        self.step = Step(self.config, self.scene, self.views, self.alignments, self.depth_trust, self.capture.extent)
 
     # The algorithm ----------------------------------------------------------------------------------------------------
 
@@ -113,7 +117,7 @@ class Trainer:
             aligned = initialize.align_to_rendering(
                 self.alignments, self.views, scene, sh_degree, self.config.antialias
             )
-            self.alignments.copy_(aligned)
+            self.alignments.copy_(torch.where(self.depth_trust[:, None] > 0, aligned, torch.nan))
         if plan.densify:
             self._densify(plan.remove_large)
         if plan.prune:
@@ -132,7 +136,9 @@ class Trainer:
         config, branches = self.config.densify, (self.scene.static, self.scene.dynamic)
         means = self.step.statistics.mean().split([len(gaussians) for gaussians in branches])
         generator = self._generator("densify")
-        most = min(config.max_gaussians, self.views.num_pixels // max(1, config.min_pixels))
+        most = config.max_gaussians
+        if config.min_pixels:
+            most = min(most, self.views.num_pixels // config.min_pixels)
         capacity = most - sum(len(gaussians) for gaussians in branches)
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]
         for gaussians, gradients, count in zip(branches, means, candidates, strict=True):

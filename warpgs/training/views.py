@@ -1,11 +1,13 @@
 """Training views on the device."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
@@ -17,9 +19,9 @@ class View(NamedTuple):
     Attributes:
         camera: The camera. Use ``time`` instead of ``camera.time``, which is not on the device.
         time: [1] time in [0, 1].
-        image: [H, W, 3] ground truth in [0, 1].
+        image: [H, W, 3] ground truth in [0, 1], without jumps of exposure if they are divided out.
         static_mask: [H, W] M of the paper, true where static.
-        mask_border: [H, W] true within the margin of a border of the mask.
+        mask_border: [H, W] true within the margin of a border of the mask; None without a margin.
         inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
     """
 
@@ -27,17 +29,15 @@ class View(NamedTuple):
     time: Float[Tensor, "1"]
     image: Float[Tensor, "H W 3"]
     static_mask: Bool[Tensor, "H W"]
-    mask_border: Bool[Tensor, "H W"]
+    mask_border: Bool[Tensor, "H W"] | None
     inverse_depth: Float[Tensor, "H W"]
 
 
 def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
     """True in pixels that have both static and dynamic pixels within ``margin`` columns and rows."""
-    if margin == 0:
-        return torch.zeros_like(static_mask)
-    values = torch.stack([static_mask, ~static_mask])[None].float()
-    static, dynamic = max_pool2d(values, 2 * margin + 1, stride=1, padding=margin)[0].bool()
-    return static & dynamic
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    static, dynamic = (cv2.dilate(mask.numpy().astype(np.uint8), kernel) for mask in (static_mask, ~static_mask))
+    return torch.from_numpy(static & dynamic).bool()
 
 
 class _Stored(NamedTuple):
@@ -48,8 +48,17 @@ class _Stored(NamedTuple):
     time: Tensor
     image: Tensor
     static_mask: Tensor
-    mask_border: Tensor
     inverse_depth: Tensor
+    mask_border: Tensor | None
+    gain: Tensor | None
+
+    def nbytes(self) -> int:
+        """Memory of all tensors [bytes]."""
+        return sum(tensor.nbytes for tensor in self if tensor is not None)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "_Stored":
+        """Applies a function to every tensor."""
+        return _Stored._make(None if tensor is None else function(tensor) for tensor in self)
 
 
 class Views:
@@ -64,6 +73,7 @@ class Views:
         device: Device of the views.
         resident_bytes: Maximum memory for views on the device [bytes].
         mask_margin: Half width of the borders of masks, as a fraction of the image's larger side.
+        gains: [T, 3] what images are divided by, per channel; nothing if None.
 
     Attributes:
         resident: Whether all views are on the device.
@@ -73,36 +83,46 @@ class Views:
         ValueError: If a frame has no mask; the message names it.
     """
 
-    def __init__(self, capture: Capture, device: torch.device, resident_bytes: int, mask_margin: float = 0.0) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        device: torch.device,
+        resident_bytes: int,
+        mask_margin: float = 0.0,
+        gains: Float[Tensor, "T 3"] | None = None,
+    ) -> None:
         self.device, self._mask_margin = device, mask_margin
+        self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
         self._capture = capture
         first = self._store(capture.frame(capture.train[0]))
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
-        self.resident = len(set(sizes)) == 1 and len(self) * sum(t.nbytes for t in first) <= resident_bytes
+        self.resident = len(set(sizes)) == 1 and len(self) * first.nbytes() <= resident_bytes
         if self.resident:
             stored = [self._store(capture.frame(name)) for name in capture.train]
-            self._all = _Stored(*(torch.stack(tensors).to(device) for tensors in zip(*stored, strict=True)))
+            parts = zip(*stored, strict=True)
+            self._all = _Stored._make(None if part[0] is None else torch.stack(part).to(device) for part in parts)
 
     def __len__(self) -> int:
         return len(self._capture.train)
 
     def __getitem__(self, index: int) -> View:
         if self.resident:
-            return self._view(_Stored(*(tensors[index] for tensors in self._all)))
+            return self._view(self._all.map(lambda tensors: tensors[index]))
         stored = self._store(self._capture.frame(self._capture.train[index]))
-        return self._view(_Stored(*(tensor.to(self.device) for tensor in stored)))
+        return self._view(stored.map(lambda tensor: tensor.to(self.device)))
 
     def pick(self, index: Int64[Tensor, "1"]) -> View:
         """The view of an index on the device; all views must be resident."""
-        return self._view(_Stored(*(tensors.index_select(0, index)[0] for tensors in self._all)))
+        return self._view(self._all.map(lambda tensors: tensors.index_select(0, index)[0]))
 
     def _view(self, stored: _Stored) -> View:
         height, width = stored.static_mask.shape
+        image = stored.image.float() / 255.0
         return View(
             Camera(stored.viewmat, stored.K, width, height),
             stored.time,
-            stored.image.float() / 255.0,
+            image if stored.gain is None else image / stored.gain,
             stored.static_mask,
             stored.mask_border,
             stored.inverse_depth.float(),
@@ -117,5 +137,7 @@ class Views:
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
         time = torch.tensor([camera.time])
-        border = mask_border(frame.static_mask, round(self._mask_margin * max(size)))
-        return _Stored(camera.viewmat, camera.K, time, frame.image, frame.static_mask, border, depth.half())
+        margin = round(self._mask_margin * max(size))
+        border = mask_border(frame.static_mask, margin) if margin else None
+        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())
+        return _Stored(*tensors, border, self._gains.get(frame.name))

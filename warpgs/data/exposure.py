@@ -1,0 +1,68 @@
+"""Jumps of exposure and white balance between the frames of a capture."""
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .capture import Capture, Frame
+
+MIN_JUMP = 0.1
+"""Minimum change of the logarithm of intensities between two frames that counts as a jump, about a third of a stop. The
+appearance network represents slow changes; dividing them out would only hide them from held-out frames."""
+
+WIDTH = 64
+"""Frames are compared at this width [px], at which a few pixels of camera motion do not matter."""
+
+DARKEST, BRIGHTEST = 0.04, 0.96
+"""Intensities outside are not compared: noise, and saturated pixels."""
+
+MIN_PIXELS = 50
+"""Minimum number of compared pixels; between two frames with fewer, no jump is assumed."""
+
+
+def exposure_gains(capture: Capture) -> Float[Tensor, "T 3"]:
+    """How much brighter each training frame is than most, per channel; exactly 1 without jumps.
+
+    Intensities are multiplied by about a constant when a camera's exposure or white balance jumps. In the order of
+    time, each frame is compared with the one before: the median of the ratio of their static pixels. Ratios close to 1
+    are taken as 1, so that gradual changes stay.
+
+    Returns:
+        [T, 3] factors of red, green and blue, in the order of ``capture.train``; their median over frames is 1.
+    """
+    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
+    logs, log, before = torch.zeros(len(order), 3), torch.zeros(3), None
+    for k in order:
+        after = _log_intensities(capture.frame(capture.train[k]))
+        if before is not None:
+            log = log + _jump(before, after)
+        logs[k], before = log, after
+    logs -= logs.median(0).values
+    logs[logs.abs().amax(1) < MIN_JUMP] = 0.0  # what rounding leaves of a jump and of the one back
+    return logs.exp()
+
+
+def _log_intensities(frame: Frame) -> np.ndarray:
+    """[h, w, 3] logarithms of the small image; NaN where not compared."""
+    height, width = frame.image.shape[:2]
+    size = (min(WIDTH, width), max(1, round(height * min(WIDTH, width) / width)))
+    values = cv2.resize(frame.image.numpy(), size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+    if frame.static_mask is not None:
+        static = cv2.resize(frame.static_mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        values[static < 1.0] = np.nan
+    values[(values < DARKEST) | (values > BRIGHTEST)] = np.nan
+    return np.log(values)
+
+
+def _jump(before: np.ndarray, after: np.ndarray) -> Float[Tensor, "3"]:
+    """Change of the logarithms of red, green and blue from one small image to the next; 0 if it is no jump."""
+    if before.shape != after.shape:
+        return torch.zeros(3)
+    change = (after - before).reshape(-1, 3)
+    known = np.isfinite(change).all(1)
+    if known.sum() < MIN_PIXELS:
+        return torch.zeros(3)
+    median = torch.from_numpy(np.median(change[known], axis=0))
+    return median if bool(median.abs().max() >= MIN_JUMP) else torch.zeros(3)
