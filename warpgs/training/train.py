@@ -48,7 +48,10 @@ class TrainingInterrupted(KeyboardInterrupt):
 
 
 def train(config: TrainConfig, log: Log | None = None) -> Run:
-    """Trains and evaluates a run: ``warpgs.train(TrainConfig(data=Path("nerfds/as")), log=print).trained_scene()``.
+    """Trains and evaluates a run.
+
+    ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
+    does, with ``dataclasses.replace`` and ``warpgs.presets.PRESETS``.
 
     The first Ctrl-C lets the current iteration finish and saves a checkpoint, the second one stops at once.
 
