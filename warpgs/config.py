@@ -185,7 +185,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Everything that is counted in iterations; ``--iterations`` rescales all of it.
+    """Everything that is counted in iterations; ``--iterations`` rescales all of it but ``warmup``.
 
     Except for the lengths of the stages and ``realign_at``, iterations count from the start of stage I.
     """
@@ -212,8 +212,9 @@ class Schedule:
     """Iteration from which the appearance network changes static Gaussians. The paper starts it in stage II; by then
     moving shadows have become Gaussians at wrong depths (docs/results.md)."""
     warmup: int = 1_000
-    """Iterations over which a network's learning rate rises once it is in use. At the full rate Adam's first steps,
-    all of the same sign, turn most ReLU units off for good, and occasionally all of them."""
+    """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. At the
+    full rate Adam's first steps, all of the same sign, turn most ReLU units off for good, and may carry all dynamic
+    Gaussians of one object off to another."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
@@ -350,6 +351,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
     factor = config.iterations / total
     # What is 0 stays 0, what is positive stays positive; the longest stage absorbs the rounding.
     values = {name: max(min(value, 1), round(value * factor)) for name, value in dataclasses.asdict(schedule).items()}
+    values["warmup"] = schedule.warmup  # Adam needs as many steps in a short run
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)
     values[longest] += config.iterations - sum(values[name] for name in stages)
