@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import warpgs
 from tests import tiny
@@ -20,8 +21,10 @@ from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
+from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
+from warpgs.training import initialize
 from warpgs.training import train as script
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
@@ -263,3 +266,19 @@ def test_train_raises_on_an_unfit_capture(config):
 
 def test_a_number_on_the_command_line_is_checked_by_its_bounds(data):
     assert "model.width must be a number of at least 1, got 0" in refused("--data", data, *QUICK, "--model.width", 0)
+
+
+def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp_path, monkeypatch):
+    whole = initialize.align_to_points
+
+    def mostly_unknown(*arguments):
+        found = whole(*arguments)
+        found.alignments[1:], found.errors[1:] = torch.nan, torch.inf
+        return found
+
+    monkeypatch.setattr(initialize, "align_to_points", mostly_unknown)
+    lines = []
+    config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=tmp_path / "run")
+    script._describe(script.make_trainer(config, lines.append), lines.append)
+    assert any(re.match(r"depth is off by \d\.\d% ", line) for line in lines)
+    assert any("depth can be aligned with the sparse points in 1 of" in line for line in lines)

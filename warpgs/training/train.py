@@ -96,7 +96,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
         log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")
     refused = int((trainer.depth_trust == 0).sum())
     if num_aligned and trainer.protocol.phase_at(0).with_depth:
-        used = trainer.depth_trust > 0
+        used = trainer.alignments.isfinite().all(1)
         error, trust = trainer.depth_errors[used].median().item(), trainer.depth_trust[used].median().item()
         log(f"depth is off by {error:.1%} at the sparse points, its weight is {trust:.2f} (medians)")
     if refused:
