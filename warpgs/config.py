@@ -76,8 +76,8 @@ class ModelConfig:
     time_bands: Annotated[int, Bounds(max=64)] = 10
     """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
     min_period: float = 0.0
-    """Minimum period of these frequencies, in training frames; higher frequencies are left out. Frames do not determine
-    them, so the networks would memorize the times of the training frames. 0 in the paper: none are left out."""
+    """Minimum period of these frequencies, in training frames; higher frequencies are dropped, because they overfit to
+    the training times. 0: none are dropped (paper)."""
     depth: Annotated[int, Bounds(min=1, max=64)] = 8
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256

@@ -91,17 +91,8 @@ PATIENT = dataclasses.replace(
 QUICK = dataclasses.replace(
     PATIENT,
     preset="quick",
-    model=ModelConfig(
-        position_bands=6,
-        time_bands=4,
-        min_period=4.0,
-        depth=3,
-        width=64,
-        skip=2,
-        max_static_points=4_000,
-        dynamic_points=1_500,
-    ),
-    densify=DensifyConfig(gradient=4e-4, max_gaussians=10_000, min_pixels=8),
+    model=dataclasses.replace(PATIENT.model, time_bands=4, sh_degree=1, max_static_points=4_000, dynamic_points=1_500),
+    densify=dataclasses.replace(PATIENT.densify, gradient=4e-4, max_gaussians=10_000),
     schedule=Schedule(
         pretrain=200,
         stage1=1_000,

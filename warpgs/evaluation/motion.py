@@ -26,9 +26,11 @@ def jitter(splats_at: Callable[[float], Splats], times: Sequence[float]) -> floa
         None if there are fewer than two times or if nothing moves.
     """
     deviation, way = 0.0, 0.0
-    for start, end in itertools.pairwise(sorted(set(times))):
-        before, opacities = _dynamic(splats_at(start))
-        after, _ = _dynamic(splats_at(end))
+    ordered = sorted(set(times))
+    at_times = (_dynamic(splats_at(time)) for time in ordered)
+    for (start, end), ((before, opacities), (after, _)) in zip(
+        itertools.pairwise(ordered), itertools.pairwise(at_times), strict=True
+    ):
         middle, _ = _dynamic(splats_at(0.5 * (start + end)))
         deviation += (opacities * (middle - 0.5 * (before + after)).norm(dim=1)).sum().item()
         way += (opacities * (after - before).norm(dim=1)).sum().item()

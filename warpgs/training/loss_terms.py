@@ -3,10 +3,11 @@
 To add one, write a ``LossTerm`` in a new file, add a line to ``TERMS`` and a test.
 """
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.ops.depth_error import depth_error
+from warpgs.rendering import Layer
 
 from . import losses
 from .losses import LossInputs, LossTerm
@@ -32,24 +33,24 @@ def joint(inputs: LossInputs) -> Float[Tensor, ""]:
     return losses.image_loss(inputs.rendering.joint.image, inputs.view.image, inputs.config.ssim)
 
 
-def depth(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The depth of the static image in the static region (Eq. 14)."""
-    view, layer = inputs.view, inputs.rendering.static
+def _depth_error(inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"]) -> Float[Tensor, ""]:
+    """The error of a layer's depth in a region, times the trust in the view's depth."""
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
-    error = depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, view.static_mask)
+    assert inputs.depth_trust is not None
+    error = depth_error(layer.depth, layer.alpha, inputs.view.inverse_depth, inputs.alignment, region)
     return error * inputs.depth_trust
+
+
+def depth(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The depth of the static image in the static region (Eq. 14)."""
+    return _depth_error(inputs, inputs.rendering.static, inputs.view.static_mask)
 
 
 def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     """The depth of the dynamic image in the dynamic region."""
-    view, layer = inputs.view, inputs.rendering.dynamic
-    assert layer is not None
-    assert layer.depth is not None
-    assert inputs.alignment is not None
-    error = depth_error(layer.depth, layer.alpha, view.inverse_depth, inputs.alignment, ~view.static_mask)
-    return error * inputs.depth_trust
+    return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask)
 
 
 TERMS: dict[str, LossTerm] = {

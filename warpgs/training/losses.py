@@ -26,7 +26,8 @@ class LossInputs(NamedTuple):
         rendering: Joint, static and dynamic image; with depth where ``Phase.with_depth``.
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
-        depth_trust: Factor of the view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``.
+        depth_trust: Factor of the view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``. None like
+            ``alignment``.
     """
 
     config: LossConfig
@@ -35,7 +36,7 @@ class LossInputs(NamedTuple):
     rendering: Rendering
     backgrounds: Float[Tensor, "3 3"]
     alignment: Float[Tensor, "2"] | None
-    depth_trust: Float[Tensor, ""]
+    depth_trust: Float[Tensor, ""] | None
 
 
 class LossTerm(NamedTuple):

@@ -138,7 +138,7 @@ class Step:
         settings = RenderSettings(branches=True, depth=phase.with_depth, antialias=self.config.antialias, replay=False)
         rendering = render(splats, view.camera, self._inputs.backgrounds, settings)
         alignment = self.alignments.index_select(0, self._index)[0] if phase.with_depth else None
-        trust = self._depth_trust.index_select(0, self._index)[0]
+        trust = self._depth_trust.index_select(0, self._index)[0] if phase.with_depth else None
         config, backgrounds = self.config.loss, self._inputs.backgrounds
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}

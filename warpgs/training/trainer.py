@@ -59,7 +59,8 @@ class Trainer:
         self.capture = capture.assuming(config.assume)
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
-        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, self.gains)
+        gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
+        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
