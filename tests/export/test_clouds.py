@@ -62,7 +62,7 @@ def test_gaussians_with_values_that_are_not_finite_are_reported():
 # The most visible Gaussians -----------------------------------------------------------------------------------------
 
 
-def test_the_gaussians_that_the_cameras_see_least_of_are_omitted(clouds):
+def test_the_least_visible_gaussians_are_omitted(clouds):
     clouds = scenes.clouds()
     hidden = torch.arange(40) % 2 == 0
     clouds.scene.scene.static.means[hidden] += torch.tensor([0.0, 0.0, -90.0])

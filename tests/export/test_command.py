@@ -72,14 +72,14 @@ def test_a_ply_file_looks_like_the_run_at_its_time(run, data, tmp_path, time):
     assert (scenes.image(read_standard(tmp_path / "out" / "scene.ply"), camera) - truth(run, camera)).abs().max() < 1e-4
 
 
-def test_a_compressed_file_looks_almost_like_the_run(run, data, tmp_path):
+def test_a_compressed_file_renders_close_to_the_run(run, data, tmp_path):
     export(run, tmp_path, format="compressed", time=0.4)
     camera = view(data, 0.4)
     image = scenes.image(read_compressed(tmp_path / "out" / "scene.compressed.ply"), camera)
     assert scenes.psnr(image, truth(run, camera)) > 35
 
 
-def test_a_page_looks_almost_like_the_run(run, data, tmp_path):
+def test_a_page_renders_close_to_the_run(run, data, tmp_path):
     summary = export(run, tmp_path, format="html", keys=3)
     assert "at 3 key times" in summary
     assert "\ncameras of " in summary

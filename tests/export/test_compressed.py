@@ -34,7 +34,7 @@ def test_a_file_has_one_chunk_per_256_gaussians_and_16_bytes_per_gaussian(path, 
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_the_image_is_almost_the_same_after_export_and_import(path, degree):
+def test_export_and_import_preserve_the_rendering(path, degree):
     cloud = scenes.cloud(300, degree)
     write_compressed(path, cloud)
     assert scenes.psnr(scenes.image(read_compressed(path)), scenes.image(cloud)) > 40
