@@ -117,9 +117,7 @@ class LossConfig:
     dynamic: float = 1.0
     """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
     joint: float = 1.0
-    """Weight of the joint image against the whole ground truth, in stage II."""
-    stage1_joint: bool = False
-    """Whether stage I compares the joint image, too."""
+    """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
     dynamic_background: Literal["black", "random"] = "random"
     """Background of the dynamic image: black (paper), or a random colour per iteration, so that black Gaussians cannot
     hide in front of it."""
@@ -211,6 +209,8 @@ class Schedule:
     appearance_from: int = 0
     """Iteration from which the appearance network changes static Gaussians. The paper starts it in stage II; by then
     moving shadows have become Gaussians at wrong depths (docs/results.md)."""
+    joint_from: int | None = None
+    """Iteration of stage I from which the joint image is compared; in stage II alone if None (paper)."""
     warmup: int = 1_000
     """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. At the
     full rate Adam's first steps, all of the same sign, turn most ReLU units off for good, and may carry all dynamic
@@ -350,7 +350,10 @@ def scaled(config: TrainConfig) -> TrainConfig:
     total = schedule.pretrain + schedule.stage1 + schedule.stage2
     factor = config.iterations / total
     # What is 0 stays 0, what is positive stays positive; the longest stage absorbs the rounding.
-    values = {name: max(min(value, 1), round(value * factor)) for name, value in dataclasses.asdict(schedule).items()}
+    values: dict[str, Any] = {
+        name: value if value is None else max(min(value, 1), round(value * factor))
+        for name, value in dataclasses.asdict(schedule).items()
+    }
     values["warmup"] = schedule.warmup  # Adam needs as many steps in a short run
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)

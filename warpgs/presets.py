@@ -13,7 +13,7 @@ BEST = TrainConfig(
     model=ModelConfig(
         position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
     ),
-    loss=LossConfig(stage1_joint=True, dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
+    loss=LossConfig(dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
     optim=OptimConfig(means=1.7e-3),
     densify=DensifyConfig(gradient=3e-4, min_pixels=8),
     schedule=Schedule(
@@ -26,6 +26,7 @@ BEST = TrainConfig(
         reset_every=1_100,
         prune_every=1_500,
         deform_from=400,
+        joint_from=0,
         warmup=400,
         noise_until=3_750,
         sh_degree_every=400,
@@ -81,6 +82,7 @@ PATIENT = dataclasses.replace(
         prune_every=1_000,
         deform_from=50,
         warmup=100,
+        joint_from=0,
         noise_until=800,
         sh_degree_every=400,
     ),
@@ -104,6 +106,7 @@ QUICK = dataclasses.replace(
         prune_every=500,
         deform_from=50,
         warmup=100,
+        joint_from=0,
         noise_until=400,
         sh_degree_every=400,
     ),

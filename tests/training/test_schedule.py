@@ -294,13 +294,13 @@ def test_no_stage_of_a_rescaled_run_is_empty(preset, iterations):
 def test_every_schedule_but_the_warmup_is_scaled_by_the_same_factor(preset):
     before = dataclasses.asdict(PRESETS[preset].schedule)
     after = dataclasses.asdict(scaled(with_iterations(preset, 3 * total(PRESETS[preset].schedule))).schedule)
-    assert after == {name: (1 if name == "warmup" else 3) * value for name, value in before.items()}
+    assert after == {name: value and (1 if name == "warmup" else 3) * value for name, value in before.items()}
 
 
 def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule_but_the_warmup():
     before = dataclasses.asdict(PRESETS["paper"].schedule)
     after = dataclasses.asdict(scaled(with_iterations("paper", 7_200)).schedule)
-    assert after == {name: value // (1 if name == "warmup" else 10) for name, value in before.items()}
+    assert after == {name: value and value // (1 if name == "warmup" else 10) for name, value in before.items()}
 
 
 @pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])
@@ -367,3 +367,14 @@ def test_the_learning_rate_of_a_network_warms_up():
 
 def test_without_warmup_networks_start_at_their_full_rate():
     assert all(set(plan.warmup_factors.values()) == {1.0} for plan in plans(schedule={"warmup": 0}))
+
+
+@pytest.mark.parametrize("joint_from", [None, 0, 3])
+def test_the_joint_image_is_compared_from_its_iteration_of_stage_1_on(joint_from):
+    protocol = Protocol(TrainConfig(schedule=Schedule(pretrain=2, stage1=5, stage2=2, joint_from=joint_from)), True)
+    start = protocol.stage2.start if joint_from is None else protocol.stage1.start + joint_from
+    assert [protocol.phase_at(i).with_joint for i in range(9)] == [i >= start for i in range(9)]
+
+
+def test_rescaling_keeps_what_never_happens():
+    assert scaled(TrainConfig(iterations=100)).schedule.joint_from is None

@@ -66,7 +66,7 @@ TERMS: dict[str, LossTerm] = {
     ),
     "joint": LossTerm(
         joint,
-        is_active=lambda phase, config: phase.stage == "stage2" or (config.stage1_joint and phase.stage == "stage1"),
+        is_active=lambda phase, config: phase.with_joint,
         weight=lambda plan, config: config.joint,
     ),
     "depth": LossTerm(

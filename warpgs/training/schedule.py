@@ -39,6 +39,7 @@ class Phase:
         use_appearance: Whether the appearance network is in use.
         sh_degree: Maximum degree of spherical harmonics in use.
         with_depth: Whether depth is rendered and compared.
+        with_joint: Whether the joint image is compared.
     """
 
     stage: StageName
@@ -46,6 +47,7 @@ class Phase:
     use_appearance: bool
     sh_degree: int
     with_depth: bool
+    with_joint: bool
 
 
 @dataclass(frozen=True)
@@ -108,12 +110,14 @@ class Protocol:
     def phase_at(self, iteration: int) -> Phase:
         """Everything that the training step of an iteration branches on."""
         config, in_stage1 = self.config, iteration - self.stage1.start
+        stage, joint_from = self.stage_at(iteration).name, config.schedule.joint_from
         return Phase(
-            stage=self.stage_at(iteration).name,
+            stage=stage,
             use_deformation=in_stage1 >= self._network_starts["deformation"],
             use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth and config.dap and config.loss.depth > 0.0,
+            with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
         )
 
     def at(self, iteration: int) -> IterationPlan:
