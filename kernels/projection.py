@@ -13,7 +13,9 @@ With the camera's rotation W and translation, t = W mean + translation, depth z 
 Gradient: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
     v_a = -(A² v_A + A B v_B + B² v_C),  v_c = -(B² v_A + B C v_B + C² v_C),
     v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C)
-for the conic (A, B, C).
+for the conic (A, B, C). Through t, with v_t: v_mean = Wᵀ v_t, and for the camera the sums over all Gaussians of
+    v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
+and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
 
 A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, touches
 the image and has a finite, invertible 2D covariance. Every test is phrased so that NaN fails it.
@@ -26,6 +28,9 @@ import warp as wp
 from .constants import ALPHA_MIN, FIELD_OF_VIEW_MARGIN, LOW_PASS
 from .covariance import scaled_rotation
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
+
+CAMERA_GRADIENTS = 16
+"""Length of a row of ``v_cameras``: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
 
@@ -66,6 +71,24 @@ def projection_jacobian(t: wp.vec3, fx: float, fy: float, u: float, v: float) ->
     """J at camera-space point t, with the clamped slopes u and v."""
     rz = 1.0 / t[2]
     return mat23(fx * rz, 0.0, -fx * u * rz, 0.0, fy * rz, -fy * v * rz)
+
+
+@wp.func
+def store_camera_gradients(
+    v_cameras: wp.array2d[float],
+    i: int,
+    mean: wp.vec3,
+    v_t: wp.vec3,
+    v_rotation: wp.mat33,
+    v_intrinsics: wp.vec4,
+):
+    """Row i of ``v_cameras``; ``v_rotation`` is the part of v_W that does not pass through t."""
+    for row in range(3):
+        for column in range(3):
+            v_cameras[i, 3 * row + column] = v_t[row] * mean[column] + v_rotation[row, column]
+        v_cameras[i, 9 + row] = v_t[row]
+    for part in range(4):
+        v_cameras[i, 12 + part] = v_intrinsics[part]
 
 
 @wp.kernel(enable_backward=False)
@@ -163,9 +186,12 @@ def project_bwd(
     v_quats: wp.array[wp.vec4],
     v_scales: wp.array[wp.vec3],
     v_opacities: wp.array[float],
+    v_cameras: wp.array2d[float],
 ):
     i = first + wp.tid()
     if radii[i][0] <= 0:
+        for part in range(v_cameras.shape[1]):
+            v_cameras[i, part] = 0.0
         v_means[i] = wp.vec3(0.0)
         v_quats[i] = wp.vec4(0.0)
         v_scales[i] = wp.vec3(0.0)
@@ -236,7 +262,8 @@ def project_bwd(
     )
     v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
 
-    v_jacobian = (v_spread * wp.transpose(shape)) * wp.transpose(rotation)
+    v_to_image = v_spread * wp.transpose(shape)
+    v_jacobian = v_to_image * wp.transpose(rotation)
     v_mean2d = wp.vec2(0.0)
     if v_means2d.shape[0] > 0:
         v_mean2d = v_means2d[i]
@@ -257,3 +284,17 @@ def project_bwd(
         v_z += v_depths[i]
     v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
     v_means[i] = wp.transpose(rotation) * v_t
+    if v_cameras.shape[1] > 0:
+        v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
+        v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])
+        v_cx = v_mean2d[0]
+        v_cy = v_mean2d[1]
+        # A clamped slope is (constant - c) / f.
+        if u != slope_u:
+            v_fx += rz * u * v_jacobian[0, 2]
+            v_cx += rz * v_jacobian[0, 2]
+        if v != slope_v:
+            v_fy += rz * v * v_jacobian[1, 2]
+            v_cy += rz * v_jacobian[1, 2]
+        v_rotation = wp.transpose(jacobian) * v_to_image
+        store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))

@@ -125,6 +125,25 @@ def test_gradients_predict_the_effect_of_a_small_step(name, branches):
     assert slope == pytest.approx(gradient.norm().item(), rel=1e-3)
 
 
+@pytest.mark.parametrize("name", ["viewmat", "K"])
+def test_the_gradient_of_the_camera_predicts_the_effect_of_a_small_step(name):
+    """Central differences along the gradient, like those above."""
+    splats = smooth_splats()
+
+    def loss(camera):
+        rendering = render(splats, camera, background(), EVERYTHING)
+        return sum(value.double().square().sum() for value in outputs(rendering))
+
+    value = getattr(CAMERA, name).clone().requires_grad_()
+    loss(dataclasses.replace(CAMERA, **{name: value})).backward()
+    direction = value.grad / value.grad.norm()
+    step = 1e-3 if name == "viewmat" else 0.05
+    with torch.no_grad():
+        cameras = [dataclasses.replace(CAMERA, **{name: value + sign * step * direction}) for sign in (1, -1)]
+        slope = (loss(cameras[0]) - loss(cameras[1])) / (2 * step)
+    assert slope.item() == pytest.approx(value.grad.norm().item(), rel=1e-3)
+
+
 @pytest.mark.parametrize("channels", [1, 5])
 def test_any_number_of_channels_can_be_rendered(channels):
     splats = as_leaves(make_splats(channels=channels))

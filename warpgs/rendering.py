@@ -77,14 +77,14 @@ def render(
     background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
     settings: RenderSettings | None = None,
 ) -> Rendering:
-    """Renders splats through a camera; differentiable in all parameters of the splats and in the background.
+    """Renders splats through a camera; differentiable in the splats, the camera and the background.
 
     Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have an opacity above 1, a
     parameter that is not finite or a zero quaternion are culled: they leave the image unchanged and get zero gradients.
 
     Args:
         splats: N Gaussians; N may be 0.
-        camera: On the device of the splats; it gets no gradient.
+        camera: On the device of the splats.
         background: [C] colour behind everything, black by default; with branches also [3, C], one for each of the
             joint, the static and the dynamic image.
         settings: What to compute besides the joint image.
@@ -129,9 +129,8 @@ def _render(splats: Splats, camera: Camera, background: Tensor | None, settings:
     request = _Request(camera.size, splats.num_channels, settings, degree)
     branch = None if splats.is_dynamic is None or not settings.branches else splats.is_dynamic.view(torch.uint8)
     appearance = splats.colors if splats.sh is None else splats.sh
-    view = [t.detach() if t.requires_grad else t for t in (camera.viewmat, camera.K)]
     geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
-    tensors = (*geometry, appearance, background, *view, branch)
+    tensors = (*geometry, appearance, background, camera.viewmat, camera.K, branch)
     op = partial(_record, request, splats.sh_stream)
     is_empty = 0 in (splats.means.shape[0], *camera.size)
     if settings.replay and splats.sh_stream is None and not is_empty:

@@ -78,6 +78,24 @@ def test_slopes_outside_the_margin_use_the_clamped_jacobian():
         assert relative_error(actual.grad, expected.grad) < 1e-5
 
 
+@pytest.mark.parametrize("antialias", [False, True])
+def test_gradients_of_the_camera_equal_the_reference(antialias):
+    far_out = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])  # clamped slopes
+    rest = torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
+    geometry = [torch.cat(pair) for pair in zip(inputs(), (far_out, *rest), strict=True)]
+    ours = [t.clone().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
+    theirs = [t.double().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
+    splats = project(Geometry(*geometry), View(*ours, *CAMERA.size), antialias=antialias)[:4]
+    doubles = Geometry(*(t.double() for t in geometry))
+    *values, visible = reference(doubles, View(*theirs, *CAMERA.size), antialias=antialias)
+    assert visible[-4:].all()
+    v_outputs = random_like(splats)
+    weighted_sum(splats, v_outputs).backward()
+    weighted_sum((v[visible] for v in values), (c[visible] for c in v_outputs)).backward()
+    for actual, expected in zip(ours, theirs, strict=True):
+        assert relative_error(actual.grad, expected.grad) < 1e-5
+
+
 def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
     """The projection of a round Gaussian to a 64 × 64 image of a camera at the origin."""
     K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]])
@@ -137,5 +155,6 @@ def test_antialiasing_only_lowers_opacities():
 def test_few_gaussians_are_enough(num):
     splats = make_splats(num)
     tensors = [getattr(splats, name).requires_grad_() for name in GEOMETRY]
-    project_here(*tensors).means2d.sum().backward()
-    assert all(t.grad.shape == t.shape for t in tensors)
+    camera = [t.clone().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
+    project(Geometry(*tensors), View(*camera, *CAMERA.size)).means2d.sum().backward()
+    assert all(t.grad.shape == t.shape for t in (*tensors, *camera))

@@ -39,6 +39,16 @@ def test_gradients_equal_the_reference(held):
     assert relative_error(ours[1].grad, theirs[1].grad) < 1e-6
 
 
+def test_the_gradient_of_the_camera_equals_the_reference():
+    ours, theirs = VIEW.clone().requires_grad_(), VIEW.double().requires_grad_()
+    means, sh = inputs()
+    colors = spherical_harmonics(means, sh, ours)
+    (v_output,) = random_like([colors])
+    colors.backward(v_output)
+    reference(means.double(), sh.double(), theirs, 3).backward(v_output.double())
+    assert relative_error(ours.grad, theirs.grad) < 1e-5
+
+
 @pytest.mark.parametrize("degree", range(3))
 def test_a_lower_degree_ignores_the_higher_bases(degree):
     means, sh = inputs(3)

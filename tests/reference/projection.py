@@ -23,8 +23,8 @@ def project(
     z = torch.where(in_front, z, torch.ones_like(z))
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    u = (x / z).clamp(min=float(-cx / fx - margin_x), max=float((width - cx) / fx + margin_x))
-    v = (y / z).clamp(min=float(-cy / fy - margin_y), max=float((height - cy) / fy + margin_y))
+    u = (x / z).clamp(min=-cx / fx - margin_x, max=(width - cx) / fx + margin_x)
+    v = (y / z).clamp(min=-cy / fy - margin_y, max=(height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
     J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
     sharp = J @ W @ covariance(quats, scales) @ W.T @ J.mT

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float, Int32
 from torch import Tensor, int32
 
@@ -81,25 +82,38 @@ def record_projection(ctx: OpContext, geometry: Geometry, view: View, near: floa
     def backward(ctx: OpContext) -> None:
         v_splats = [ctx.gradient(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
         v_geometry = [ctx.empty(*t.shape) for t in geometry]
+        with_camera = ctx.needs_gradient(view.viewmat) or ctx.needs_gradient(view.K)
+        v_cameras = ctx.empty(N, kernels.CAMERA_GRADIENTS if with_camera else 0)
         inputs = (*geometry, *view, int(antialias), splats.conics, splats.radii)
-        ctx.launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry)
+        ctx.launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras)
         for tensor, gradient in zip(geometry, v_geometry, strict=True):
             ctx.add_gradient(tensor, gradient)
+        if with_camera:
+            _add_camera_gradients(ctx, view, v_cameras.sum(0))
 
     ctx.on_backward(backward, reads=(splats.conics, splats.radii))
     return splats
 
 
+def _add_camera_gradients(ctx: OpContext, view: View, sums: Float[Tensor, "16"]) -> None:
+    """Adds to the gradients of ``viewmat`` and ``K``; their constant last rows get none."""
+    v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)
+    v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
+    v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
+    ctx.add_gradient(view.viewmat, v_viewmat)
+    ctx.add_gradient(view.K, v_K)
+
+
 def project(
     geometry: Geometry, view: View, *, near: float = RenderSettings.near, antialias: bool = False
 ) -> Projection:
-    """Projects Gaussians into a pinhole camera; differentiable in means, quats, scales and opacities.
+    """Projects Gaussians into a pinhole camera; differentiable in them and in the camera.
 
     The formulas are at the head of ``kernels/projection.py``.
 
     Args:
         geometry: N Gaussians.
-        view: The camera; it gets no gradient.
+        view: The camera.
         near: Near plane: Gaussians at this depth or closer are culled [scene units].
         antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
 

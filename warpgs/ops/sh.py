@@ -49,9 +49,19 @@ def record_sh(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii:
         ctx.launch(kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh)
         ctx.add_gradient(means, v_means)
         ctx.add_gradient(sh, v_sh)
+        if ctx.needs_gradient(viewmat):
+            _add_viewmat_gradient(ctx, viewmat, -v_means.sum(0))
 
     ctx.on_backward(backward, reads=(colors,))
     return colors
+
+
+def _add_viewmat_gradient(ctx: OpContext, viewmat: Tensor, v_viewpoint: Float[Tensor, "3"]) -> None:
+    """Adds what the viewpoint -Wᵀ translation passes on to the viewing matrix [W, translation]."""
+    v_viewmat = torch.zeros_like(viewmat)
+    v_viewmat[:3, :3] = -torch.outer(viewmat[:3, 3], v_viewpoint)
+    v_viewmat[:3, 3] = -viewmat[:3, :3] @ v_viewpoint
+    ctx.add_gradient(viewmat, v_viewmat)
 
 
 def spherical_harmonics(
@@ -62,7 +72,9 @@ def spherical_harmonics(
     degree: int | None = None,
     radii: Int32[Tensor, "N 2"] | None = None,
 ) -> Float[Tensor, "N 3"]:
-    """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k); differentiable in means and sh.
+    """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k).
+
+    Differentiable in means, sh and viewmat.
 
     Args:
         means: [N, 3] centres in the world.
