@@ -131,6 +131,8 @@ class LossConfig:
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
     by 1 + (error / tolerance)², and depth that is hardly better than a constant is not used. If 0, all views have the
     same weight (paper)."""
+    depth_smooth: bool = False
+    """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along the borders of masks in which the dynamic image is not compared, as a fraction of
     the image's larger side; 0 in the paper. Masks are a few pixels off, and the rim of background inside them would be
@@ -153,6 +155,9 @@ class OptimConfig:
     """Spherical harmonics of degree 0."""
     sh_rest: float = 1.25e-4
     """Spherical harmonics of higher degrees."""
+    poses: float = 0.0
+    """Initial rate of the corrections of camera poses [rad, and fractions of the extent]; decays exponentially to 1 %.
+    0: cameras stay as the capture has them (paper)."""
     networks: Annotated[float, Bounds(positive=True)] = 8e-4
     """Initial rate of both networks (paper, training protocol)."""
     networks_end: Annotated[float, Bounds(positive=True)] = 1.6e-6

@@ -13,13 +13,20 @@ BEST = TrainConfig(
     model=ModelConfig(
         position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
     ),
-    loss=LossConfig(dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
-    optim=OptimConfig(means=1.7e-3),
+    loss=LossConfig(
+        dynamic_background="black",
+        depth=0.5,
+        depth_dynamic=4.0,
+        depth_tolerance=0.03,
+        depth_smooth=True,
+        mask_margin=0.008,
+    ),
+    optim=OptimConfig(means=1.7e-3, poses=1e-4),
     densify=DensifyConfig(gradient=3e-4, min_pixels=8),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
-        stage2=7_100,
+        stage2=22_500,
         realign_at=200,
         densify_from=100,
         densify_until=4_500,
@@ -68,7 +75,7 @@ PATIENT = dataclasses.replace(
         max_static_points=8_000,
         dynamic_points=3_000,
     ),
-    loss=dataclasses.replace(BEST.loss, ssim=0.0),
+    loss=LossConfig(ssim=0.0, dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8),
     schedule=Schedule(

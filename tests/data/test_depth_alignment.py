@@ -13,6 +13,7 @@ from warpgs.data.depth_alignment import (
     is_unusable,
     metric_depth,
     relative_errors,
+    smooth_factor,
 )
 
 CAMERA = make_camera()
@@ -283,3 +284,57 @@ def test_errors_are_infinite_without_points_or_alignment(alignment):
 )
 def test_depth_is_unusable_if_it_is_wrong_and_hardly_better_than_a_constant(depth_error, constant_error, unusable):
     assert bool(is_unusable(torch.tensor([depth_error, constant_error]))) == unusable
+
+
+# The smooth factor ---------------------------------------------------------------------------------------------------
+
+IDENTITY = torch.tensor([1.0, 0.0])
+
+
+def dense_points(depth, every=2):
+    """Points of the scene at every second pixel of a depth image."""
+    row, column = torch.cartesian_prod(torch.arange(0, HEIGHT, every), torch.arange(0, WIDTH, every)).T
+    return CAMERA.unproject(row, column, depth[row, column])
+
+
+def bumps():
+    """A factor that varies by 10 % over the image."""
+    y, x = torch.meshgrid(torch.linspace(0, 3, HEIGHT), torch.linspace(0, 4, WIDTH), indexing="ij")
+    return 1.0 + 0.1 * torch.sin(x) * torch.cos(y)
+
+
+def slanted():
+    return torch.linspace(2.0, 4.0, WIDTH).expand(HEIGHT, WIDTH)
+
+
+def test_a_smooth_error_is_divided_out():
+    factor, left = smooth_factor(bumps() / slanted(), EVERYWHERE, CAMERA, dense_points(slanted()), IDENTITY)
+    assert (factor * bumps() - 1.0).abs().median() < 0.005
+    assert left < 0.01
+
+
+def test_outliers_hardly_change_the_factor():
+    depth = slanted().clone()
+    points = dense_points(depth)
+    hidden = torch.rand(len(points), generator=generator()) < 0.1
+    points[hidden] = CAMERA.position + 2.0 * (points[hidden] - CAMERA.position)  # behind a surface
+    factor, _ = smooth_factor(bumps() / depth, EVERYWHERE, CAMERA, points, IDENTITY)
+    assert (factor * bumps() - 1.0).abs().median() < 0.01
+
+
+def test_the_error_of_noise_is_left():
+    noise = torch.exp(torch.randn(HEIGHT, WIDTH, generator=generator()))
+    _, left = smooth_factor(noise / slanted(), EVERYWHERE, CAMERA, dense_points(slanted()), IDENTITY)
+    assert left > 0.3
+
+
+def test_far_from_points_and_with_few_points_the_factor_is_1():
+    static = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    static[:, : WIDTH // 3] = True
+    arguments = CAMERA, dense_points(slanted()), IDENTITY
+    factor, _ = smooth_factor(1.2 / slanted(), static, *arguments)
+    assert (factor[:, : WIDTH // 4] * 1.2 - 1.0).abs().max() < 0.02
+    assert error(factor[:, -WIDTH // 6 :], torch.ones(HEIGHT, -(-WIDTH // 6))) < 0.01
+    factor, left = smooth_factor(1.2 / slanted(), torch.zeros_like(static), *arguments)
+    assert torch.equal(factor, torch.ones(HEIGHT, WIDTH))
+    assert left == torch.inf

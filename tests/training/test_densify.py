@@ -42,7 +42,7 @@ def make_gaussians(sizes, opacities=0.8):
 def make_scene(static, dynamic):
     """A scene, and its optimizer after one step at rate 0 that left every moment at 1 or more."""
     scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.0))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
     for parameter in scene.parameters():
         parameter.grad = torch.full_like(parameter, 100.0)
     optimizer.step()

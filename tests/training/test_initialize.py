@@ -408,3 +408,30 @@ def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
 def test_without_points_nothing_is_refused():
     found = initialize.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf))
     assert torch.equal(found.trust(0.03), torch.ones(2))
+
+
+def test_depth_with_smooth_errors_is_brought_to_the_points():
+    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
+    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
+    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
+    inverse_depth[row, column] = (1.0 + 0.1 * torch.sin(column / 16.0)) / depth
+    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
+    views = Views(capture, torch.device("cpu"), 1 << 30)
+    plain = initialize.align_to_points(capture, views)
+    smooth = initialize.align_to_points(capture, views, smooth=True)
+    assert (smooth.errors[:, 0] < 0.3 * plain.errors[:, 0]).all()
+    assert torch.equal(smooth.alignments, plain.alignments)
+    again = initialize.align_to_points(capture, views)  # of the depth as it is now
+    assert (again.errors[:, 0] < 0.3 * plain.errors[:, 0]).all()
+
+
+def test_depth_that_a_smooth_factor_makes_no_better_stays():
+    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
+    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
+    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
+    inverse_depth[row, column] = 1.0 / depth
+    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
+    views = Views(capture, torch.device("cpu"), 1 << 30)
+    before = views[0].inverse_depth.clone()
+    initialize.align_to_points(capture, views, smooth=True)
+    assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))

@@ -55,7 +55,7 @@ def step(scene, optimizer, gradients):
 
 def trained(num_steps=3, rate=0.01, **sizes):
     scene = make_scene(**sizes)
-    optimizer = make_optimizer(scene, tiny.equal_rates(rate))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(rate))
     for seed in range(num_steps):
         step(scene, optimizer, random_gradients(scene, seed))
     return scene, optimizer
@@ -73,7 +73,7 @@ def rates_at(progress, network_progress, extent=1.0, config=RATES, warmup_factor
 
 def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
     scene = make_scene()
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.0))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
     group_from_parameter = {id(p): group["name"] for group in optimizer.param_groups for p in group["params"]}
     for name, parameter in scene.named_parameters():
         network_or_parameter = name.split(".")[0] if name.startswith(NETWORKS) else name
@@ -84,7 +84,7 @@ def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
 def test_steps_are_those_of_adam():
     scene = make_scene()
     start = {name: p.detach().double() for name, p in scene.named_parameters()}
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.01))
     first = {name: torch.zeros_like(value) for name, value in start.items()}
     second = {name: torch.zeros_like(value) for name, value in start.items()}
     for iteration in range(1, 5):
@@ -101,7 +101,7 @@ def test_steps_are_those_of_adam():
 
 def test_the_step_does_not_depend_on_the_size_of_the_gradient():
     scene = make_scene()
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.01))
     before = scene.static.means.detach().clone()
     gradients = {name: torch.full_like(p, 1e-10) for name, p in scene.named_parameters()}
     step(scene, optimizer, gradients)
@@ -112,7 +112,7 @@ def test_the_step_does_not_depend_on_the_size_of_the_gradient():
 def test_each_group_has_its_own_learning_rate(group):
     scene = make_scene()
     rates = tiny.equal_rates(0.0)
-    optimizer = make_optimizer(scene, rates)
+    optimizer = make_optimizer(dict(scene.named_parameters()), rates)
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
     rates[group].fill_(0.125)  # after construction: the optimizer reads its rates in every step
     step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
@@ -186,7 +186,7 @@ def test_resizing_one_branch_leaves_everything_else_unchanged():
 
 def test_resizing_before_the_first_step_needs_no_moments():
     scene = make_scene()
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.01))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.01))
     gather(optimizer, scene.static, torch.tensor([1, 1, 1]), num_kept=1)
     before = scene.static.means.detach().clone()
     step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
@@ -219,7 +219,7 @@ def test_a_reset_sets_the_moments_of_one_parameter_to_zero():
 
 def test_a_reset_of_an_untrained_parameter_changes_nothing():
     scene = make_scene()
-    optimizer = make_optimizer(scene, tiny.equal_rates(0.0))
+    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
     reset_moments(optimizer, scene.static.means)
     assert not optimizer.state.get(scene.static.means, {})
 

@@ -59,7 +59,7 @@ def make_scene(static, dynamic=None):
 
 def make_scene_and_optimizer(static, dynamic=None):
     scene = make_scene(static, dynamic)
-    return scene, make_optimizer(scene, tiny.equal_rates(0.0))
+    return scene, make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
 
 
 def expected_visibility(gaussians, cameras):

@@ -248,3 +248,17 @@ def test_a_run_without_a_checkpoint_starts_from_the_beginning(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path / "run")
     trainer.restore_newest()
     assert trainer.iteration == 0
+
+
+def test_corrections_of_poses_are_trained_and_resumed(data, tmp_path):
+    config = dataclasses.replace(tiny.CONFIG, optim=dataclasses.replace(tiny.CONFIG.optim, poses=1e-3))
+    runs = tmp_path / "whole", tmp_path / "resumed"
+    tiny.train(tiny.trainer(data, runs[0], config))
+    first = tiny.trainer(data, runs[1], config)
+    assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 14))
+    second = tiny.trainer(data, runs[1], config)
+    second.restore_newest()
+    assert tiny.train(second)
+    assert tiny.differences(*(tiny.state(run) for run in runs)) == []
+    assert (second.views.poses.angles() > 0.0).all()
+    assert (second.views.poses.shifts() > 0.0).all()

@@ -9,6 +9,7 @@ from tests import tiny
 from tests.data.captures import ids_of, write_capture
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
+from warpgs.model.poses import PoseCorrections
 from warpgs.training.views import Views, mask_border
 
 CPU = torch.device("cpu")
@@ -160,3 +161,33 @@ def test_the_margin_is_relative_to_the_larger_side(tmp_path):
     assert view.static_mask.shape == (24, 40)
     assert torch.equal(view.mask_border, mask_border(view.static_mask, 2))
     assert view.mask_border.any()
+
+
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_corrections_move_the_cameras_of_views(capture, resident_bytes):
+    if capture.frame(capture.train[0]).static_mask is None:
+        capture = capture.assuming("static")
+    poses = PoseCorrections(len(capture.train), 2.0)
+    with torch.no_grad():
+        poses.translations[1] = 0.25
+    views = Views(capture, CPU, resident_bytes, poses=poses)
+    plain = Views(capture, CPU, resident_bytes)
+    moves = [views[k].camera.viewmat - plain[k].camera.viewmat for k in range(2)]
+    assert not moves[0].any()
+    assert torch.allclose(moves[1][:3, 3], torch.full((3,), 0.5))
+    assert [torch.equal(camera.viewmat, views[k].camera.viewmat) for k, camera in enumerate(views.cameras())] == [
+        True
+    ] * len(views)
+
+
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_a_factor_changes_aligned_inverse_depth(capture, resident_bytes):
+    if capture.frame(capture.train[0]).inverse_depth is None:
+        pytest.skip("a layout without depth")
+    views = views_of(capture, resident_bytes)
+    before, other, alignment = views[1].inverse_depth, views[0].inverse_depth, torch.tensor([2.0, 0.5])
+    factor = torch.linspace(0.8, 1.2, before.numel()).view(before.shape)
+    views.set_depth_factor(1, alignment, factor)
+    expected = (2.0 * before + 0.5) * factor
+    torch.testing.assert_close(2.0 * views[1].inverse_depth + 0.5, expected, rtol=3e-3, atol=0.0, equal_nan=True)
+    assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), other.nan_to_num(-1.0))

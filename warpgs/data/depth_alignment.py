@@ -1,7 +1,12 @@
-"""Alignment of monocular depth: a scale and an offset of inverse depth per frame (paper, Sec. DAP)."""
+"""Alignment of monocular depth: a scale and an offset of inverse depth per frame (paper, Sec. DAP), and, beyond the
+paper, a smooth factor over the image, because the errors of depth networks vary smoothly (Xu et al. 2022)."""
 
+import math
+from functools import partial
+
+import cv2
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.cameras import Camera
@@ -10,6 +15,17 @@ from warpgs.kernels.constants import MIN_INVERSE_DEPTH
 MAX_ERROR, MAX_ERROR_OF_CONSTANT = 0.1, 0.6
 """Depth is unusable if its relative error exceeds both the first, and the second times that of a constant depth. The
 error of a depth network is about 0.05, 0.15 times that of a constant; that of noise is about that of a constant."""
+
+CELLS_PER_SIGMA = 2.0
+"""Standard deviation of the filter that smooths factors at points, in mean distances between points."""
+
+PRIOR_WEIGHT = 0.1
+"""Weight of a factor of 1, in points at no distance: where there are no points, depth is not changed."""
+
+ROBUST_SCALE = 0.1
+"""Error of the logarithm of a factor at which the weight of a point is halved: some points are behind surfaces."""
+
+ROBUST_ITERATIONS = 3
 
 REWEIGHTINGS = 50
 """Iterations of reweighted least squares; enough to converge with 30 % outliers."""
@@ -79,6 +95,54 @@ def relative_errors(
         return z.new_full((2,), torch.inf)
     aligned, z = aligned[known], z[known]
     return torch.stack([(aligned * z - 1.0).abs().median(), ((1.0 / z).median() * z - 1.0).abs().median()])
+
+
+def smooth_factor(
+    inverse_depth: Float[Tensor, "H W"],
+    static: Tensor,
+    camera: Camera,
+    points: Float[Tensor, "P 3"],
+    alignment: Float[Tensor, "2"],
+) -> tuple[Float[Tensor, "H W"], float]:
+    """Factor of aligned inverse depth that brings it to the sparse points, and the error that is left.
+
+    Logarithms of the factors at the points are smoothed by normalized convolution (Knutsson and Westin 1993).
+
+    Returns:
+        [H, W] factors, and the median relative error at one half of the points after fitting to the other half.
+    """
+    row, column, z, inside = camera.project(points)
+    aligned = alignment[0] * inverse_depth[row, column] + alignment[1]
+    known = inside & static[row, column] & (aligned > MIN_INVERSE_DEPTH)
+    row, column, ratios = (t[known].cpu() for t in (row, column, -(z * aligned).log()))
+    if len(ratios) < 2 * MIN_SAMPLES:
+        return torch.ones_like(inverse_depth), torch.inf
+    size = inverse_depth.shape
+    even = torch.arange(len(ratios)) % 2 == 0
+    half = _smoothed(row[even], column[even], ratios[even], size)
+    error = (ratios - half[row, column])[~even].expm1().abs().median().item()
+    return _smoothed(row, column, ratios, size).exp().to(inverse_depth), error
+
+
+def _smoothed(
+    row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], values: Float[Tensor, " P"], size: torch.Size
+) -> Float[Tensor, "H W"]:
+    """A smooth image through values at pixels, near 0 far from all of them."""
+    height, width = size
+    spacing = max(1.0, (height * width / len(values)) ** 0.5)
+    rows, columns = max(1, round(height / spacing)), max(1, round(width / spacing))
+    cell = (row * rows // height) * columns + column * columns // width
+    sums = partial(torch.bincount, cell, minlength=rows * columns)
+    smooth, weights = values.new_zeros(rows, columns), torch.ones_like(values)
+    for _ in range(ROBUST_ITERATIONS):
+        density = 2.0 * math.pi * CELLS_PER_SIGMA**2  # the filter has a sum of 1 instead of a peak of 1
+        total, count = (
+            density * cv2.GaussianBlur(sums(part).float().view(rows, columns).numpy(), (0, 0), CELLS_PER_SIGMA)
+            for part in (weights * values, weights)
+        )
+        smooth = torch.from_numpy(total / (count + PRIOR_WEIGHT))
+        weights = 1.0 / (1.0 + ((values - smooth.flatten()[cell]) / ROBUST_SCALE) ** 2)
+    return torch.from_numpy(cv2.resize(smooth.numpy(), (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def is_unusable(errors: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from warpgs import visualize
+from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.files import write_json, write_png
 from warpgs.progress import progress
@@ -20,6 +21,7 @@ from warpgs.video.mp4 import Video
 from .evaluate import evaluate, write_views
 from .lpips import find
 from .motion import jitter
+from .poses import aligned_camera
 
 NUM_IMAGES = 6
 """Evaluation views to save as images, spread over the capture."""
@@ -61,9 +63,16 @@ def evaluate_run(
         if index in chosen:
             write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
 
-    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, quiet)
+    def align(camera: Camera, truth: torch.Tensor) -> Camera:
+        return aligned_camera(scene.splats(camera.time), camera, truth, capture.extent, run.config.antialias)
+
+    poses_aligned = run.config.optim.poses > 0
+    evaluation = evaluate(
+        scene, capture, network and network.to(scene.device), save_image, align if poses_aligned else None, quiet
+    )
     times = [capture.cameras[name].time for name in capture.train]
-    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), **_training(scene)}
+    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), "poses_aligned": poses_aligned}
+    values |= _training(scene)
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
@@ -112,6 +121,8 @@ def _summary(values: dict[str, Any]) -> str:
         f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, {motion}",
         last_line,
     ]
+    if values["poses_aligned"]:
+        lines.append("camera poses were corrected in training, so held-out cameras were aligned to the scene")
     if values["masked_psnr"] is not None:
         lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")
     return "\n".join(lines)

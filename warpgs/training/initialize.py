@@ -77,6 +77,7 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     return points, color_points(points, views)
 
 
+@torch.no_grad()
 def dynamic_gaussians(
     config: TrainConfig,
     capture: Capture,
@@ -181,8 +182,16 @@ class DepthAlignment(NamedTuple):
         return torch.where(refused, 0.0, torch.where(known, trust, typical))
 
 
-def align_to_points(capture: Capture, views: Views) -> DepthAlignment:
-    """Aligns each view's inverse depth to the sparse points."""
+@torch.no_grad()
+def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> DepthAlignment:
+    """Aligns each view's inverse depth to the sparse points.
+
+    Args:
+        capture: The capture, with the points.
+        views: Its training views.
+        smooth: Whether to change the views' depth by a smooth factor as well, where that brings it nearer to points
+            that were left out.
+    """
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
     errors = torch.full((len(views), 2), torch.inf, device=views.device)
     points = capture.points.to(views.device)
@@ -191,6 +200,11 @@ def align_to_points(capture: Capture, views: Views) -> DepthAlignment:
         sources = (view.inverse_depth, view.static_mask, view.camera, points)
         alignments[index] = depth_alignment.align_to_points(*sources)
         errors[index] = depth_alignment.relative_errors(*sources, alignments[index])
+        if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
+            factor, error = depth_alignment.smooth_factor(*sources, alignments[index])
+            if error < errors[index, 0]:
+                views.set_depth_factor(index, alignments[index], factor)
+                errors[index, 0] = error
     return DepthAlignment(alignments, errors)
 
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from warpgs.config import OptimConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 
@@ -21,20 +22,30 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 MEANS_DECAY = 0.01
 """Final learning rate of positions, relative to the initial one (3DGS)."""
 
+POSES_DECAY = 0.01
+"""Final learning rate of camera poses, relative to the initial one."""
+
 BRANCHES = ("static", "dynamic")
 NETWORKS = ("deformation", "appearance")
-GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS)
-"""Names of the parameter groups: each Gaussian parameter of each branch, and each network."""
+GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS, "poses")
+"""Names of the parameter groups: each Gaussian parameter of each branch, each network, and the camera poses."""
 
 
-def make_optimizer(scene: SplitScene, rates: Mapping[str, Tensor]) -> Adam:
+def trained_parameters(scene: SplitScene, poses: PoseCorrections | None) -> dict[str, nn.Parameter]:
+    """Everything that is trained, by names that begin with that of a group."""
+    named = dict(scene.named_parameters())
+    if poses is not None:
+        named |= {f"poses.{name}": parameter for name, parameter in poses.named_parameters()}
+    return named
+
+
+def make_optimizer(parameters: Mapping[str, nn.Parameter], rates: Mapping[str, Tensor]) -> Adam:
     """Adam with the groups of ``GROUPS``.
 
     Args:
-        scene: What is trained.
+        parameters: From ``trained_parameters``.
         rates: Learning rate of each group, a scalar on the scene's device that the optimizer reads in every step.
     """
-    parameters = dict(scene.named_parameters())
     groups = [
         {
             "name": name,
@@ -74,6 +85,7 @@ def learning_rates(
     for name in NETWORKS:
         rate = exponential(config.networks, config.networks_end, network_progress[name])
         rates[name] = warmup_factors[name] * rate
+    rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, progress)
     return rates
 
 

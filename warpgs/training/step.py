@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
 from warpgs.config import RenderSettings, TrainConfig
@@ -89,11 +89,15 @@ class Step:
         self._inputs = StepInputs(sums, optim.GROUPS, device)
         self._sums = torch.zeros(len(sums), device=device)
         self._zero, self._one = torch.zeros((), device=device), torch.ones((), device=device)
-        self.optimizer = optim.make_optimizer(scene, self._inputs.learning_rates)
+        self.optimizer = optim.make_optimizer(self.parameters(), self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
         if config.graph and views.resident and device.type == "cuda":
             self._graphs = GraphCache(max_graphs=1, repeatable=False, shared_memory=device)
         self.reset_statistics()
+
+    def parameters(self) -> dict[str, nn.Parameter]:
+        """Everything that is trained, by name: the scene and the corrections of the views' cameras."""
+        return optim.trained_parameters(self.scene, self.views.poses)
 
     def reset_statistics(self) -> None:
         """Clears the gradient statistics and invalidates the graph; call it after the Gaussians were replaced."""

@@ -79,6 +79,12 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
         TrainingLogger(run.folder / "events", num_iterations, trainer.iteration, quiet) as logger,
     ):
         finished = trainer.train(logger, interrupt)
+    if (poses := trainer.views.poses) is not None:
+        turned, shifted = poses.angles().rad2deg(), 100.0 * poses.shifts()
+        log(
+            f"camera poses were corrected by {turned.median():.2f}° and {shifted.median():.2f} % of the extent "
+            f"(medians; at most {turned.max():.2f}° and {shifted.max():.2f} %)"
+        )
     if not finished:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks

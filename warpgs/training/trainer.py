@@ -10,6 +10,7 @@ import torch
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.exposure import exposure_gains
+from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 
@@ -60,12 +61,15 @@ class Trainer:
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
-        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains)
+        poses = None
+        if config.optim.poses:
+            poses = PoseCorrections(len(self.capture.train), self.capture.extent).to(self.device)
+        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses)
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
         self._earlier_peak = 0
-        found = initialize.align_to_points(self.capture, self.views)
+        found = initialize.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
         self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
@@ -122,9 +126,10 @@ class Trainer:
         if plan.densify:
             self._densify(plan.remove_large)
         if plan.prune:
-            cameras = [self.capture.cameras[name].to(self.device) for name in self.capture.train]
             threshold = self.config.densify.visibility
-            removed = prune_invisible(scene, self.step.optimizer, cameras, sh_degree, threshold, self.config.antialias)
+            removed = prune_invisible(
+                scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
+            )
             logger.log(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
@@ -185,7 +190,7 @@ class Trainer:
         """
         means = self.step.take_means()
         loss = sum(means.terms.values())
-        finite = torch.stack([parameter.isfinite().all() for parameter in self.scene.parameters()]).all()
+        finite = torch.stack([parameter.isfinite().all() for parameter in self.step.parameters().values()]).all()
         if not math.isfinite(loss) or not bool(finite):
             return False
         counts = len(self.scene.static), len(self.scene.dynamic)
@@ -211,7 +216,9 @@ class Trainer:
     def save(self) -> None:
         """Writes a checkpoint of the whole state of training."""
         tensors = {f"scene.{name}": tensor for name, tensor in self.scene.state_dict().items()}
-        for name, parameter in self.scene.named_parameters():
+        if self.views.poses is not None:
+            tensors |= {f"poses.{name}": tensor for name, tensor in self.views.poses.state_dict().items()}
+        for name, parameter in self.step.parameters().items():
             for part, value in self.step.optimizer.state.get(parameter, {}).items():
                 tensors[f"adam.{part}.{name}"] = value
         tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
@@ -246,8 +253,13 @@ class Trainer:
         if loaded.metadata.views != self.capture.train:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
+        if self.views.poses is not None:
+            state = self.views.poses.state_dict()
+            self.views.poses.load_state_dict(
+                {name: loaded.tensor(f"poses.{name}", t.shape) for name, t in state.items()}
+            )
         self._set_scene(checkpoint.load_scene(loaded, self.config.model))
-        for name, parameter in self.scene.named_parameters():
+        for name, parameter in self.step.parameters().items():
             if f"adam.step.{name}" in loaded.tensors:
                 shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
                 self.step.optimizer.state[parameter] = {

@@ -1,5 +1,6 @@
 """Training views on the device."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
+from warpgs.model.poses import PoseCorrections
 
 
 class View(NamedTuple):
@@ -74,8 +76,10 @@ class Views:
         resident_bytes: Maximum memory for views on the device [bytes].
         mask_margin: Half width of the borders of masks, as a fraction of the image's larger side.
         gains: [T, 3] what images are divided by, per channel; nothing if None.
+        poses: Corrections of the cameras; none if None.
 
     Attributes:
+        poses: The corrections.
         resident: Whether all views are on the device.
         num_pixels: Number of pixels of all views.
 
@@ -90,10 +94,13 @@ class Views:
         resident_bytes: int,
         mask_margin: float = 0.0,
         gains: Float[Tensor, "T 3"] | None = None,
+        poses: PoseCorrections | None = None,
     ) -> None:
         self.device, self._mask_margin = device, mask_margin
+        self.poses = poses
         self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
         self._capture = capture
+        self._depth_factors: dict[str, tuple[Tensor, Tensor]] = {}
         first = self._store(capture.frame(capture.train[0]))
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -108,19 +115,40 @@ class Views:
 
     def __getitem__(self, index: int) -> View:
         if self.resident:
-            return self._view(self._all.map(lambda tensors: tensors[index]))
-        stored = self._store(self._capture.frame(self._capture.train[index]))
-        return self._view(stored.map(lambda tensor: tensor.to(self.device)))
+            stored = self._all.map(lambda tensors: tensors[index])
+        else:
+            stored = self._store(self._capture.frame(self._capture.train[index]))
+            stored = stored.map(lambda tensor: tensor.to(self.device))
+        return self._view(stored, torch.tensor([index], device=self.device))
 
     def pick(self, index: Int64[Tensor, "1"]) -> View:
         """The view of an index on the device; all views must be resident."""
-        return self._view(self._all.map(lambda tensors: tensors.index_select(0, index)[0]))
+        return self._view(self._all.map(lambda tensors: tensors.index_select(0, index)[0]), index)
 
-    def _view(self, stored: _Stored) -> View:
+    def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
+        """Multiplies the aligned inverse depth of a view by a factor, from now on; the alignment stays the same."""
+        name = self._capture.train[index]
+        self._depth_factors[name] = (alignment.cpu(), factor.half().cpu())
+        if self.resident:
+            self._all.inverse_depth[index] = self._store(self._capture.frame(name)).inverse_depth
+
+    @torch.no_grad()
+    def cameras(self) -> list[Camera]:
+        """The corrected cameras of all views, on the device."""
+        cameras = [self._capture.cameras[name].to(self.device) for name in self._capture.train]
+        indices = torch.arange(len(self), device=self.device).split(1)
+        return [self._corrected(*pair) for pair in zip(cameras, indices, strict=True)]
+
+    def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
+        if self.poses is None:
+            return camera
+        return dataclasses.replace(camera, viewmat=self.poses(camera.viewmat, index))
+
+    def _view(self, stored: _Stored, index: Int64[Tensor, "1"]) -> View:
         height, width = stored.static_mask.shape
         image = stored.image.float() / 255.0
         return View(
-            Camera(stored.viewmat, stored.K, width, height),
+            self._corrected(Camera(stored.viewmat, stored.K, width, height), index),
             stored.time,
             image if stored.gain is None else image / stored.gain,
             stored.static_mask,
@@ -136,6 +164,9 @@ class Views:
                 "give the capture masks, or train with --assume static or --assume dynamic"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
+        if frame.name in self._depth_factors:
+            (scale, offset), factor = self._depth_factors[frame.name]
+            depth = ((scale * depth + offset) * factor - offset) / scale
         time = torch.tensor([camera.time])
         margin = round(self._mask_margin * max(size))
         border = mask_border(frame.static_mask, margin) if margin else None
