@@ -419,10 +419,10 @@ def test_depth_with_smooth_errors_is_brought_to_the_points():
     views = Views(capture, torch.device("cpu"), 1 << 30)
     plain = initialize.align_to_points(capture, views)
     smooth = initialize.align_to_points(capture, views, smooth=True)
-    assert (smooth.errors[:, 0] < 0.3 * plain.errors[:, 0]).all()
+    assert (smooth.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
     assert torch.equal(smooth.alignments, plain.alignments)
     again = initialize.align_to_points(capture, views)  # of the depth as it is now
-    assert (again.errors[:, 0] < 0.3 * plain.errors[:, 0]).all()
+    assert (again.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
 
 
 def test_depth_that_a_smooth_factor_makes_no_better_stays():
