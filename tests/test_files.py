@@ -2,8 +2,11 @@
 
 import errno
 import json
+import math
 import os
 import struct
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +16,7 @@ from warpgs.files import (
     partial_path,
     read_array,
     read_bounded,
+    read_numbers,
     remove_numbered,
     write_array,
     write_bytes,
@@ -81,12 +85,54 @@ def test_a_file_larger_than_the_maximum_is_refused(path):
 
 
 @pytest.mark.parametrize("read", [read_bounded, read_array])
-@pytest.mark.parametrize("case", ["folder", "missing", "device"])
+@pytest.mark.parametrize("case", ["folder", "missing", "zero", "fifo"])
 def test_only_regular_files_are_read(tmp_path, case, read):
-    path = {"folder": tmp_path, "missing": tmp_path / "a", "device": tmp_path / "zero"}[case]
+    path = tmp_path if case == "folder" else tmp_path / case
     (tmp_path / "zero").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "fifo")
     with pytest.raises(ValueError, match=rf"{path} is (not a file|missing)"):
         read(path, 10)
+
+
+@pytest.mark.parametrize("read", [read_bounded, read_array])
+def test_a_large_file_without_content_is_refused_by_its_size(tmp_path, read):
+    with open(tmp_path / "a", "wb") as file:
+        file.truncate(8 << 30)
+    with pytest.raises(ValueError, match=rf"{tmp_path / 'a'} has 8,589,934,592 bytes, more than the maximum of"):
+        read(tmp_path / "a", 1 << 20)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_a_file_that_holds_more_than_its_size_is_refused():
+    with pytest.raises(ValueError, match="/proc/self/status changes while it is read"):
+        read_bounded(Path("/proc/self/status"), 1 << 20)
+
+
+def test_numbers_are_read_with_their_shape():
+    assert read_numbers(Path("a.json"), {"a": [[1, 2.5]]}, "a", (1, 2)).tolist() == [[1.0, 2.5]]
+
+
+BAD_NUMBERS = [
+    (None, "must hold numbers"),
+    ("1.5", "must hold numbers"),
+    ([1, "2"], "must hold numbers"),
+    ([True, False], "must hold numbers"),
+    ([1, [2]], "must hold numbers"),
+    ([1, 10**400], "must hold numbers"),
+    (json.loads("[" * 900 + "]" * 900), "must hold numbers"),
+    ([1], r"must be finite numbers of shape \[2\]"),
+    ([1, math.nan], "must be finite"),
+    ([1, -math.inf], "must be finite"),
+    ([1, -2e9], r"must be at most 1e\+09 in magnitude"),
+]
+
+
+@pytest.mark.parametrize(("value", "message"), BAD_NUMBERS, ids=[str(k) for k in range(len(BAD_NUMBERS))])
+def test_a_field_without_valid_numbers_is_refused_by_name(value, message):
+    with pytest.raises(ValueError, match=rf"^a\.json: b {message}"):
+        read_numbers(Path("a.json"), {"b": value}, "b", (2,))
+    with pytest.raises(ValueError, match=r"^a\.json has no b$"):
+        read_numbers(Path("a.json"), {}, "b", (2,))
 
 
 def test_numbered_files_are_removed_up_to_the_first_gap(tmp_path):

@@ -4,6 +4,8 @@ import io
 import json
 import math
 import os
+import reprlib
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -13,10 +15,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt
+from jaxtyping import Float, Shaped, UInt
 
 MAX_JSON = 64 << 20
 """Maximum size of a JSON file [bytes]; metadata.json of a long capture has a few MiB."""
+
+MAX_NUMBER = 1e9
+"""Maximum magnitude of a position, a focal length or another measured number in a file: larger ones are damage, and
+their products overflow in single precision."""
+
+MAX_NPY_HEADER = 1 << 20
+"""Maximum size of what precedes the numbers of a .npy file [bytes]."""
 
 
 def partial_path(path: Path) -> Path:
@@ -102,32 +111,48 @@ def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
     write_bytes(path, [data.getvalue()])
 
 
-def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
-    """The content of a regular file of at most ``max_bytes``.
+def require_file(path: Path, max_bytes: int, hint: str = "") -> int:
+    """Checks a file before a library opens it by its path: a FIFO would never open, and a device never end.
 
     Args:
         path: The file.
         max_bytes: Its maximum size.
         hint: Why the file is needed, for the message if it is missing.
 
+    Returns:
+        The size of the file [bytes].
+
+    Raises:
+        ValueError: If it is missing, not a regular file or larger; the message names it.
+    """
+    try:
+        info = path.stat()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise ValueError(f"{path} is missing{': ' + hint if hint else ''}") from error
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise ValueError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from error
+    if not stat.S_ISREG(info.st_mode):
+        raise ValueError(f"{path} is not a file")
+    if info.st_size > max_bytes:
+        raise ValueError(f"{path} has {info.st_size:,} bytes, more than the maximum of {max_bytes:,}")
+    return info.st_size
+
+
+def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
+    """The content of a regular file of at most ``max_bytes``; arguments as for ``require_file``.
+
     Raises:
         ValueError: If it is missing, not a regular file (a device would never end) or larger; the message names it.
     """
+    size = require_file(path, max_bytes, hint)
     try:
-        _check_regular(path, hint)
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise ValueError(f"{path} has {size:,} bytes, more than the maximum of {max_bytes:,}")
-        return path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(size + 1)  # the size of a file in /proc says nothing about its content
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def _check_regular(path: Path, hint: str = "") -> None:
-    if not path.exists():
-        raise ValueError(f"{path} is missing{': ' + hint if hint else ''}")
-    if not path.is_file():
-        raise ValueError(f"{path} is not a file")
+    if len(data) != size:
+        raise ValueError(f"{path} changes while it is read: expected {size:,} bytes")
+    return data
 
 
 def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str, Any]:
@@ -147,21 +172,53 @@ def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str
 
 
 def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
-    """A .npy file of at most ``max_values`` numbers; pickled objects are refused.
+    """A .npy file of at most ``max_values`` numbers of up to 8 bytes; pickled objects are refused.
 
     Raises:
         ValueError: If the file is missing, truncated or larger, or holds something other than numbers.
     """
-    _check_regular(path)
+    require_file(path, MAX_NPY_HEADER + 8 * max_values)
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # allocates nothing, whatever the header claims
     except (ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError) as error:
         raise ValueError(f"{path} is damaged or not a .npy file of numbers") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         raise ValueError(f"{path} must be a .npy file of numbers")
     if array.size > max_values:
         raise ValueError(f"{path} has {array.size} numbers, more than the maximum of {max_values}")
     return np.array(array)
+
+
+def read_numbers(
+    path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...], max_magnitude: float = MAX_NUMBER
+) -> Float[np.ndarray, "..."]:
+    """Numbers in a field of a JSON object, as an array of double precision.
+
+    Args:
+        path: The file that the object comes from, for messages.
+        fields: The object.
+        key: Name of the field.
+        shape: Expected shape; () for a single number.
+        max_magnitude: Maximum absolute value.
+
+    Raises:
+        ValueError: If the field is missing, or holds something other than finite numbers of this shape and size.
+    """
+    if key not in fields:
+        raise ValueError(f"{path} has no {key}")
+    try:
+        values = np.array(fields[key])
+    except (ValueError, RecursionError) as error:  # lists of different lengths, or too deep
+        raise ValueError(f"{path}: {key} must hold numbers, got {reprlib.repr(fields[key])}") from error
+    if values.dtype.kind not in "fiu":  # objects are integers of too many digits, too
+        raise ValueError(f"{path}: {key} must hold numbers, got {reprlib.repr(fields[key])}")
+    if values.shape != shape or not np.isfinite(values).all():
+        raise ValueError(
+            f"{path}: {key} must be finite numbers of shape {list(shape)}, got {reprlib.repr(fields[key])}"
+        )
+    if values.size and np.abs(values).max() > max_magnitude:
+        raise ValueError(f"{path}: {key} must be at most {max_magnitude:g} in magnitude, got {values.tolist()}")
+    return values.astype(np.float64)
 
 
 def remove_numbered(folder: Path, name: Callable[[int], str]) -> None:

@@ -77,15 +77,67 @@ def test_a_truncated_jpeg_is_refused_by_name(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def chunk(name, content):
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def bomb(width, height):
+    """A valid PNG of 16-bit RGBA, all zero: a thousandth of the size of its pixels."""
+    header = struct.pack(">IIBBBBB", width, height, 16, 6, 0, 0, 0)
+    row, compress = bytes(1 + 8 * width), zlib.compressobj(1)
+    pixels = b"".join(compress.compress(row) for _ in range(height)) + compress.flush()
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
 @pytest.mark.parametrize("size", [(20_000, 10), (10, 2**31), (0, 5)])
 def test_a_png_that_claims_an_absurd_size_is_refused_before_it_is_decoded(tmp_path, size):
-    def chunk(name, content):
-        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
-
     header = struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0)
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IEND", b""))
     with pytest.raises(ValueError, match=f"claims {size[0]}×{size[1]}"):
         images.decode(tmp_path / "a.png")
+
+
+@pytest.fixture
+def no_decoding(monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
+
+
+@pytest.mark.usefixtures("no_decoding")
+@pytest.mark.parametrize("read", [images.read_image, images.read_mask])
+def test_an_image_of_another_size_is_refused_before_it_is_decoded(tmp_path, read):
+    (tmp_path / "a.png").write_bytes(bomb(2000, 1000))
+    with pytest.raises(ValueError, match=r"a\.png: the .* is 2000×1000, expected 40×24, the image_size of its camera"):
+        read(tmp_path / "a.png", SIZE)
+
+
+@pytest.mark.usefixtures("no_decoding")
+def test_images_and_depth_with_too_many_pixels_are_refused_before_they_are_decoded(tmp_path):
+    header = struct.pack(">IIBBBBB", 16000, 16000, 16, 6, 0, 0, 0)
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IEND", b""))
+    with pytest.raises(ValueError, match="claims 16000×16000 pixels, expected at most 100,000,000 together"):
+        images.decode(tmp_path / "a.png")
+    with pytest.raises(ValueError, match="claims 16000×16000 pixels, expected at most 16,777,216 together"):
+        images.read_depth(tmp_path / "a.png", SIZE)
+
+
+def test_the_first_chunk_of_a_png_must_be_its_header(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"tEXt", b"x" * 8) + chunk(b"IEND", b""))
+    with pytest.raises(ValueError, match="its first chunk must be its header"):
+        images.image_size(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("part", [b"\xff", b"\xff\xe0\x00\x02"], ids=["padding", "segments"])
+def test_a_jpeg_of_millions_of_parts_is_refused(tmp_path, part):
+    (tmp_path / "a.jpg").write_bytes(b"\xff\xd8" + part * 3_000_000 + b"\xff\xd9")
+    with pytest.raises(ValueError, match="it has no frame header"):
+        images.image_size(tmp_path / "a.jpg")
+
+
+def test_the_size_of_an_image_is_read_without_decoding_it(tmp_path, path, no_decoding):
+    jpeg_path = tmp_path / "b.jpg"
+    assert images.image_size(path) == SIZE
+    jpeg(jpeg_path)
+    assert images.image_size(jpeg_path) == SIZE
 
 
 def test_a_missing_image_is_refused_by_name(tmp_path):

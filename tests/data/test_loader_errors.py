@@ -55,6 +55,11 @@ BAD_CAMERAS = [
     ({"focal_length": None}, "no focal_length"),
     ({"focal_length": -5}, "focal_length"),
     ({"focal_length": 10**400}, "focal_length"),
+    ({"focal_length": 1e30}, "focal_length must be at most"),
+    ({"focal_length": 1e-30}, "focal_length and pixel_aspect_ratio must be at least"),
+    ({"focal_length": "12.5"}, "focal_length must hold numbers"),
+    ({"focal_length": True}, "focal_length must hold numbers"),
+    ({"orientation": [[1, 0, 0], [0, 1]]}, "orientation must hold numbers"),
     ({"principal_point": [1]}, "principal_point"),
     ({"skew": 0.1}, "skew"),
     ({"radial_distortion": [1, 2, 3, 4]}, "radial_distortion"),
@@ -62,6 +67,7 @@ BAD_CAMERAS = [
     ({"radial_distortion": {"k1": 1}}, "radial_distortion"),
     ({"image_size": [10**9, 10]}, "image_size"),
     ({"image_size": [0, 10]}, "image_size"),
+    ({"image_size": [16000, 16000]}, "image_size"),
 ]
 
 
@@ -127,10 +133,25 @@ def test_a_frame_without_a_time_is_refused(root, step):
     refused(root, r"metadata\.json has no time_id or warp_id for frame left_000001")
 
 
-@pytest.mark.parametrize("scene", [{}, {"center": [0, 0]}, {"scale": 0}, {"scale": float("inf")}, {"scale": None}])
+BAD_UNITS = [{"center": [0, 0]}, {"center": [1e300, 0, 0]}, *({"scale": s} for s in (0, float("inf"), None, 1e30))]
+
+
+@pytest.mark.parametrize("scene", [{}, *BAD_UNITS])
 def test_bad_scene_units_are_refused(root, scene):
     write_json(root / "scene.json", scene and {"center": [0, 0, 0], "scale": 1.0, **scene})
-    refused(root, r"scene\.json must have")
+    refused(root, rf"scene\.json(:| has no) {next(iter(scene), 'scale')}")
+
+
+@pytest.mark.parametrize("value", [1e300, 1e30, -1e10])
+def test_points_too_far_away_are_refused(root, value):
+    write_array(root / "points.npy", np.full((4, 3), value))
+    refused(root, r"points\.npy: positions must be finite and at most 1e\+09 scene units")
+
+
+def test_a_camera_too_far_away_is_refused(root):
+    write_json(root / "scene.json", {"center": [0, 0, 0], "scale": 1e8})
+    edit_json(root / "camera/right_000002.json", position=[1e8, 0, 0])
+    refused(root, r"right_000002\.json: positions must be finite and at most 1e\+09 scene units")
 
 
 def test_a_truncated_image_is_refused_when_it_is_read(root):

@@ -1,18 +1,21 @@
 """Camera files of the layout of Nerfies: camera/<id>.json."""
 
+import reprlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from warpgs.cameras import Camera
-from warpgs.files import read_json
+from warpgs.files import read_json, read_numbers
 
-from .images import MAX_SIDE
+from .images import MAX_PIXELS, MAX_SIDE
 from .lens import Lens, pinhole_matrix
 from .units import SceneUnits
+
+MIN_FOCAL = 1e-3
+"""Minimum focal length and pixel aspect ratio [px, 1]; the reciprocals of smaller ones overflow."""
 
 MAX_ROTATION_ERROR = 1e-3
 """Maximum entry of R Rᵀ − 1 for a rotation R; the files have at least six digits."""
@@ -35,12 +38,12 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
     """
     fields = read_json(path, "every frame needs its camera")
     lens = _lens(path, fields, factor)
-    rotation, position = _numbers(path, fields, "orientation", (3, 3)), _numbers(path, fields, "position", (3,))
+    rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
         raise ValueError(f"{path}: orientation is not a rotation")
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ units.from_world(position)
     try:
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ units.from_world(position)
         K = pinhole_matrix(lens)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -50,19 +53,21 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
 
 def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     focal, aspect = _number(path, fields, "focal_length"), _number(path, fields, "pixel_aspect_ratio", 1.0)
-    if focal <= 0 or aspect <= 0:
-        raise ValueError(f"{path}: focal_length and pixel_aspect_ratio must be positive, got {focal}, {aspect}")
+    if min(focal, aspect) < MIN_FOCAL:
+        raise ValueError(
+            f"{path}: focal_length and pixel_aspect_ratio must be at least {MIN_FOCAL}, got {focal}, {aspect}"
+        )
     if skew := _number(path, fields, "skew", 0.0):
         raise ValueError(f"{path}: cameras must have no skew, got {skew}")
-    x, y = _numbers(path, fields, "principal_point", (2,)) / factor
+    x, y = read_numbers(path, fields, "principal_point", (2,)) / factor
     # Old files call the field "tangential"; some have a third coefficient, 0.
     tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
     k1, k2, k3 = _coefficients(path, fields, "radial_distortion", 3)
     p1, p2 = _coefficients(path, fields, tangential, 2)
-    full = _numbers(path, fields, "image_size", (2,))
+    full = read_numbers(path, fields, "image_size", (2,))
     # Rounded as in Nerfies, whose code created the images.
     width, height = (round(float(side) / factor) for side in full)
-    if not (full > 0).all() or not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
+    if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE or width * height > MAX_PIXELS:
         raise ValueError(f"{path}: image_size {full.tolist()} is out of range")
     return Lens(
         width=width,
@@ -74,32 +79,15 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     )
 
 
-def _numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    if key not in fields:
-        raise ValueError(f"{path} has no {key}")
-    try:
-        values = np.array(fields[key], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: {key} must hold numbers") from error
-    if values.shape != shape or not np.isfinite(values).all():
-        raise ValueError(f"{path}: {key} must be finite numbers of shape {list(shape)}, got {_short(fields[key])}")
-    return values
-
-
 def _number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
     given = fields if default is None else {key: default, **fields}
-    return float(_numbers(path, given, key, ()))
+    return float(read_numbers(path, given, key, ()))
 
 
 def _coefficients(path: Path, fields: dict[str, Any], key: str, count: int) -> list[float]:
     """The first ``count`` coefficients of a list, padded with zeros; further coefficients must be zero."""
     given = fields.get(key) or []
-    values = _numbers(path, {key: given}, key, (len(given) if isinstance(given, list) else count,)).tolist()
+    values = read_numbers(path, {key: given}, key, (len(given) if isinstance(given, list) else count,)).tolist()
     if any(values[count:]):
-        raise ValueError(f"{path}: {key} must be {count} numbers, got {_short(given)}")
+        raise ValueError(f"{path}: {key} must be {count} numbers, got {reprlib.repr(given)}")
     return [*values, *[0.0] * count][:count]
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:60]}…"

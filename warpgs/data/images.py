@@ -13,8 +13,26 @@ from warpgs.files import read_array, read_bounded
 MAX_SIDE = 16_384
 """Maximum side of an image [px]; larger ones are refused before memory is allocated for them."""
 
-MAX_BYTES = 2 << 30
-"""Maximum size of an image file [bytes]: 16 bits per channel, RGBA, of the maximum side, uncompressed."""
+MAX_PIXELS = 100_000_000
+"""Maximum number of pixels of an image."""
+
+MIN_MAX_DEPTH_PIXELS = 1 << 24
+"""Depth may have at least this number of pixels, however small its image is; see ``read_depth``."""
+
+MAX_DEPTH_FACTOR = 8
+"""Depth may have this times the sides of its image: the full size serves images of every factor."""
+
+MAX_OVERHEAD = 64 << 20
+"""Maximum size of what an image file holds besides pixels, such as previews and profiles [bytes]."""
+
+MAX_BYTES_PER_PIXEL = 9
+"""RGBA of 16 bits, and what a compressor may add to pixels that it cannot compress [bytes]."""
+
+MAX_PARTS = 1_000_000
+"""Maximum number of chunks of a PNG or segments of a JPEG file."""
+
+MAX_PADDING = 1 << 16
+"""Maximum number of zeros after the end of a JPEG file."""
 
 FILL_RADIUS = 3
 """Neighbourhood used to inpaint unknown pixels [px]."""
@@ -22,24 +40,29 @@ FILL_RADIUS = 3
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
-def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> Shaped[np.ndarray, "H W ..."]:
+def decode(
+    path: Path,
+    flags: int = cv2.IMREAD_UNCHANGED,
+    size: tuple[int, int] | None = None,
+    what: str = "the image",
+    max_pixels: int = MAX_PIXELS,
+) -> Shaped[np.ndarray, "H W ..."]:
     """The pixels of a PNG or JPEG file in OpenCV's channel order, as stored or converted as OpenCV's ``flags`` request.
 
     Some versions of OpenCV decode a damaged file partially, fill the rest with grey and warn on stderr, so the file is
     checked first.
 
+    Args:
+        path: The file.
+        flags: OpenCV's flags.
+        size: Expected width and height; another size is refused before memory is allocated for it.
+        what: Name of the image in the message about its size.
+        max_pixels: Maximum number of pixels if ``size`` is None.
+
     Raises:
-        ValueError: If it is missing, truncated, damaged, too large, or not a PNG or JPEG image.
+        ValueError: If it is missing, truncated, damaged, too large, of another size, or not a PNG or JPEG image.
     """
-    data = read_bounded(path, MAX_BYTES)
-    if data.startswith(_PNG):
-        size = _check_png(path, data)
-    elif data.startswith(_JPEG):
-        size = _check_jpeg(path, data)
-    else:
-        raise ValueError(f"{path} is not a PNG or JPEG image")
-    if not 0 < min(size) <= max(size) <= MAX_SIDE:
-        raise ValueError(f"{path} claims {size[0]}×{size[1]} pixels, expected 1 to {MAX_SIDE} per side")
+    data, _ = _read_checked(path, size[0] * size[1] if size else max_pixels, size, what)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -49,23 +72,53 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> Shaped[np.ndarray, 
     return image
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of a PNG or JPEG file, without decoding it; raises as ``decode``."""
+    return _read_checked(path, MAX_PIXELS)[1]
+
+
+def _read_checked(
+    path: Path, max_pixels: int, size: tuple[int, int] | None = None, what: str = ""
+) -> tuple[bytes, tuple[int, int]]:
+    """The content of an image file, and its width and height."""
+    data = read_bounded(path, MAX_OVERHEAD + MAX_BYTES_PER_PIXEL * max_pixels)
+    if data.startswith(_PNG):
+        width, height = _check_png(path, data)
+    elif data.startswith(_JPEG):
+        width, height = _check_jpeg(path, data)
+    else:
+        raise ValueError(f"{path} is not a PNG or JPEG image")
+    if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
+        raise ValueError(f"{path} claims {width}×{height} pixels, expected 1 to {MAX_SIDE} per side")
+    if size is not None and (width, height) != size:
+        raise ValueError(
+            f"{path}: {what} is {width}×{height}, expected {size[0]}×{size[1]}, the image_size of its camera"
+        )
+    if width * height > max_pixels:
+        raise ValueError(f"{path} claims {width}×{height} pixels, expected at most {max_pixels:,} together")
+    return data, (width, height)
+
+
 def _check_png(path: Path, data: bytes) -> tuple[int, int]:
     """Checks the chunks (length, type, content, checksum) up to IEND; returns width and height."""
-    start, chunk = len(_PNG), b""
+    start, chunk, count = len(_PNG), b"", 0
     while chunk != b"IEND":
+        count += 1
         length, chunk = int.from_bytes(data[start : start + 4], "big"), data[start + 4 : start + 8]
         end = start + 8 + length
         if end + 4 > len(data):
             raise ValueError(f"{path} is truncated: its last chunk is cut off")
         if zlib.crc32(data[start + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise ValueError(f"{path} is damaged: a checksum is wrong")
+        if (count == 1) != (chunk == b"IHDR") or count > MAX_PARTS:
+            raise ValueError(f"{path} is damaged: its first chunk must be its header, with at most {MAX_PARTS:,} more")
         start = end + 4
     return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
 
 
 def _check_jpeg(path: Path, data: bytes) -> tuple[int, int]:
     """Checks the end marker; returns width and height from the frame header."""
-    if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
+    if not data[-MAX_PADDING:].rstrip(b"\0").endswith(b"\xff\xd9"):
         raise ValueError(f"{path} is truncated: its end marker is missing")
     for marker, content in _jpeg_segments(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
@@ -75,21 +128,15 @@ def _check_jpeg(path: Path, data: bytes) -> tuple[int, int]:
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     start = len(_JPEG)
-    while start + 4 <= len(data) and data[start] == 0xFF:
+    for _ in range(MAX_PARTS):
+        if start + 4 > len(data) or data[start] != 0xFF:
+            return
         if data[start + 1] == 0xFF:  # padding before a marker
             start += 1
             continue
         length = int.from_bytes(data[start + 2 : start + 4], "big")
         yield data[start + 1], data[start + 4 : start + 2 + length]
         start += 2 + length
-
-
-def _check_size(path: Path, what: str, array: np.ndarray, size: tuple[int, int]) -> None:
-    width, height = array.shape[1::-1]
-    if (width, height) != size:
-        raise ValueError(
-            f"{path}: {what} is {width}×{height}, expected {size[0]}×{size[1]}, the image_size of its camera"
-        )
 
 
 def _to_8_bits(image: np.ndarray) -> np.ndarray:
@@ -105,8 +152,7 @@ def read_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = _to_8_bits(decode(path))
-    _check_size(path, "the image", stored, size)
+    stored = _to_8_bits(decode(path, size=size))
     if stored.ndim == 2:
         return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
     image = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2RGB)
@@ -124,8 +170,7 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = decode(path)
-    _check_size(path, "the mask", stored, size)
+    stored = decode(path, size=size, what="the mask")
     if stored.ndim == 3:
         stored = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY)
     largest = next(value for value in (1, 255, 65535) if stored.max() <= value)
@@ -136,18 +181,20 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     """An 8- or 16-bit image, scaled to [0, 1], or a .npy file, resized to ``size`` (width, height).
 
     Networks often predict depth at a lower resolution than the image. Values that are not finite become NaN. In .npy
-    files NaN and 0 mark unknown pixels; arrays that have any are resized without interpolation.
+    files NaN and 0 mark unknown pixels; arrays that have any are resized without interpolation. Depth may have 8 times
+    the sides of the image, or 16 million pixels if that is more.
 
     Raises:
         ValueError: If the file is missing or damaged, or does not hold an [H, W] array.
     """
     values: np.ndarray
+    max_pixels = max(MIN_MAX_DEPTH_PIXELS, min(MAX_PIXELS, MAX_DEPTH_FACTOR**2 * size[0] * size[1]))
     if path.suffix == ".npy":
-        values = read_array(path, MAX_SIDE**2).astype(np.float32)
+        values = read_array(path, max_pixels).astype(np.float32)
         values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
         has_unknown = bool((~np.isfinite(values) | (values == 0)).any())
     else:
-        stored = decode(path)
+        stored = decode(path, max_pixels=max_pixels)
         values = stored.astype(np.float32) / np.iinfo(stored.dtype).max
         has_unknown = False
     if values.ndim != 2 or not 0 < min(values.shape) <= max(values.shape) <= MAX_SIDE:

@@ -34,7 +34,10 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         return torch.zeros(0, 3), None
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
         raise ValueError(f"{path} must hold finite points, [P, 3] with P > 0, got shape {list(points.shape)}")
-    return torch.tensor(units.from_world(points), dtype=torch.float32), colors
+    try:
+        return torch.tensor(units.from_world(points), dtype=torch.float32), colors
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _read_colmap(model: Path) -> tuple[np.ndarray, Tensor]:

@@ -6,7 +6,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from warpgs.files import read_json
+from warpgs.files import MAX_NUMBER, read_json, read_numbers
+
+MIN_SCALE = 1e-9
+"""Minimum number of scene units per unit of the files; the maximum is ``files.MAX_NUMBER``."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +25,15 @@ class SceneUnits:
     scale: float
 
     def from_world(self, positions: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Positions in scene units of positions in world units."""
-        return (positions - self.center) * self.scale
+        """Positions in scene units of positions in world units.
+
+        Raises:
+            ValueError: If one is not finite or larger than ``files.MAX_NUMBER``.
+        """
+        scene = (positions - self.center) * self.scale
+        if not (np.abs(scene) <= MAX_NUMBER).all():
+            raise ValueError(f"positions must be finite and at most {MAX_NUMBER:g} scene units from the center")
+        return scene
 
 
 def read_units(path: Path) -> SceneUnits:
@@ -33,10 +43,7 @@ def read_units(path: Path) -> SceneUnits:
         ValueError: If the file is missing or damaged, or has no valid center and scale.
     """
     fields = read_json(path)
-    try:
-        center, scale = np.array(fields["center"], dtype=np.float64), float(fields["scale"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path} must have center (3 numbers) and scale (a number)") from error
-    if center.shape != (3,) or not np.isfinite(center).all() or not 0.0 < scale < np.inf:
-        raise ValueError(f"{path} must have a finite center (3 numbers) and a positive scale")
-    return SceneUnits(center, scale)
+    scale = float(read_numbers(path, fields, "scale", ()))
+    if scale < MIN_SCALE:
+        raise ValueError(f"{path}: scale must be at least {MIN_SCALE}, got {scale}")
+    return SceneUnits(read_numbers(path, fields, "center", (3,)), scale)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from warpgs.data.images import decode, read_mask
+from warpgs.data.images import image_size, read_mask
 
 from .frames import SourceFrame
 
@@ -46,7 +46,7 @@ def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     Raises:
         ValueError: If it is damaged or its aspect ratio is not that of the frame.
     """
-    width, height = decode(path).shape[1::-1]
+    width, height = image_size(path)
     tolerance = 0.5 * (width + height + sum(size))  # both may have been rounded to whole pixels
     if abs(width * size[1] - height * size[0]) > tolerance:
         raise ValueError(
