@@ -9,6 +9,7 @@ from torch import Tensor
 
 from warpgs.files import read_array
 
+from .colmap_files import read_model
 from .units import SceneUnits
 
 MAX_POINTS = 50_000_000
@@ -41,12 +42,7 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
 
 
 def _read_colmap(model: Path) -> tuple[np.ndarray, Tensor]:
-    import pycolmap  # takes 0.2 s, and only captures without points.npy need it
-
-    try:
-        found = [p for _, p in sorted(pycolmap.Reconstruction(str(model)).points3D.items())]
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise ValueError(f"{model} is not a COLMAP model: {error}") from error
+    found = [p for _, p in sorted(read_model(model).points3D.items())]
     points = np.array([p.xyz for p in found], dtype=np.float64).reshape(-1, 3)
     colors = np.array([p.color for p in found], dtype=np.uint8).reshape(-1, 3)
     return points, torch.from_numpy(colors)
