@@ -233,6 +233,24 @@ def test_a_file_of_something_else_is_refused_in_words(tmp_path, content):
         lpips.find(tmp_path)
 
 
+@pytest.mark.parametrize("name", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
+def test_a_fifo_is_refused(tmp_path, name):
+    path = write(tmp_path, network("squeeze")) / name
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match=rf"({path} is not a file|holds no weights|is missing)"):
+        lpips.load(tmp_path, "squeeze")
+
+
+@pytest.mark.parametrize("name", ["features", "weights"])
+def test_weights_that_are_not_finite_are_refused(tmp_path, name):
+    distance = network("squeeze")
+    next(getattr(distance, name).parameters()).data.view(-1)[3] = torch.nan
+    write(tmp_path, distance)
+    with pytest.raises(ValueError, match=r"holds values that are not finite: \w+"):
+        lpips.load(tmp_path, "squeeze")
+
+
 def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
     class Bomb:
         def __reduce__(self):

@@ -1,5 +1,6 @@
 """Which frames are taken, and which sources are refused."""
 
+import os
 import struct
 
 import cv2
@@ -104,6 +105,14 @@ def test_files_that_are_not_videos_are_refused(tmp_path):
         take_frames(tmp_path / "notes.mp4", tmp_path / "frames", Selection())
     with pytest.raises(ValueError, match="is missing"):
         take_frames(tmp_path / "nothing.mp4", tmp_path / "frames", Selection())
+
+
+def test_a_video_that_is_a_fifo_or_a_device_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "fifo.mp4")
+    (tmp_path / "zero.mp4").symlink_to("/dev/zero")
+    for name in ("fifo.mp4", "zero.mp4"):
+        with pytest.raises(ValueError, match=f"{name} is not a file"):
+            take_frames(tmp_path / name, tmp_path / "frames", Selection())
 
 
 def test_one_frame_is_too_few(tmp_path, images):

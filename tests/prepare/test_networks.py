@@ -1,6 +1,7 @@
 """SAM 2 and Depth Anything with tiny networks of random weights, and the errors if they are missing."""
 
 import json
+import os
 import sys
 from importlib.util import find_spec
 
@@ -116,6 +117,17 @@ def test_weights_of_another_network_and_incomplete_ones_are_skipped(tmp_path, mo
     (tmp_path / "a" / "model.safetensors").touch()
     assert find_weights(DEPTH_ANYTHING, tmp_path) == tmp_path / "a"
     with pytest.raises(ValueError, match="needs the weights of SAM 2"):
+        find_weights(SAM2, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "preprocessor_config.json"])
+def test_weights_that_are_not_regular_files_are_refused(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(weights, "find_spec", lambda name: object())
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "sam2_video"}))
+    (tmp_path / "model.safetensors").touch()
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(ValueError, match=f"{name} is not a file"):
         find_weights(SAM2, tmp_path)
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,6 +130,53 @@ def test_an_interrupted_preparation_continues_after_the_last_finished_step(shots
     prepare(shots, tmp_path / "made", masks="none", depth="none")
     capture = load_capture(tmp_path / "made")
     assert bool(capture.frame(capture.train[0]).static_mask.all())
+
+
+def spoil_poses(path):
+    cameras = Cameras.load(path.with_suffix(""))
+    cameras.poses[0, 0, 0] = np.nan
+    cameras.save(path.with_suffix(""))
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def replace_with_fifo(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+DAMAGES = [
+    ("frames/frames.json", lambda path: path.write_text("{}"), "frames"),
+    ("frames/frames.json", lambda path: path.write_text('{"width": 3, "height": 3, "frames": [1]}'), "TypeError|not"),
+    ("frames/frames.json", replace_with_fifo, "is not a file"),
+    ("first-cameras.npz", cut, "zip"),
+    ("first-cameras.npz", spoil_poses, "a finite pose of every frame"),
+    ("first-cameras.npz", replace_with_fifo, "is not a file"),
+]
+
+
+@pytest.mark.parametrize(("name", "damage", "reason"), DAMAGES, ids=[str(k) for k in range(len(DAMAGES))])
+def test_a_damaged_result_of_an_earlier_call_is_refused_by_name(shots, tmp_path, monkeypatch, name, damage, reason):
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", true_cameras)
+    with monkeypatch.context() as patch:
+        patch.setattr("warpgs.prepare.steps.write_capture", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            prepare(shots, tmp_path / "made", masks="none", depth="none")
+    (path,) = (tmp_path / "made/.prepare").glob(name.replace("first-cameras", "*cameras*"))
+    damage(path)
+    with pytest.raises(ValueError, match=rf"of an earlier call, is damaged \(.*{reason}.*\): use --force"):
+        prepare(shots, tmp_path / "made", masks="none", depth="none")
+
+
+def test_a_damaged_journal_is_refused(made, shots, tmp_path):
+    root = shutil.copytree(made, tmp_path / "made")
+    state = json.loads((root / ".prepare/state.json").read_text())
+    for done in ([1], {"frames": 3}, {"frames": {"result": "x"}}, {"frames": {"result": "x", "seconds": "y"}}):
+        (root / ".prepare/state.json").write_text(json.dumps({**state, "done": done}))
+        with pytest.raises(ValueError, match="exists and was not made by prepare"):
+            prepare(shots, root)
 
 
 def test_a_frame_without_a_camera_is_noted_and_omitted(tmp_path):

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import html.parser
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -460,6 +461,20 @@ def test_invalid_events_are_ignored(tmp_path, run):
     path = next((run / "events").iterdir())
     path.write_bytes(b"nonsense" * 100)
     assert "PSNR [dB] of each view" in report(tmp_path, run, views=0).text
+
+
+def test_a_fifo_among_the_events_is_refused(capsys, run):
+    os.mkfifo(run / "events" / "events.out.tfevents.9")
+    assert "tfevents.9 is not a file" in error_line(capsys, run)
+
+
+def test_a_saved_image_that_is_damaged_or_of_absurd_size_is_not_shown(tmp_path, run):
+    edit_json(run / "config.json", data=str(tmp_path / "gone"))
+    paths = sorted(run.glob("images/**/*.png"))
+    assert paths
+    for path in paths:
+        path.write_bytes(path.read_bytes()[:-20])
+    assert report(tmp_path, run, views=1).images() == []
 
 
 def test_an_output_that_cannot_be_written_is_reported_in_one_line(capsys, run, tmp_path):

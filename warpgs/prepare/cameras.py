@@ -1,13 +1,19 @@
 """Cameras and sparse points as structure from motion recovers them."""
 
 import dataclasses
+import io
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.lens import Lens, pinhole_matrix
+from warpgs.files import read_bounded
+
+MAX_BYTES = 1 << 30
+"""Maximum size of a file of cameras and points [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +62,25 @@ class Cameras:
 
     @staticmethod
     def load(path: Path) -> "Cameras":
-        """The cameras that ``save`` wrote."""
-        with np.load(f"{path}.npz") as z:
+        """The cameras that ``save`` wrote.
+
+        Raises:
+            ValueError: If the file is missing or damaged.
+        """
+        file = path.with_name(path.name + ".npz")
+        data = io.BytesIO(read_bounded(file, MAX_BYTES))
+        try:
+            found = Cameras._parse(data)
+        except (BadZipFile, KeyError, TypeError, EOFError, OSError) as error:
+            raise ValueError(f"{file} is damaged: {error}") from error
+        numbers = (found.poses, found.points, found.lens.focal, found.lens.center)
+        if found.poses.shape != (len(found.names), 3, 4) or not all(np.isfinite(n).all() for n in numbers):
+            raise ValueError(f"{file} is damaged: expected a finite pose of every frame")
+        return found
+
+    @staticmethod
+    def _parse(data: io.BytesIO) -> "Cameras":
+        with np.load(data) as z:
             v = z["lens"].tolist()
             lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
             error, angle = z["quality"].tolist()

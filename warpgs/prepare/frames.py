@@ -62,7 +62,8 @@ class Frames:
     def load(folder: Path) -> "Frames":
         """The frames that ``take_frames`` wrote."""
         index = read_json(folder / INDEX)
-        return Frames(folder, [SourceFrame(**frame) for frame in index["frames"]], index["width"], index["height"])
+        taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"])) for f in index["frames"]]
+        return Frames(folder, taken, int(index["width"]), int(index["height"]))
 
     @property
     def names(self) -> list[str]:

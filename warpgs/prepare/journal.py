@@ -66,8 +66,9 @@ class Journal:
     def _read_state(self) -> tuple[dict[str, Any], list[str]]:
         try:
             state = read_json(self.work / STATE)
-            begun, done, notes = dict(state["options"]), dict(state["done"]), list(state["notes"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            begun, done, notes = dict(state["options"]), dict(state["done"]), list(map(str, state["notes"]))
+            done = {name: {"result": str(e["result"]), "seconds": float(e["seconds"])} for name, e in done.items()}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             if list(self.root.iterdir()) == [self.work]:  # interrupted during the first step
                 return {}, []
             raise ValueError(
@@ -109,10 +110,16 @@ class Journal:
             name: Name of the step; its path in the work folder follows from it.
             load: Reads the result from this path.
             make: Writes the result to this path and returns a summary; not called if the step is finished.
+
+        Raises:
+            ValueError: If the result was damaged since it was written.
         """
         path = self.work / name.replace(", ", "-").replace(" ", "-")
         self.step(name, lambda: make(path))
-        return load(path)
+        try:
+            return load(path)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{path}, a result of an earlier call, is damaged ({error}): use --force") from error
 
     def require_space(self, megabytes: int) -> None:
         """Checks the free disk space before something large is written: COLMAP aborts the process on a full disk.

@@ -63,7 +63,8 @@ class Masks:
     @staticmethod
     def load(folder: Path) -> "Masks":
         """The masks that ``write_masks`` wrote."""
-        return Masks(folder, **read_json(folder / INDEX))
+        index = read_json(folder / INDEX)
+        return Masks(folder, float(index["dynamic_fraction"]), bool(index["undistorted"]))
 
     def read_dynamic(self, cameras: Cameras) -> list[Bool[np.ndarray, "H W"]]:
         """[H, W] the dynamic mask of each undistorted frame of the cameras, in the size of the lens.

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from warpgs.data.images import MAX_SIDE
+from warpgs.files import require_file
 from warpgs.progress import progress
 
 from .images import sharpness
@@ -19,6 +20,9 @@ DEFAULT_FRAMES = 150
 
 MIN_DECODED_FRACTION = 0.95
 """Fraction of a video's nominal frames below which a note says that it ends early."""
+
+MAX_BYTES = 1 << 42
+"""Maximum size of a video [bytes]; it is decoded frame by frame."""
 
 MAX_COUNTED = 1_000_000
 """Frames after which counting stops."""
@@ -81,6 +85,7 @@ def _sharpest(
 
 
 def _open(source: Path) -> cv2.VideoCapture:
+    require_file(source, MAX_BYTES)
     before = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

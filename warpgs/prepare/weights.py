@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from warpgs.files import read_json
+from warpgs.files import read_json, require_file
+
+MAX_BYTES = 8 << 30
+"""Maximum size of a file of weights [bytes]; the largest network has a fifth of that."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def find_weights(network: Network, folder: Path | None) -> Path:
 
     Raises:
         ImportError: If the transformers package is missing.
-        ValueError: If the weights are not found; the message says how to get them.
+        ValueError: If the weights are not found, which the message says how to get, or a file is not a regular one.
     """
     if find_spec("transformers") is None:
         raise ImportError(f"{network.option} needs the package transformers: pip install 'warpgs[networks]'")
@@ -63,6 +66,9 @@ def find_weights(network: Network, folder: Path | None) -> Path:
             f"{folder or 'the Hugging Face cache'}: get them once with `hf download {network.names[0]}`, or name their "
             "folder (config.json and model.safetensors) with --weights"
         )
+    for path in found.iterdir():
+        if path.suffix in (".json", ".safetensors"):
+            require_file(path, MAX_BYTES)
     return found
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
 from warpgs.config import TrainConfig
-from warpgs.files import read_bounded, read_json
+from warpgs.files import read_bounded, read_json, require_file
 from warpgs.runs.config_file import read_config
 
 Curve = list[tuple[float, float]]
@@ -20,6 +20,9 @@ Curve = list[tuple[float, float]]
 
 MAX_FILE = 64 << 20
 """Maximum size of metrics.json and of views.csv [bytes]."""
+
+MAX_EVENTS = 1 << 30
+"""Maximum size of an event file of TensorBoard [bytes]; one of 100,000 iterations has about 20 MB."""
 
 MAX_VALUE = 1e18
 """Maximum magnitude of their numbers."""
@@ -145,8 +148,11 @@ def _metric(name: str, text: str) -> float | None:
 
 def _read_curves(folder: Path) -> dict[str, Curve]:
     """The scalars of TensorBoard's event files; damaged parts are skipped, as in TensorBoard."""
-    if not folder.is_dir() or not any(folder.iterdir()):
+    files = sorted(folder.glob("*tfevents*"))
+    if not files:
         return {}
+    for path in files:
+        require_file(path, MAX_EVENTS)
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     events = EventAccumulator(str(folder), size_guidance={SCALARS: 0})
     try:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs import visualize
+from warpgs.data.images import decode
 from warpgs.progress import progress
 from warpgs.runs.run import Device, Run
 
@@ -94,8 +95,11 @@ def _read_saved(folder: Path, name: str) -> Strip | None:
     path = next((p for p, root in zip(paths, roots, strict=True) if p.parent == root and p.is_file()), None)
     if path is None:
         return None
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None or image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:
+    try:
+        image = decode(path, cv2.IMREAD_COLOR)
+    except ValueError:  # the same as without a saved image, which the page's note says
+        return None
+    if image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:
         return None
     panels = np.split(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[visualize.CAPTION_HEIGHT :], PANELS, axis=1)
     return Strip(*(data_uri(np.ascontiguousarray(panels[k])) for k in (0, 1, 4)))
