@@ -120,10 +120,11 @@ def state(run: Path) -> dict[str, Tensor]:
 
 
 def edit_metadata(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Changes the plain values of a checkpoint in its file."""
+    """Changes the plain values of a checkpoint in its file, which then has no hash, as those of version 0.2."""
     with safe_open(path, framework="pt") as file:
         header, tensors = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     values = json.loads(header["facts"])
+    header.pop("sha256", None)
     change(values)
     save_file(tensors, path, metadata={**header, "facts": json.dumps(values)})
 

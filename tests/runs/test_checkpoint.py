@@ -199,7 +199,7 @@ def test_a_truncated_file_is_damaged(path, kept):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"nothing\.safetensors does not exist"):
+    with pytest.raises(ValueError, match=r"nothing\.safetensors is missing"):
         checkpoint.load(tmp_path / "nothing.safetensors")
 
 
@@ -323,6 +323,63 @@ def test_a_damaged_checkpoint_is_read_or_refused_in_one_line(tmp_path):
         refused += message is not None
         assert message is None or str(path) in message
     assert refused > 200
+
+
+def test_every_flipped_bit_is_refused_or_changes_nothing(tmp_path):
+    path = checkpoint.path_of(tmp_path, 3)
+    checkpoint.save(path, {**tensors_of(scene()), "b": torch.arange(5)}, METADATA)
+    expected, whole, random = checkpoint.load(path), path.read_bytes(), np.random.default_rng(0)
+    header = 8 + struct.unpack("<Q", whole[:8])[0]
+    refused = 0
+    for bit in [*random.integers(0, 8 * header, 200), *random.integers(8 * header, 8 * len(whole), 200)]:
+        data = bytearray(whole)
+        data[bit // 8] ^= 1 << (bit % 8)
+        path.write_bytes(data)
+        message = refusal(checkpoint.load, path)
+        refused += message is not None
+        if message is None:  # the header has spaces at its end
+            loaded = checkpoint.load(path)
+            assert tiny.differences(loaded.tensors, expected.tensors) == []
+            assert loaded.metadata == expected.metadata
+        else:
+            assert str(path) in message
+    assert refused > 395
+
+
+def test_checkpoints_without_a_hash_are_read(path):
+    """As version 0.2 wrote them."""
+    tiny.edit_metadata(path, lambda values: None)
+    with safe_open(path, framework="pt") as file:
+        assert "sha256" not in file.metadata()
+    loaded = checkpoint.load(path)
+    assert tiny.differences(loaded.tensors, TENSORS) == []
+    assert loaded.metadata == METADATA
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("adam.exp_avg.a", torch.nan, "not finite"),
+        ("adam.exp_avg_sq.a", torch.inf, "not finite"),
+        ("adam.exp_avg_sq.a", -1.0, "negative"),
+        ("adam.step.a", -1.0, "negative"),
+        ("gradients.total", torch.nan, "not finite"),
+        ("gradients.count", -1.0, "negative"),
+    ],
+)
+def test_a_state_that_training_cannot_have_is_refused_by_name(tmp_path, name, value, reason):
+    path = tmp_path / "a.safetensors"
+    checkpoint.save(path, {name: torch.tensor([0.0, value])}, METADATA)
+    with pytest.raises(checkpoint.DamagedCheckpointError, match=rf"{path} is damaged: {name} holds .*{reason}"):
+        checkpoint.load(path)
+
+
+def test_folders_fifos_and_devices_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for path in (tmp_path, tmp_path / "fifo", tmp_path / "zero"):
+        with pytest.raises(ValueError, match=f"{path} is not a file"):
+            checkpoint.load(path)
 
 
 def test_rows_of_zero_width_take_no_memory(tmp_path):

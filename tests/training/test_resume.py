@@ -57,7 +57,7 @@ def whole(data, tmp_path_factory):
 
 def resumed(data, run):
     trainer = tiny.trainer(data, run)
-    trainer.restore_newest()
+    trainer.restore_newest(print)
     assert tiny.train(trainer)
     return trainer
 
@@ -88,7 +88,7 @@ def test_a_run_resumed_after_every_iteration_is_bit_identical(data, whole, tmp_p
     sessions = 1
     while not finished:
         trainer = tiny.trainer(data, tmp_path)
-        trainer.restore_newest()
+        trainer.restore_newest(print)
         finished = tiny.train(trainer, tiny.StopWhen(lambda: True)) or trainer.iteration == tiny.LENGTH
         sessions += 1
     assert sessions == tiny.LENGTH
@@ -145,7 +145,7 @@ def test_a_run_with_the_options_for_captures_resumes_bit_by_bit(data, tmp_path):
     first = tiny.trainer(data, tmp_path / "parts", config)
     tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 12))
     second = tiny.trainer(data, tmp_path / "parts", config)
-    second.restore_newest()
+    second.restore_newest(print)
     assert second.iteration == 12
     tiny.train(second)
     assert tiny.differences(tiny.state(tmp_path / "whole"), tiny.state(tmp_path / "parts")) == []
@@ -167,20 +167,69 @@ def test_a_resumed_run_keeps_its_device_unless_another_is_given(stopped, monkeyp
     assert script.make_trainer(TrainConfig(resume=stopped)).config.device == "cpu"
 
 
-@pytest.mark.parametrize("kept", [0, 4, 100, -1])
-def test_a_truncated_newest_checkpoint_is_refused_by_name(stopped, kept):
-    newest = checkpoint.list_checkpoints(stopped)[-1]
-    newest.write_bytes(newest.read_bytes()[:kept])
-    with pytest.raises(ValueError, match=f"{newest} is damaged"):
-        script.make_trainer(command.parse(["--resume", str(stopped)]))
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-1])
 
 
-def test_after_deleting_the_newest_checkpoint_a_run_continues_from_the_previous_one(stopped, whole):
-    checkpoint.list_checkpoints(stopped)[-1].unlink()
-    trainer = script.make_trainer(command.parse(["--resume", str(stopped)]))
+def flip_a_bit(path):
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 4
+    path.write_bytes(data)
+
+
+def spoil(name, value):
+    """Changes one value of a tensor and writes the checkpoint as training would."""
+
+    def change(path):
+        loaded = checkpoint.load(path)
+        loaded.tensors[name].view(-1)[0] = value
+        checkpoint.save(path, loaded.tensors, loaded.metadata)
+
+    return change
+
+
+DAMAGES = {
+    "empty": lambda path: path.write_bytes(b""),
+    "truncated": truncate,
+    "bit": flip_a_bit,
+    "moment": spoil("adam.exp_avg.static.means", torch.nan),
+    "squared": spoil("adam.exp_avg_sq.static.means", -1.0),
+    "step": spoil("adam.step.static.means", -1.0),
+    "gradients": spoil("gradients.total", torch.inf),
+    "scene": spoil("scene.static.means", torch.nan),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_with_a_damaged_newest_checkpoint_a_run_continues_from_the_one_before_and_names_both(stopped, whole, damage):
+    before, newest = checkpoint.list_checkpoints(stopped)[-2:]
+    damage(newest)
+    lines = []
+    trainer = script.make_trainer(command.parse(["--resume", str(stopped)]), lines.append)
     assert trainer.iteration == 7
-    tiny.train(trainer)
+    (line,) = [line for line in lines if "damaged" in line]
+    assert line.startswith(f"warning: {newest} is damaged: ")
+    assert line.endswith(f"; it is now {newest.name}.damaged, and training continues from {before}")
+    assert newest not in checkpoint.list_checkpoints(stopped)
+    assert tiny.train(trainer)
     assert tiny.differences(tiny.state(stopped), tiny.state(whole)) == []
+
+
+def test_two_damaged_checkpoints_are_both_passed_over(stopped):
+    for path in checkpoint.list_checkpoints(stopped)[1:]:
+        truncate(path)
+    lines = []
+    assert script.make_trainer(TrainConfig(resume=stopped), lines.append).iteration == 0
+    assert sum("is damaged" in line for line in lines) == 2
+
+
+def test_without_an_undamaged_checkpoint_the_newest_is_refused_and_all_are_kept(stopped):
+    paths = checkpoint.list_checkpoints(stopped)
+    for path in paths:
+        truncate(path)
+    with pytest.raises(ValueError, match=f"^{paths[-1]} is damaged"):
+        script.make_trainer(TrainConfig(resume=stopped))
+    assert checkpoint.list_checkpoints(stopped) == paths
 
 
 def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
@@ -224,7 +273,7 @@ def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
     loaded = checkpoint.load(path)
     checkpoint.save(path, {**loaded.tensors, name: loaded.tensors[name][:2].clone()}, loaded.metadata)
     with pytest.raises(ValueError, match=rf"{path.name} is damaged: expected {name} as "):
-        tiny.trainer(data, run).restore_newest()
+        tiny.trainer(data, run).restore(checkpoint.list_checkpoints(run)[-1])
 
 
 @pytest.mark.parametrize(("name", "value"), [("iteration", "x"), ("train_seconds", None), ("rollbacks", -1)])
@@ -233,7 +282,7 @@ def test_metadata_of_another_type_is_refused_by_name(data, tmp_path, name, value
     tiny.train(tiny.trainer(data, run))
     tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values.update({name: value}))
     with pytest.raises(ValueError, match=f"is damaged: {name} cannot be"):
-        tiny.trainer(data, run).restore_newest()
+        tiny.trainer(data, run).restore(checkpoint.list_checkpoints(run)[-1])
 
 
 def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
@@ -241,12 +290,12 @@ def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
     tiny.train(tiny.trainer(data, run))
     tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values["views"].reverse())
     with pytest.raises(ValueError, match="was trained on other frames than builtin has now"):
-        tiny.trainer(data, run).restore_newest()
+        tiny.trainer(data, run).restore_newest(print)
 
 
 def test_a_run_without_a_checkpoint_starts_from_the_beginning(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path / "run")
-    trainer.restore_newest()
+    trainer.restore_newest(print)
     assert trainer.iteration == 0
 
 

@@ -1,9 +1,10 @@
 """Checkpoints: safetensors files, written so that a crash at any time leaves a complete one."""
 
+import hashlib
 import json
 import os
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,29 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from warpgs.config import MAX_VALUE, ModelConfig
-from warpgs.files import atomic_path
+from warpgs.files import atomic_path, require_file
 from warpgs.model.scene import SplitScene
 
 VERSION = 2
 FOLDER = "checkpoints"
+
+MAX_BYTES = 16 << 30
+"""Maximum size of a checkpoint [bytes]; 20 million Gaussians with Adam's moments."""
+
+HEADER_KEYS = ("format", "version", "facts", "sha256")
+"""Keys of the file's metadata. Checkpoints of version 0.2 and earlier have no ``sha256``."""
+
+
+class DamagedCheckpointError(ValueError):
+    """A checkpoint whose content is not what was written.
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, path: Path, reason: object) -> None:
+        super().__init__(f"{path} is damaged: {reason}")
+        self.path = path
 
 
 @dataclass(frozen=True)
@@ -68,15 +87,15 @@ class Checkpoint:
         """A tensor of single-precision numbers.
 
         Raises:
-            ValueError: If it is missing or has another shape or type.
+            DamagedCheckpointError: If it is missing or has another shape or type.
         """
         if name not in self.tensors:
-            raise ValueError(f"{self.path} is damaged: it has no {name}")
+            raise DamagedCheckpointError(self.path, f"it has no {name}")
         tensor = self.tensors[name]
         if tensor.shape != torch.Size(shape) or tensor.dtype != torch.float32:
-            raise ValueError(
-                f"{self.path} is damaged: expected {name} as {list(shape)} single-precision numbers, "
-                f"got {list(tensor.shape)} {tensor.dtype}"
+            raise DamagedCheckpointError(
+                self.path,
+                f"expected {name} as {list(shape)} single-precision numbers, got {list(tensor.shape)} {tensor.dtype}",
             )
         return tensor
 
@@ -89,7 +108,8 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     values = {FILE_KEYS.get(name, name): value for name, value in asdict(metadata).items()}
-    header = {"format": "warpgs", "version": str(VERSION), "facts": json.dumps(values)}
+    facts = json.dumps(values)
+    header = {"format": "warpgs", "version": str(VERSION), "facts": facts, "sha256": _hash(plain, facts)}
     with atomic_path(path) as partial:
         partial.touch()
         mode = partial.stat().st_mode
@@ -102,12 +122,23 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
             os.fsync(file.fileno())
 
 
+def _hash(tensors: Mapping[str, Tensor], facts: str) -> str:
+    """SHA-256 of the names, types, shapes and bytes of tensors on the CPU, and of the plain values."""
+    digest = hashlib.sha256(facts.encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"\0{name} {tensor.dtype} {list(tensor.shape)}\0".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
 def load(path: Path) -> Checkpoint:
     """Reads a checkpoint; never executes anything from it.
 
     Raises:
-        ValueError: If it is missing, damaged or not a checkpoint of this program; the message names the file.
+        DamagedCheckpointError: If its content is not what was written.
+        ValueError: If it is missing, not a regular file or not a checkpoint of this program. All messages name it.
     """
+    require_file(path, MAX_BYTES)
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -116,26 +147,42 @@ def load(path: Path) -> Checkpoint:
             if header.get("version") != str(VERSION):
                 raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return Checkpoint(path, tensors, _parse_metadata(path, header["facts"]))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path} does not exist") from error
-    except (SafetensorError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    except (SafetensorError, OSError) as error:
+        raise DamagedCheckpointError(path, error) from error
+    if unknown := sorted(set(header) - set(HEADER_KEYS)):  # as a damaged "sha256" is
+        raise DamagedCheckpointError(path, f"its header has {reprlib.repr(unknown[0])}")
+    if "sha256" in header and header["sha256"] != _hash(tensors, header.get("facts", "")):
+        raise DamagedCheckpointError(path, "its content has another SHA-256 than what was written")
+    _check_state(path, tensors)
+    return Checkpoint(path, tensors, _parse_metadata(path, header.get("facts", "")))
+
+
+def _check_state(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuses a state of the optimizer, or of densification, that training cannot have."""
+    for name, tensor in tensors.items():
+        if not name.startswith(("adam.", "gradients.")):
+            continue
+        if not bool(tensor.isfinite().all()):
+            raise DamagedCheckpointError(path, f"{name} holds values that are not finite")
+        if not name.startswith("adam.exp_avg.") and not bool((tensor >= 0).all()):
+            raise DamagedCheckpointError(path, f"{name} holds negative values")
 
 
 def _parse_metadata(path: Path, text: str) -> Metadata:
     try:
         values = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DamagedCheckpointError(path, error) from error
+    if not isinstance(values, dict) or not isinstance(values.get("views", []), list):
+        raise DamagedCheckpointError(path, "expected an object of plain values")
     parsed: dict[str, Any] = {}
     for field in fields(Metadata):
         key = FILE_KEYS.get(field.name, field.name)
         if key not in values:
-            raise ValueError(f"{path} is damaged: it has no {key}")
+            raise DamagedCheckpointError(path, f"it has no {key}")
         value = tuple(values[key]) if field.name == "views" else values[key]
         if not _is_valid(field.name, value):
-            raise ValueError(f"{path} is damaged: {key} cannot be {reprlib.repr(value)}")
+            raise DamagedCheckpointError(path, f"{key} cannot be {reprlib.repr(value)}")
         parsed[field.name] = value
     return Metadata(**parsed)
 
@@ -167,12 +214,21 @@ def keep_newest(run: Path, count: int) -> None:
         path.unlink()
 
 
+def set_aside(path: Path) -> Path:
+    """Renames a damaged checkpoint, so that it is not listed any more; returns its new path.
+
+    Raises:
+        OSError: If it cannot be renamed.
+    """
+    return path.replace(path.with_name(path.name + ".damaged"))
+
+
 def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
     """The scene of a checkpoint, on the CPU.
 
     Raises:
-        ValueError: If tensors are missing, not finite, or do not have the shapes of the config; the message names the
-            file.
+        DamagedCheckpointError: If its values are not finite, or its metadata does not fit the config.
+        ValueError: If tensors are missing or do not have the shapes of the config. All messages name the file.
     """
     state = {
         name.removeprefix("scene."): tensor for name, tensor in checkpoint.tensors.items() if name.startswith("scene.")
@@ -190,7 +246,7 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
         reason = str(error).splitlines()[:2][-1].strip()  # torch has the first detail on the second line
         raise ValueError(f"{path} does not hold a scene of this run's config: {reason}") from error
     if not all(bool(torch.isfinite(tensor).all()) for tensor in state.values()):
-        raise ValueError(f"{path} holds values that are not finite")
+        raise DamagedCheckpointError(path, "its scene holds values that are not finite")
     if checkpoint.metadata.sh_degree > config.sh_degree:
-        raise ValueError(f"{path} is damaged: sh_degree cannot be {checkpoint.metadata.sh_degree}")
+        raise DamagedCheckpointError(path, f"sh_degree cannot be {checkpoint.metadata.sh_degree}")
     return scene

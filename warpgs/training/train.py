@@ -131,7 +131,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
         locate(run.config.lpips)
         capture = check_capture(run.open_capture(quiet), run.config, log)
         trainer = Trainer(run.config, capture, run.folder)
-        trainer.restore_newest()
+        trainer.restore_newest(log)
         return trainer
     config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
     locate(config.lpips)  # reports a wrong folder now, not after training

@@ -3,6 +3,7 @@
 import hashlib
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -199,14 +200,14 @@ class Trainer:
 
     def _roll_back(self, logger: TrainingLogger) -> None:
         """Returns to the newest checkpoint; from there, random numbers are different ones."""
-        newest = checkpoint.list_checkpoints(self.run)[-1]
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
         if rollbacks > MAX_ROLLBACKS:
+            newest = checkpoint.list_checkpoints(self.run)[-1]
             raise ValueError(
                 f"the loss or a parameter is not finite after iteration {failed_at}, even after {MAX_ROLLBACKS} "
                 f"returns to a checkpoint; {newest} holds the last valid state"
             )
-        self.restore(newest)
+        self.restore_newest(logger.log)
         self.rollbacks = rollbacks
         logger.log(
             f"the loss or a parameter is not finite after iteration {failed_at}: back to iteration {self.iteration}, "
@@ -247,7 +248,8 @@ class Trainer:
         """Restores the state of a checkpoint.
 
         Raises:
-            ValueError: If it is damaged, or of another config or capture.
+            DamagedCheckpointError: If it is damaged.
+            ValueError: If it is of another config or capture.
         """
         loaded = checkpoint.load(path)
         if loaded.metadata.views != self.capture.train:
@@ -273,12 +275,27 @@ class Trainer:
         self.seconds, self._started = metadata.train_seconds, time.monotonic()
         self._earlier_peak = metadata.peak_bytes or 0
 
-    def restore_newest(self) -> None:
+    def restore_newest(self, log: Callable[[str], None]) -> None:
         """Restores the newest checkpoint of the run folder; without any, training starts from the beginning.
 
+        Damaged ones are renamed, with a warning, and the one before them is restored.
+
+        Args:
+            log: Receives the warnings.
+
         Raises:
-            ValueError: If it is damaged; delete it to continue from the one before it.
+            ValueError: If all are damaged, or the newest that is not is of another config or capture.
         """
-        saved = checkpoint.list_checkpoints(self.run)
-        if saved:
-            self.restore(saved[-1])
+        damaged: list[checkpoint.DamagedCheckpointError] = []
+        for path in reversed(checkpoint.list_checkpoints(self.run)):
+            try:
+                self.restore(path)
+            except checkpoint.DamagedCheckpointError as error:
+                damaged.append(error)
+                continue
+            for reason in damaged:
+                aside = checkpoint.set_aside(reason.path)
+                log(f"warning: {reason}; it is now {aside.name}, and training continues from {path}")
+            return
+        if damaged:
+            raise damaged[0]
