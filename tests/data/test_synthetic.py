@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import tempfile
 
 import cv2
 import numpy as np
@@ -29,6 +30,21 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def capture(folder):
     return load_capture(folder)
+
+
+def test_without_a_home_the_capture_is_kept_in_a_temporary_folder(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = synthetic.cache_folder()
+    assert folder.parent == tmp_path
+    assert list(folder.iterdir()) == []
+    error = capsys.readouterr().err
+    assert error.startswith("warpgs: no cache for the built-in scene (")
+    assert error.count("\n") == 1
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert synthetic.cache_folder() == tmp_path / "cache" / "warpgs"
+    assert capsys.readouterr().err == ""
 
 
 def test_every_frame_has_all_its_files(folder):

@@ -3,11 +3,13 @@
 It is ray-traced and written in the layout of NeRF-DS, so that it is loaded like a real capture.
 """
 
+import atexit
 import hashlib
 import json
 import math
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -244,7 +246,8 @@ def builtin_capture(
     """The folder of the built-in capture, which is created on the first call.
 
     Args:
-        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
+        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None, or a temporary folder if
+            that cannot be written.
         scene: Size of the capture; the default size if None.
         device: Device to trace on; the CPU if None.
         quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
@@ -255,12 +258,28 @@ def builtin_capture(
     """
     scene = scene or BuiltinScene()
     if cache_dir is None:
-        cache_dir = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
+        cache_dir = cache_folder()
     key = hashlib.blake2b(json.dumps([VERSION, asdict(scene)]).encode(), digest_size=6).hexdigest()
     folder = cache_dir / key / "builtin"
     if not folder.is_dir():
         with _complete_or_absent(folder) as partial:
             write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet)
+    return folder
+
+
+def cache_folder() -> Path:
+    """The user's cache of warpgs; without a writable home a folder that is removed at exit, with a warning."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
+        folder.mkdir(parents=True, exist_ok=True)
+        reason = "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
+    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
+        reason = str(error)
+    if not reason:
+        return folder
+    folder = Path(tempfile.mkdtemp(prefix="warpgs-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    sys.stderr.write(f"warpgs: no cache for the built-in scene ({reason}): it is made anew; set XDG_CACHE_HOME\n")
     return folder
 
 

@@ -9,6 +9,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from . import kernel_cache
+
 
 @dataclass(frozen=True)
 class PerShard:
@@ -30,6 +32,7 @@ class Command:
     """
 
     def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
+        kernel_cache.load(kernel, device, block_dim)
         blank = [None if hasattr(a.type, "ndim") else 0 for a in kernel.adj.args]
         self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
         self.dim = 1

@@ -17,13 +17,14 @@ from typing import Any
 import torch
 import warp as wp
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from . import profiling
+from .kernel_cache import init_warp
 from .launch import command_for
 from .streams import WARP_STREAM
 
-wp.config.log_level = wp.LOG_WARNING
-wp.init()
+init_warp()
 
 CHUNKS_PER_SHARD = 16
 """Chunks per core that a CPU launch is split into; cores take them in turn, so that their work is balanced."""
@@ -247,6 +248,7 @@ class _Differentiable(torch.autograd.Function):
         return outputs
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         with torch.no_grad():

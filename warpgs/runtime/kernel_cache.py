@@ -1,0 +1,118 @@
+"""Warp's cache of compiled kernels: what is damaged is compiled again, and a temporary folder replaces a missing home.
+
+Warp trusts its files: a truncated one stops every start, and machine code with a flipped bit ends in an illegal
+instruction. So the SHA-256 of a module's files is written beside them once the module has been loaded, and checked
+before it is loaded by a later process.
+"""
+
+import atexit
+import contextlib
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import warp as wp
+
+from warpgs.files import read_bounded
+
+SEAL = "warpgs.sha256"
+"""File in a module's folder with a line ``<SHA-256> <name>`` for each of its other files."""
+
+MAX_SEAL, MAX_BYTES = 1 << 16, 1 << 28
+"""Maximum size of this file and of a compiled module [bytes]; modules have less than a MiB."""
+
+
+def init_warp() -> None:
+    """Initializes Warp, with its kernel cache in a temporary folder if the usual one cannot be written."""
+    wp.config.log_level = wp.LOG_WARNING
+    try:
+        wp.init()
+    except OSError as error:
+        _use_temporary_folder(error)
+        wp.init()
+    folder = Path(wp.config.kernel_cache_dir)
+    if not os.access(folder, os.W_OK) and not any(folder.iterdir()):  # a filled one may be part of an image
+        _use_temporary_folder(f"{folder} cannot be written")
+
+
+def _use_temporary_folder(reason: object) -> None:
+    folder = tempfile.mkdtemp(prefix="warpgs-kernels-")  # a fixed name might hold kernels of another user
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    wp.config.kernel_cache_dir = folder
+    sys.stderr.write(
+        f"warpgs: no cache for compiled kernels ({reason}): they are compiled at every start; "
+        "set WARP_CACHE_PATH to a folder that can be written\n"
+    )
+
+
+_loaded: set[tuple[wp.Module, str, int]] = set()
+
+
+def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
+    """Loads the module of a kernel; what is damaged in its folder of the cache is compiled again, with a warning.
+
+    Args:
+        kernel: A kernel of the module.
+        device: Device that it is loaded on.
+        block_dim: Threads per CUDA block.
+    """
+    key = kernel.module, device.alias, 1 if device.is_cpu else block_dim  # as in wp.launch
+    if key in _loaded:
+        return
+    folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(key[2])
+    if damaged := _damaged_file(folder):
+        _discard(folder, f"{damaged} is not what was written")
+    was_cached = folder.is_dir()
+    try:
+        wp.load_module(kernel.module, device, block_dim=key[2])
+    except OSError:
+        raise
+    except Exception as error:  # of json, of Warp or of its linker
+        if not was_cached:
+            raise
+        _discard(folder, error)
+        wp.load_module(kernel.module, device, block_dim=key[2])
+    _seal(folder)
+    _loaded.add(key)
+
+
+def _discard(folder: Path, reason: object) -> None:
+    sys.stderr.write(f"warpgs: warning: the kernel cache is damaged ({reason}): {folder} is compiled again\n")
+    shutil.rmtree(folder)
+
+
+def _read_seal(folder: Path) -> dict[str, str]:
+    """SHA-256 by file name; empty if the module was never sealed."""
+    try:
+        lines = read_bounded(folder / SEAL, MAX_SEAL).decode(errors="replace").splitlines()
+    except ValueError:
+        return {}
+    return {name: digest for digest, _, name in (line.partition(" ") for line in lines)}
+
+
+def _damaged_file(folder: Path) -> Path | None:
+    sealed = _read_seal(folder)
+    return next((folder / name for name, digest in sealed.items() if _hash(folder / name) != digest), None)
+
+
+def _hash(path: Path) -> str:
+    """SHA-256 of a file; empty if it cannot be read."""
+    try:
+        return hashlib.sha256(read_bounded(path, MAX_BYTES)).hexdigest()
+    except ValueError:
+        return ""
+
+
+def _seal(folder: Path) -> None:
+    """Adds the hashes of the files that Warp has written since the last time; a cache that is not writable has none."""
+    sealed = _read_seal(folder)
+    names = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith(SEAL))
+    if set(names) <= set(sealed):
+        return
+    partial = folder / f"{SEAL}.{os.getpid()}"  # other processes may seal the same module now
+    with contextlib.suppress(OSError):
+        partial.write_text("".join(f"{sealed.get(name) or _hash(folder / name)} {name}\n" for name in names), "utf-8")
+        partial.replace(folder / SEAL)
