@@ -8,6 +8,7 @@ import torch
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs.config import RenderSettings
+from warpgs.ops.mlp import perceptron
 from warpgs.ops.projection import Geometry, View, project
 from warpgs.ops.sh import spherical_harmonics
 from warpgs.rendering import render
@@ -24,6 +25,21 @@ def test_two_backward_passes_give_the_same_gradients():
     second = torch.autograd.grad(loss, tensors)
     for a, b in zip(first, second, strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_second_derivative_is_an_error_not_zero():
+    splats = as_leaves(make_splats())
+    loss = render(splats, CAMERA).joint.image.square().sum()
+    (first,) = torch.autograd.grad(loss, [splats.means], create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        first.sum().backward()
+
+
+def test_a_second_derivative_of_the_perceptron_is_an_error_not_zero():
+    inputs, values = torch.rand(5, 4), torch.rand(5 * 8).requires_grad_()
+    (first,) = torch.autograd.grad(perceptron(inputs, values, [(8, 4)], 0, 8).square().sum(), values, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        first.sum().backward()
 
 
 def test_a_backward_pass_adds_to_existing_gradients():

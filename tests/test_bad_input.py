@@ -130,6 +130,12 @@ def test_a_camera_matrix_that_does_not_fit_is_refused(name, shape):
         dataclasses.replace(CAMERA, **{name: torch.ones(shape)})
 
 
+@pytest.mark.parametrize("camera", [[CAMERA], (CAMERA, CAMERA), None, CAMERA.viewmat], ids=str)
+def test_anything_but_one_camera_is_refused(camera):
+    with pytest.raises(TypeError, match=f"^camera must be one Camera, got {type(camera).__name__}: call render once"):
+        render(make_splats(), camera)
+
+
 @pytest.mark.parametrize("name", ["width", "height"])
 @pytest.mark.parametrize("value", [-1, 32769, 12.0, True, None])
 def test_an_invalid_image_size_is_refused(name, value):

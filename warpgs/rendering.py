@@ -77,7 +77,7 @@ def render(
     background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
     settings: RenderSettings | None = None,
 ) -> Rendering:
-    """Renders splats through a camera; differentiable in the splats, the camera and the background.
+    """Renders splats through a camera; differentiable, once, in the splats, the camera and the background.
 
     Gaussians that are behind the near plane, outside the image, fainter than 1/255 or that have an opacity above 1, a
     parameter that is not finite or a zero quaternion are culled: they leave the image unchanged and get zero gradients.
@@ -90,6 +90,7 @@ def render(
         settings: What to compute besides the joint image.
 
     Raises:
+        TypeError: If the camera is something else, such as a list of cameras.
         ValueError: If the background does not fit the splats, devices differ, or branches are requested for splats
             without ``is_dynamic``.
     """
@@ -112,6 +113,8 @@ def render(
 
 
 def _check_inputs(splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings) -> None:
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera must be one Camera, got {type(camera).__name__}: call render once per camera")
     C = splats.num_channels
     if background is not None:
         is_per_image = settings.branches and isinstance(background, Tensor) and background.ndim == 2

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, Float16, Float32
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import mlp as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
@@ -112,6 +113,7 @@ class _Perceptron(torch.autograd.Function):
         return _product(x, head.weight.t())[:, :num_outputs] + bias
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         *layer_inputs, copy = ctx.saved_tensors
         layers = split(copy, ctx.shapes)

@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from . import profiling
 from .graphs import record
@@ -263,6 +264,7 @@ class _Replayed(torch.autograd.Function):
         return tuple(outputs)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
         _ = ctx.saved_tensors
         with torch.set_grad_enabled(False):  # faster than no_grad
