@@ -75,6 +75,30 @@ def test_paths_are_saved_as_absolute_paths(tmp_path, capture, monkeypatch):
     assert kept.lpips == tmp_path / "weights"
 
 
+def test_what_a_kill_in_the_first_write_leaves_is_an_empty_folder(tmp_path, capture):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.json.partial").write_text("{")
+    config = dataclasses.replace(tiny.CONFIG, out=folder)
+    assert create(config, capture) == folder
+    assert read_config(folder).out == folder
+    with pytest.raises(ValueError, match="exists and is not empty"):
+        new_folder(config, capture)
+
+
+def fail_locked(run):
+    with Run.open(run, "cpu").lock():
+        raise KeyError
+
+
+def test_a_run_folder_cannot_be_locked_twice_and_is_unlocked_after_an_error(run):
+    for _ in range(2):
+        with pytest.raises(KeyError):
+            fail_locked(run)
+    with Run.open(run, "cpu").lock(), pytest.raises(ValueError, match="is being trained by another process"):
+        fail_locked(run)
+
+
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))

@@ -1,7 +1,6 @@
 """Run folders: config.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
 
 import dataclasses
-import fcntl
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,14 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
+from warpgs.files import partial_path
 
 from . import checkpoint
-from .config_file import read_config, write_config
+from .config_file import NAME, read_config, write_config
 from .trained import TrainedScene
 
 LOCK = ".lock"
@@ -57,11 +58,16 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
     if folder is None:
         stem = Path("runs") / f"{capture.name}-{config.preset}"
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    elif folder.exists() and (not folder.is_dir() or not _is_empty(folder)):
         raise ValueError(
             f"{folder} exists and is not empty: continue it with --resume {folder}, or choose another --out"
         )
     return folder
+
+
+def _is_empty(folder: Path) -> bool:
+    """Whether a folder holds nothing but what a kill in the first write leaves."""
+    return {path.name for path in folder.iterdir()} <= {partial_path(folder / NAME).name}
 
 
 @dataclass(frozen=True)
@@ -136,11 +142,11 @@ class Run:
             ValueError: If another process holds the lock.
             OSError: If the lock file cannot be written.
         """
-        with open(self.folder / LOCK, "w") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise ValueError(f"{self.folder} is being trained by another process") from error
+        try:
+            held = FileLock(self.folder / LOCK).acquire(timeout=0)
+        except Timeout as error:
+            raise ValueError(f"{self.folder} is being trained by another process") from error
+        with held:
             yield
 
 
