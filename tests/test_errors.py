@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from warpgs.data.check import Finding
 from warpgs.errors import ADVICE, is_out_of_memory, one_line, run_command
 
 
@@ -27,6 +28,22 @@ def test_a_command_that_succeeds_decides_its_exit_code(returned, code, capsys):
 def test_errors_of_the_user_are_one_line_and_exit_code_2(error, capsys):
     assert run_command(failing(error("a file\n  is missing"))) == 2
     assert capsys.readouterr().err == "warpgs: a file is missing\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a\x1b[31m.png is missing", r"a\x1b[31m.png is missing"),
+        ("a\x07b\x9bc", r"a\x07b\x9bc"),
+        ("gnp\u202e.a", r"gnp\u202e.a"),
+        ("\udcff.png", r"\udcff.png"),
+        ("Tür 日本.png", "Tür 日本.png"),
+    ],
+)
+def test_what_a_terminal_would_obey_is_escaped(capsys, text, shown):
+    run_command(failing(ValueError(text)))
+    assert capsys.readouterr().err == f"warpgs: {shown}\n"
+    assert str(Finding("error", "files", text)) == f"error: {shown}"
 
 
 def test_ctrl_c_is_one_line_and_exit_code_130(capsys):

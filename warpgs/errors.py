@@ -41,8 +41,13 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error without line breaks."""
-    return " ".join(str(error).split())
+    """The message of an error without line breaks and control characters."""
+    return visible(" ".join(str(error).split()))
+
+
+def visible(text: str) -> str:
+    """A text in which what a terminal would obey is escaped: names of files and fields come from others."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -124,6 +124,15 @@ def test_a_video_has_its_name_only_when_it_is_complete(tmp_path):
     assert len(frames_of(tmp_path / "a.mp4")) == 1
 
 
+def test_an_ffmpeg_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeypatch):
+    def fail(name):
+        raise ImportError("libavcodec.so: failed to map segment: Cannot allocate memory")
+
+    monkeypatch.setattr(mp4.importlib, "import_module", fail)
+    with pytest.raises(OSError, match=r"^FFmpeg could not be loaded: libavcodec\.so: failed to map"):
+        mp4._ffmpeg()
+
+
 def test_without_ffmpeg_the_error_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with (

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.cameras import Camera
+from warpgs.errors import visible
 
 from .capture import MIN_EXTENT, Capture, Frame
 from .depth_alignment import align_to_points, is_unusable, relative_errors
@@ -61,7 +62,7 @@ class Finding:
     text: str
 
     def __str__(self) -> str:
-        return f"{self.level}: {self.text}"
+        return f"{self.level}: {visible(self.text)}"
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Report:
         order = {"note": 0, "warning": 1, "error": 2}
         lines = [str(f) for f in sorted(self.findings, key=lambda f: order[f.level])]
         verdict = "fit to train on" if self.is_fit else "not fit to train on"
-        return "\n".join([*lines, f"{self.root}: {verdict}"])
+        return "\n".join([*lines, f"{visible(str(self.root))}: {verdict}"])
 
 
 def check_capture(root: Path, dataset: str | None = None, factor: int | None = None) -> Report:

@@ -100,9 +100,11 @@ def _ffmpeg() -> ModuleType:
     """PyAV, which includes FFmpeg; imported on first use because the import takes a third of a second.
 
     Raises:
-        OSError: If PyAV is not installed.
+        OSError: If PyAV is not installed or cannot be loaded.
     """
     try:
         return importlib.import_module("av")
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise OSError("a video needs FFmpeg, which comes with PyAV: pip install av") from error
+    except ImportError as error:  # of its libraries, such as for lack of memory
+        raise OSError(f"FFmpeg could not be loaded: {error}") from error

@@ -43,7 +43,7 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
         host = f"[{options.host}]" if ":" in options.host else options.host
         report(f"{options.run_folder}: http://{host}:{viewer.port} (press Ctrl-C to stop)")
         _wait()
-    report("")
+        report("\nstopping")  # open connections take seconds to close
 
 
 def training_cameras(source: Source, warn: Callable[[str], None]) -> TrainingCameras | None:
