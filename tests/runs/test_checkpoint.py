@@ -365,6 +365,7 @@ def test_checkpoints_without_a_hash_are_read(path):
         ("adam.step.a", -1.0, "negative"),
         ("gradients.total", torch.nan, "not finite"),
         ("gradients.count", -1.0, "negative"),
+        ("poses.a", torch.nan, "not finite"),
     ],
 )
 def test_a_state_that_training_cannot_have_is_refused_by_name(tmp_path, name, value, reason):

@@ -158,13 +158,13 @@ def load(path: Path) -> Checkpoint:
 
 
 def _check_state(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Refuses a state of the optimizer, or of densification, that training cannot have."""
+    """Refuses a state of the optimizer, of densification or of poses that training cannot have."""
     for name, tensor in tensors.items():
-        if not name.startswith(("adam.", "gradients.")):
+        if not name.startswith(("adam.", "gradients.", "poses.")):
             continue
         if not bool(tensor.isfinite().all()):
             raise DamagedCheckpointError(path, f"{name} holds values that are not finite")
-        if not name.startswith("adam.exp_avg.") and not bool((tensor >= 0).all()):
+        if not name.startswith(("adam.exp_avg.", "poses.")) and not bool((tensor >= 0).all()):
             raise DamagedCheckpointError(path, f"{name} holds negative values")
 
 
