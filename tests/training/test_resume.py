@@ -306,7 +306,7 @@ def test_corrections_of_poses_are_trained_and_resumed(data, tmp_path):
     first = tiny.trainer(data, runs[1], config)
     assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= 14))
     second = tiny.trainer(data, runs[1], config)
-    second.restore_newest()
+    second.restore_newest(print)
     assert tiny.train(second)
     assert tiny.differences(*(tiny.state(run) for run in runs)) == []
     assert (second.views.poses.angles() > 0.0).all()
