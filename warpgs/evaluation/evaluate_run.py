@@ -2,6 +2,7 @@
 
 import dataclasses
 import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,20 +64,18 @@ def evaluate_run(
         if index in chosen:
             write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
 
-    def align(camera: Camera, truth: torch.Tensor) -> Camera:
-        return aligned_camera(scene.splats(camera.time), camera, truth, capture.extent, run.config.antialias)
-
-    poses_aligned = run.config.optim.poses > 0
-    evaluation = evaluate(
-        scene, capture, network and network.to(scene.device), save_image, align if poses_aligned else None, quiet
-    )
+    align = partial(_align, scene, capture.extent) if run.config.optim.poses else None
+    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
     times = [capture.cameras[name].time for name in capture.train]
-    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), "poses_aligned": poses_aligned}
-    values |= _training(scene)
+    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), **_training(scene)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)
+
+
+def _align(scene: TrainedScene, extent: float, camera: Camera, truth: torch.Tensor) -> Camera:
+    return aligned_camera(scene.splats(camera.time), camera, truth, extent, scene.config.antialias)
 
 
 def _training(scene: TrainedScene) -> dict[str, Any]:
@@ -87,6 +86,7 @@ def _training(scene: TrainedScene) -> dict[str, Any]:
         "peak_bytes": metadata.peak_bytes,
         "num_static": len(scene.scene.static),
         "num_dynamic": len(scene.scene.dynamic),
+        "poses_aligned": scene.config.optim.poses > 0,
     }
 
 

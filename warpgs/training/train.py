@@ -9,6 +9,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
+from warpgs.model.poses import PoseCorrections
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_capture
 
@@ -79,12 +80,8 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
         TrainingLogger(run.folder / "events", num_iterations, trainer.iteration, quiet) as logger,
     ):
         finished = trainer.train(logger, interrupt)
-    if (poses := trainer.views.poses) is not None:
-        turned, shifted = poses.angles().rad2deg(), 100.0 * poses.shifts()
-        log(
-            f"camera poses were corrected by {turned.median():.2f}° and {shifted.median():.2f} % of the extent "
-            f"(medians; at most {turned.max():.2f}° and {shifted.max():.2f} %)"
-        )
+    if trainer.views.poses is not None:
+        _describe_corrections(trainer.views.poses, log)
     if not finished:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
@@ -110,6 +107,15 @@ def _describe(trainer: Trainer, log: Log) -> None:
     if num_aligned < num_views - refused:
         reason = "" if num_aligned else NO_DEPTH
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+
+
+def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
+    """Logs how far the training cameras were moved."""
+    turned, shifted = poses.angles().rad2deg(), 100.0 * poses.shifts()
+    log(
+        f"camera poses were corrected by {turned.median():.2f}° and {shifted.median():.2f} % of the extent "
+        f"(medians; at most {turned.max():.2f}° and {shifted.max():.2f} %)"
+    )
 
 
 def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
