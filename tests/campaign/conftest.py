@@ -2,7 +2,7 @@
 
 import pytest
 
-DEFAULT = 120
+DEFAULT = 60
 
 
 def pytest_addoption(parser):
