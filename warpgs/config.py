@@ -248,7 +248,8 @@ class TrainConfig:
     data: Path | None = None
     """Folder of the capture; the built-in scene if omitted."""
     dataset: str | None = None
-    """Dataset of the capture: nerfds, hypernerf or iphone; recognized from its files if omitted."""
+    """Layout of the capture: nerfds, hypernerf, iphone, nerfstudio, blender (D-NeRF), llff (NVIDIA), colmap, vipe or
+    megasam; recognized from its files if omitted."""
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
     out: Path | None = None

@@ -36,9 +36,9 @@ def test_an_unfit_capture_exits_with_code_1_and_prints_json_on_request(tmp_path,
 
 def test_an_unknown_dataset_is_reported_with_the_known_ones(root, capsys):
     with pytest.raises(SystemExit) as stop:
-        check(root, "--dataset", "blender")
+        check(root, "--dataset", "blend")
     assert stop.value.code == 1
-    assert "unknown dataset 'blender', expected one of iphone, nerfds, hypernerf" in capsys.readouterr().out
+    assert "unknown dataset 'blend', expected one of iphone, nerfds, hypernerf, nerfstudio" in capsys.readouterr().out
 
 
 def test_the_dataset_and_factor_given_are_used(root, capsys):

@@ -107,7 +107,7 @@ def test_the_error_for_a_missing_size_lists_the_existing_sizes(root):
 
 @pytest.mark.usefixtures("contracts_off")
 def test_an_unknown_dataset_is_refused_with_the_known_ones(root):
-    refused(root, "unknown dataset 'blender', expected one of iphone, nerfds, hypernerf", dataset="blender")
+    refused(root, "unknown dataset 'blend', expected one of iphone, nerfds, hypernerf, nerfstudio", dataset="blend")
 
 
 def test_a_factor_below_one_is_refused(root):

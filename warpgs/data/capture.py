@@ -53,6 +53,7 @@ class Capture:
         point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
         cache_frames: Number of frames to keep in memory.
+        unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
             unit of 3DGS's position learning rate and densification thresholds [scene units].
@@ -69,7 +70,8 @@ class Capture:
     point_colors: UInt8[Tensor, "P 3"] | None
     read: Callable[[str], Frame]
     cache_frames: int = 256
-    assumption: Assumption = field(default="masks", init=False)
+    unmasked: Assumption = "masks"
+    assumption: Assumption = field(init=False)
     extent: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -78,15 +80,17 @@ class Capture:
         self.train, self.val = tuple(self.train), tuple(self.val)
         positions = torch.stack([self.cameras[name].position for name in self.train])
         self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+        self.assumption = self.unmasked
         self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
 
     def assuming(self, assumption: Assumption) -> "Capture":
         """The same capture with static masks as in the files ("masks"), all true ("static") or all false ("dynamic").
 
-        The captures have one cache of frames. ``assuming("masks")`` restores the masks of the files for evaluation.
+        The captures have one cache of frames. ``assuming("masks")`` restores the masks of the files for evaluation, or
+        ``unmasked`` if that is what the capture says of itself.
         """
         capture = copy.copy(self)
-        capture.assumption = assumption
+        capture.assumption = self.unmasked if assumption == "masks" else assumption
         return capture
 
     def frame(self, name: str) -> Frame:

@@ -15,7 +15,8 @@ class Check:
     capture: tyro.conf.Positional[Path]
     """Folder of the capture."""
     dataset: str | None = None
-    """Dataset (iphone, nerfds, hypernerf); recognized from the files by default."""
+    """Layout: iphone, nerfds, hypernerf, nerfstudio, blender, llff, colmap, vipe or megasam; recognized from the files
+    by default."""
     factor: int | None = None
     """Downscaling factor of the images; the dataset's usual one by default."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False

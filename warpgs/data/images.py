@@ -63,6 +63,16 @@ def decode(
         ValueError: If it is missing, truncated, damaged, too large, of another size, or not a PNG or JPEG image.
     """
     data, _ = _read_checked(path, size[0] * size[1] if size else max_pixels, size, what)
+    return _decode(path, data, flags)
+
+
+def decode_bytes(path: Path, data: bytes) -> Shaped[np.ndarray, "H W ..."]:
+    """The pixels of the content of a PNG or JPEG file, as ``decode``; ``path`` is for messages."""
+    _check(path, data, MAX_PIXELS)
+    return _decode(path, data, cv2.IMREAD_UNCHANGED)
+
+
+def _decode(path: Path, data: bytes, flags: int) -> Shaped[np.ndarray, "H W ..."]:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -82,6 +92,13 @@ def _read_checked(
 ) -> tuple[bytes, tuple[int, int]]:
     """The content of an image file, and its width and height."""
     data = read_bounded(path, MAX_OVERHEAD + MAX_BYTES_PER_PIXEL * max_pixels)
+    return data, _check(path, data, max_pixels, size, what)
+
+
+def _check(
+    path: Path, data: bytes, max_pixels: int, size: tuple[int, int] | None = None, what: str = ""
+) -> tuple[int, int]:
+    """Width and height of the content of an image file."""
     if data.startswith(_PNG):
         width, height = _check_png(path, data)
     elif data.startswith(_JPEG):
@@ -96,7 +113,7 @@ def _read_checked(
         )
     if width * height > max_pixels:
         raise ValueError(f"{path} claims {width}×{height} pixels, expected at most {max_pixels:,} together")
-    return data, (width, height)
+    return width, height
 
 
 def _check_png(path: Path, data: bytes) -> tuple[int, int]:
@@ -139,7 +156,8 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         start += 2 + length
 
 
-def _to_8_bits(image: np.ndarray) -> np.ndarray:
+def to_8_bits(image: np.ndarray) -> np.ndarray:
+    """The image with 8 bits per channel."""
     return (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
 
 
@@ -152,9 +170,14 @@ def read_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = _to_8_bits(decode(path, size=size))
+    stored = to_8_bits(decode(path, size=size))
     if stored.ndim == 2:
         return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
+    return fill_transparent(stored)
+
+
+def fill_transparent(stored: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W 3"]:
+    """RGB of an image in OpenCV's channel order, with transparent pixels inpainted."""
     image = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2RGB)
     unknown = stored[..., 3:] < 128
     if unknown.any():
@@ -170,7 +193,11 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = decode(path, size=size, what="the mask")
+    return is_bright(decode(path, size=size, what="the mask"))
+
+
+def is_bright(stored: Shaped[np.ndarray, "H W ..."]) -> Bool[np.ndarray, "H W"]:
+    """Where an image is brighter than half of the range that its values suggest: 0 to 1, 255 or 65535."""
     if stored.ndim == 3:
         stored = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY)
     largest = next(value for value in (1, 255, 65535) if stored.max() <= value)

@@ -12,12 +12,14 @@ u, v are measured from the corner of the image: Nerfies casts the ray of a pixel
 needs no conversion. OpenCV has pixel centres at integers, hence the − 0.5 in the maps.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
+
+from .images import MAX_SIDE
 
 MAX_ZOOM = 2.0
 """Maximum zoom of the undistorted image; distortion that needs more is considered an error in the file."""
@@ -41,6 +43,27 @@ class Lens:
     center: tuple[float, float]
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
+
+    def checked(self) -> "Lens":
+        """The same lens.
+
+        Raises:
+            ValueError: If a number is not finite, a focal length is not positive, the size is out of range, or the
+                distortion is too strong to undistort.
+        """
+        values = (*self.focal, *self.center, *self.radial, *self.tangential)
+        if not np.isfinite(values).all() or min(self.focal) <= 0:
+            raise ValueError(f"focal lengths must be positive and intrinsics finite, got {values}")
+        if not 0 < min(self.width, self.height) <= max(self.width, self.height) <= MAX_SIDE:
+            raise ValueError(f"{self.width}×{self.height} pixels, expected 1 to {MAX_SIDE} per side")
+        filling_zoom(self)
+        return self
+
+    def resized(self, width: int, height: int) -> "Lens":
+        """The lens of images that were resized to another size."""
+        x, y = width / self.width, height / self.height
+        focal, center = (self.focal[0] * x, self.focal[1] * y), (self.center[0] * x, self.center[1] * y)
+        return replace(self, width=width, height=height, focal=focal, center=center)
 
     @property
     def is_pinhole(self) -> bool:

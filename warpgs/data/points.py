@@ -9,7 +9,7 @@ from torch import Tensor
 
 from warpgs.files import read_array
 
-from .colmap_files import read_model
+from .colmap import load_model
 from .units import SceneUnits
 
 MAX_POINTS = 50_000_000
@@ -30,7 +30,8 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         points = read_array(path, 3 * MAX_POINTS).astype(np.float64)
     elif model.is_dir():
         path = model
-        points, colors = _read_colmap(model)
+        _, points, stored = load_model(model)
+        colors = torch.from_numpy(stored)
     else:
         return torch.zeros(0, 3), None
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
@@ -39,10 +40,3 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         return torch.tensor(units.from_world(points), dtype=torch.float32), colors
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _read_colmap(model: Path) -> tuple[np.ndarray, Tensor]:
-    found = [p for _, p in sorted(read_model(model).points3D.items())]
-    points = np.array([p.xyz for p in found], dtype=np.float64).reshape(-1, 3)
-    colors = np.array([p.color for p in found], dtype=np.uint8).reshape(-1, 3)
-    return points, torch.from_numpy(colors)

@@ -12,6 +12,10 @@ MIN_SCALE = 1e-9
 """Minimum number of scene units per unit of the files; the maximum is ``files.MAX_NUMBER``."""
 
 
+MIN_SIZE = 1e-9
+"""Minimum size of a scene, which a scale divides by [world units]."""
+
+
 @dataclass(frozen=True)
 class SceneUnits:
     """The transform (p − center) · scale from positions of the files (world units) to the scene.
@@ -34,6 +38,22 @@ class SceneUnits:
         if not (np.abs(scene) <= MAX_NUMBER).all():
             raise ValueError(f"positions must be finite and at most {MAX_NUMBER:g} scene units from the center")
         return scene
+
+
+OUTLIER_FRACTION = 0.02
+"""Fraction of the points at each end of each axis that does not count for the extent of the scene."""
+
+
+def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> SceneUnits:
+    """Scene units in which static points and cameras are in about [-1, 1].
+
+    Args:
+        points: [P, 3] static points.
+        centers: [F, 3] centres of the cameras.
+    """
+    low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
+    low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
+    return SceneUnits((low + high) / 2.0, float(2.0 / max((high - low).max(), MIN_SIZE)))
 
 
 def read_units(path: Path) -> SceneUnits:

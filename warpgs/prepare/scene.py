@@ -5,11 +5,11 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 
 from warpgs.data import writer
 from warpgs.data.lens import undistort
-from warpgs.data.units import SceneUnits
+from warpgs.data.units import scene_units
 from warpgs.files import write_png
 
 from .cameras import Cameras
@@ -17,9 +17,6 @@ from .contact_sheet import choose_evenly, contact_sheet, overlay_mask
 from .frames import Frames
 from .images import brighten, read_images
 from .masks import Masks
-
-OUTLIER_FRACTION = 0.02
-"""Fraction of the points at each end of each axis that does not count for the extent of the scene."""
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks; training uses the second with ``--factor 2``."""
@@ -104,18 +101,6 @@ def static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) 
         views += visible
         hits[visible] += mask[row[visible], column[visible]]
     return hits <= MAX_DYNAMIC_VIEWS * np.maximum(views, 1)
-
-
-def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> SceneUnits:
-    """Scene units in which static points and cameras are in about [-1, 1].
-
-    Args:
-        points: [P, 3] static points.
-        centers: [F, 3] centres of the cameras.
-    """
-    low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
-    low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
-    return SceneUnits((low + high) / 2.0, float(2.0 / (high - low).max()))
 
 
 def write_frames(

@@ -11,9 +11,15 @@ from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.masks import check_perturbation
 
+from .blender import BlenderLoader
+from .colmap import ColmapLoader
 from .hypernerf import HyperNerfLoader
 from .iphone import IPhoneLoader
+from .llff import LlffLoader
+from .megasam import MegaSamLoader
 from .nerfds import NerfDsLoader
+from .nerfstudio import NerfstudioLoader
+from .vipe import VipeLoader
 
 __all__ = ["LOADERS", "Loader", "load_capture", "recognize"]
 
@@ -34,6 +40,12 @@ LOADERS: dict[str, Loader] = {
     "iphone": IPhoneLoader(),
     "nerfds": NerfDsLoader(),
     "hypernerf": HyperNerfLoader(),
+    "nerfstudio": NerfstudioLoader(),
+    "blender": BlenderLoader(),
+    "llff": LlffLoader(),
+    "colmap": ColmapLoader(),
+    "vipe": VipeLoader(),
+    "megasam": MegaSamLoader(),
 }
 """Loader of each dataset; a folder is read by the first one that recognizes it."""
 

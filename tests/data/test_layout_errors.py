@@ -1,0 +1,238 @@
+"""Damaged or unsupported captures of other programs are refused in one line that names the file."""
+
+import json
+import os
+import shutil
+import struct
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.data import layouts
+from tests.data.captures import edit_json, write_array, write_png
+from warpgs.data.exr import read_exr_channel
+from warpgs.data.loaders import load_capture
+from warpgs.data.npz import read_npz
+from warpgs.data.ply import read_ply_points
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    root = tmp_path_factory.mktemp("layouts")
+    return {name: write(root / name) for name, write in layouts.WRITERS.items()}
+
+
+@pytest.fixture
+def edited(written, tmp_path):
+    """A function that copies a layout's folder, to be damaged."""
+    return lambda layout: shutil.copytree(written[layout], tmp_path / "copy")
+
+
+def refused(root: Path, match: str, dataset: str | None = None) -> None:
+    """The capture is refused in one line, on opening or when its frames are read."""
+    with pytest.raises(ValueError, match=match) as caught:
+        read_all(root, dataset)
+    assert "\n" not in str(caught.value)
+
+
+def read_all(root: Path, dataset: str | None = None) -> None:
+    capture = load_capture(root, dataset)
+    for name in (*capture.train, *capture.val):
+        capture.frame(name)
+
+
+def edit_matrix(path: Path, change) -> None:
+    values = json.loads(path.read_text())
+    matrix = np.array(values["frames"][0]["transform_matrix"])
+    change(matrix)
+    layouts.edit_transforms(path, transform_matrix=matrix.tolist())
+
+
+def save_npz(path: Path, **changes) -> None:
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(path, **{name: array for name, array in {**arrays, **changes}.items() if array is not None})
+
+
+def rewrite_zip(path: Path, name: str, data: bytes) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(name, data)
+
+
+def cameras_bin(model: int, params: list[float], size=layouts.SIZE) -> bytes:
+    return struct.pack(f"<QIiQQ{len(params)}d", 1, 3, model, *size, *params)
+
+
+def unrotate(matrix: np.ndarray) -> None:
+    matrix[0, 0] += 0.1
+
+
+def shift_far(matrix: np.ndarray) -> None:
+    matrix[0, 3] = np.nan
+
+
+FISHEYE = cameras_bin(5, layouts.PARAMS)
+BENT = [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0]
+ROW = np.zeros((layouts.COUNT, 17))
+INDICES = np.arange(layouts.COUNT)
+
+DAMAGES = [
+    ("colmap", lambda r: (r / "images/frame_00003.png").unlink(), r"frame_00003\.png is missing: the COLMAP model"),
+    ("colmap", lambda r: (r / "sparse/0/images.bin").unlink(), "is not a COLMAP model"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(FISHEYE), "OPENCV_FISHEYE is not supported; first"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(4, BENT)), "too strong"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [-5.0, 1, 1])), "must be positive"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
+    (
+        "colmap",
+        lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [5.0, 1, 1], (10**9, 5))),
+        "out of range",
+    ),
+    (
+        "colmap",
+        lambda r: (r / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", 2**60)),
+        r"points3D\.bin is damaged",
+    ),
+    (
+        "colmap",
+        lambda r: write_png(r / "images/frame_00002.png", np.zeros((9, 9, 3), np.uint8)),
+        "has not the shape of",
+    ),
+    ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", np.zeros((9, 9), np.uint8)), "the mask is 9×9"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[3]), "frames must be a list"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE is not"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", w="wide"), "w must hold numbers"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", w=-3), "expected 1 to"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", k4=0.1), "k4 must be 0"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", depth_unit_scale_factor=0), "must be positive"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", ply_file_path="no.ply"), r"no\.ply is missing"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["x.png"]), r"x\.png is missing"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["points.ply"]), "which is not a frame"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", val_filenames=7), "must be a list of files"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path=None), "no file_path"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path=7), "must name a file, got 7"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path="/dev/zero"), "is missing"),
+    (
+        "nerfstudio",
+        lambda r: layouts.edit_transforms(r / "transforms.json", mask_path="m.png"),
+        "lists it as mask_path",
+    ),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", transform_matrix=None), "transform_matrix"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", transform_matrix=[[1]]), "shape"),
+    ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", unrotate), "is not a rotation"),
+    ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", shift_far), "finite"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", fl_x=0), "must be positive"),
+    ("blender", lambda r: layouts.edit_transforms(r / "transforms_train.json", time=1.5), r"time must be in \[0, 1\]"),
+    ("blender", lambda r: edit_json(r / "transforms_test.json", camera_angle_x=4), "between 0 and π"),
+    ("blender", lambda r: edit_json(r / "transforms_train.json", camera_angle_x=None), "no fl_x or camera_angle_x"),
+    ("llff", lambda r: write_array(r / "poses_bounds.npy", ROW), "not a rotation"),
+    ("llff", lambda r: write_array(r / "poses_bounds.npy", ROW[:, :16]), r"shape \[N, 17\]"),
+    ("llff", lambda r: write_array(r / "poses_bounds.npy", np.load(r / "poses_bounds.npy")[1:]), "has 11 poses, but"),
+    ("llff", lambda r: shutil.rmtree(r / "images"), "images is missing"),
+    ("llff", lambda r: (r / "mv_images/00002/cam02.png").rename(r / "mv_images/00002/cam77.png"), "cam01 to cam12"),
+    (
+        "llff",
+        lambda r: write_png(r / "images/frame_00002.png", np.zeros((9, 9, 3), np.uint8)),
+        "which has not the shape",
+    ),
+    ("vipe", lambda r: (r / "intrinsics/clip_camera.txt").write_text("0: MEI\n"), "camera model MEI is not supported"),
+    ("vipe", lambda r: save_npz(r / "intrinsics/clip.npz", data=np.ones((12, 5))), "those of pinhole cameras"),
+    ("vipe", lambda r: save_npz(r / "intrinsics/clip.npz", inds=INDICES + 1), "no intrinsics of frame 0"),
+    ("vipe", lambda r: save_npz(r / "pose/clip.npz", inds=INDICES[1:]), "must belong together"),
+    ("vipe", lambda r: save_npz(r / "pose/clip.npz", data=None), "has no array data"),
+    ("vipe", lambda r: save_npz(r / "pose/clip.npz", inds=INDICES + 5, data=None), "has no array data"),
+    ("vipe", lambda r: save_npz(r / "pose/clip.npz", data=np.array([object()] * 12)), "not an array of numbers"),
+    ("vipe", lambda r: (r / "depth/clip.zip").write_bytes(b"PK"), r"clip\.zip is damaged"),
+    ("vipe", lambda r: rewrite_zip(r / "depth/clip.zip", "00000.exr", b"v/1\x01\2\0\0\0"), r"00000\.exr.*OpenEXR"),
+    ("vipe", lambda r: rewrite_zip(r / "mask/clip.zip", "00000.png", b"x"), r"00000\.png is not a PNG"),
+    ("vipe", lambda r: shutil.copy(r / "pose/clip.npz", r / "pose/other.npz"), "of one video, .* got those of 2"),
+    ("vipe", lambda r: (r / "rgb/clip.mp4").write_bytes(b"no video"), r"clip\.mp4 is damaged or not a video"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), images=np.zeros((12, 24, 40))), "images must be 8-bit RGB"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), depths=None), "has no array depths"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), cam_c2w=np.zeros((12, 4, 4))), "not a rotation"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), intrinsic=np.ones((3, 3))), "must have no skew"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), intrinsic=np.diag([0.0, 1, 1])), "must be positive"),
+    ("megasam", lambda r: shutil.copy(next(r.iterdir()), r / "b_sgd_cvd_hr.npz"), "2 videos of MegaSaM"),
+]
+
+
+@pytest.mark.parametrize(("layout", "damage", "message"), DAMAGES, ids=[f"{d[0]}-{k}" for k, d in enumerate(DAMAGES)])
+def test_a_damaged_capture_is_refused(edited, layout, damage, message):
+    root = edited(layout)
+    damage(root)
+    refused(root, message, layout)
+
+
+@pytest.mark.parametrize("layout", layouts.WRITERS)
+def test_a_folder_without_anything_is_refused(tmp_path, layout):
+    refused(tmp_path, str(tmp_path), layout)
+
+
+def test_a_fifo_instead_of_a_file_does_not_hang(edited):
+    root = edited("colmap")
+    (root / "sparse/0/images.bin").unlink()
+    os.mkfifo(root / "sparse/0/images.bin")
+    refused(root, r"images\.bin is not a file")
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_points_of_every_encoding_are_read_and_truncated_ones_refused(tmp_path, encoding):
+    path = layouts.write_ply(tmp_path / "a.ply", encoding)
+    points, colors = read_ply_points(path)
+    assert np.allclose(points, layouts.POINTS)
+    assert colors[:, 0].tolist() == list(range(len(points)))
+    data = path.read_bytes()
+    for size in range(0, len(data) - 4, 97):
+        path.write_bytes(data[:size])
+        with pytest.raises(ValueError, match=r"a\.ply"):
+            read_ply_points(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ("double z", "double w"),
+        ("element vertex 60", "element face 60"),
+        ("element vertex 60", "element vertex 99999999999"),
+        ("property uchar red", "property list uchar int red"),
+        ("format binary_little_endian", "format zip"),
+    ],
+)
+def test_a_ply_header_that_does_not_fit_is_refused(tmp_path, changes):
+    path = layouts.write_ply(tmp_path / "a.ply")
+    path.write_bytes(path.read_bytes().replace(*(change.encode() for change in changes)))
+    with pytest.raises(ValueError, match=r"a\.ply"):
+        read_ply_points(path)
+
+
+@pytest.mark.parametrize("compression", [0, 2, 3])
+@pytest.mark.parametrize("size", [(1, 1), (16, 7), (37, 20)])
+def test_exr_depth_is_read_and_every_truncation_refused(compression, size):
+    depth = np.random.default_rng(0).uniform(0.5, 9.0, size).round(1).astype(np.float16)
+    data = layouts.exr(depth, compression)
+    assert np.array_equal(read_exr_channel(data, "Z"), depth.astype(np.float32))
+    for end in range(0, len(data), max(1, len(data) // 40)):
+        with pytest.raises(ValueError, match="OpenEXR"):
+            read_exr_channel(data[:end], "Z")
+    with pytest.raises(ValueError, match="no floating-point channel R"):
+        read_exr_channel(data, "R")
+
+
+def test_openexr_itself_writes_what_is_read(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    depth = np.random.default_rng(0).uniform(0.5, 9.0, (50, 40)).astype(np.float16)
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    with openexr.File(header, {"Z": depth}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    assert np.array_equal(read_exr_channel((tmp_path / "a.exr").read_bytes(), "Z"), depth.astype(np.float32))
+
+
+def test_an_npz_array_that_claims_too_much_is_refused_before_it_is_read(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", x=np.zeros(1_000_000))
+    assert read_npz(tmp_path / "a.npz", ["x"])["x"].shape == (1_000_000,)
+    with pytest.raises(ValueError, match="its arrays have 8,000,128 bytes, more than the maximum of 1,000"):
+        read_npz(tmp_path / "a.npz", ["x"], 1000)

@@ -1,0 +1,75 @@
+"""D-NeRF and other datasets rendered by Blender: transforms_train.json, transforms_val.json, transforms_test.json."""
+
+import math
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Capture
+from warpgs.data.resized import WHITE, read_metric_depth, read_resized_image, read_resized_mask
+from warpgs.data.units import SceneUnits
+from warpgs.files import read_numbers
+
+from .posed import LoadOptions, PosedFrame, World, posed_capture
+from .transforms import Transforms
+
+TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
+
+HALF_SIZE = 1.3
+"""The scenes lie within this distance of the origin, along each axis [world units], as Deformable-3DGS assumes."""
+
+
+class BlenderLoader:
+    """Loads the training frames, and for evaluation the test frames, or those of validation if there are none.
+
+    Transparent pixels are white. Everything is dynamic unless frames have a mask_path.
+    """
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether there is a transforms_train.json."""
+        return (root / TRAIN).is_file()
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``."""
+        evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
+        train = _frames(Transforms(root / TRAIN), "train")
+        val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
+        frames = [*train, *val]
+        masked = any(frame.static_mask is not None for frame in train)
+        world = World(
+            np.zeros((0, 3)),
+            units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
+            assumption="masks" if masked else "dynamic",
+            own_times=True,
+        )
+        options = LoadOptions(factor, perturbation, cache_frames)
+        return posed_capture(root, frames, {frame.name for frame in val}, world, options)
+
+
+def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
+    """The frames of a file; their names begin with the split, because all splits have an r_000."""
+    size: tuple[int, int] | None = None
+    frames = []
+    for entry in transforms.frames:
+        image = transforms.image(entry)
+        if size is None:  # the images of these datasets have one size
+            first = transforms.lens(entry, image)
+            size = first.width, first.height
+        mask, depth = transforms.file(entry, "mask_path"), transforms.file(entry, "depth_file_path")
+        time = float(read_numbers(transforms.path, {"time": 0.0, **entry}, "time", ()))
+        if not (math.isfinite(time) and 0.0 <= time <= 1.0):
+            raise ValueError(f"{transforms.path}: time must be in [0, 1], got {time}")
+        frames.append(
+            PosedFrame(
+                f"{split}_{image.stem}",
+                transforms.lens({"w": size[0], "h": size[1], **entry}, image),
+                transforms.pose(entry),
+                time,
+                partial(read_resized_image, image, background=WHITE),
+                None if mask is None else partial(read_resized_mask, mask),
+                None if depth is None else partial(read_metric_depth, depth, unit=1.0),
+            )
+        )
+    return frames

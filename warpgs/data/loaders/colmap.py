@@ -1,0 +1,87 @@
+"""COLMAP: a model in sparse/0 (text or binary) beside images/, as 3DGS, gsplat and nerfstudio's tools write it."""
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Capture
+from warpgs.data.colmap import MODEL_FOLDERS, ModelImage, find_model, load_model
+from warpgs.data.images import read_depth
+from warpgs.data.resized import read_resized_image, read_resized_mask
+
+from .posed import (
+    LoadOptions,
+    PosedFrame,
+    World,
+    every_eighth,
+    natural_order,
+    plain_name,
+    posed_capture,
+    times_of_names,
+)
+
+MASKS, DEPTHS = "masks", "depths"
+"""Folders of the static masks (white = static) and of inverse depth up to scale and offset."""
+
+
+class ColmapLoader:
+    """Loads a COLMAP model and its images; times from the file names, every eighth frame for evaluation."""
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether there are a model and a folder of images, but not another program's index."""
+        others = ("dataset.json", "transforms.json", "transforms_train.json")
+        return (
+            find_model(root) is not None and (root / "images").is_dir() and not any((root / o).exists() for o in others)
+        )
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``."""
+        folder = find_model(root)
+        if folder is None:
+            raise ValueError(f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}")
+        model = load_model(folder)
+        images = sorted(model.images, key=lambda image: natural_order(image.name))
+        names = [plain_name(image.name) for image in images]
+        times = times_of_names(names)
+        files = _Files(root, factor or 1)
+        frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
+        world = World(model.points, model.colors)
+        options = LoadOptions(factor, perturbation, cache_frames)
+        return posed_capture(root, frames, every_eighth(names), world, options)
+
+
+class _Files:
+    """The images of a capture and what lies beside them; images_<factor>/ is used if it exists."""
+
+    def __init__(self, root: Path, factor: int) -> None:
+        reduced = root / f"images_{factor}"
+        self.images = reduced if factor > 1 and reduced.is_dir() else root / "images"
+        self.masks, self.depths = root / MASKS, root / DEPTHS
+
+    def frame(self, name: str, image: ModelImage, time: float) -> PosedFrame:
+        """A frame of the model.
+
+        Raises:
+            ValueError: If its image is missing.
+        """
+        stem = Path(image.name).with_suffix("")
+        path = first_file(self.images / f for f in (image.name, f"{stem}.png", f"{stem}.jpg"))
+        if path is None:
+            raise ValueError(f"{self.images / image.name} is missing: the COLMAP model has a camera for it")
+        mask = first_file(self.masks / f for f in (f"{image.name}.png", f"{stem}.png"))
+        depth = first_file(self.depths / f for f in (f"{stem}.npy", f"{stem}.png"))
+        return PosedFrame(
+            name,
+            image.lens,
+            image.pose,
+            time,
+            partial(read_resized_image, path),
+            None if mask is None else partial(read_resized_mask, mask),
+            None if depth is None else partial(read_depth, depth),
+        )
+
+
+def first_file(paths: Iterable[Path]) -> Path | None:
+    """The first of some paths that is a file."""
+    return next((path for path in paths if path.is_file()), None)

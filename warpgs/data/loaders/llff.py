@@ -1,0 +1,172 @@
+"""LLFF: poses_bounds.npy beside images/, also with masks and other cameras (NVIDIA Dynamic Scene, as in NSFF).
+
+A row of poses_bounds.npy holds a [3, 5] matrix and the nearest and farthest depth. The first three columns of the
+matrix are the camera's axes down, right and backward in the world, the fourth is its centre, the fifth is height, width
+and focal length [px]. Rows belong to the images in the order of their names.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Capture
+from warpgs.data.colmap import find_model, load_model
+from warpgs.data.images import image_size, read_depth
+from warpgs.data.lens import Lens
+from warpgs.data.resized import read_resized_image, read_resized_mask
+from warpgs.data.units import scene_units
+from warpgs.files import read_array
+
+from .colmap import first_file
+from .posed import LoadOptions, PosedFrame, World, every_eighth, natural_order, posed_capture, world_to_camera
+
+INDEX = "poses_bounds.npy"
+
+MAX_FRAMES = 100_000
+
+NUM_CAMERAS = 12
+"""Cameras of NVIDIA's rig: frame t of the video is that of camera t modulo 12."""
+
+MASKS, EVALUATION, EVALUATION_MASKS, DEPTHS = "motion_masks", "mv_images", "mv_masks", "disp"
+"""Folders of NSFF: dynamic masks (white = dynamic), images of all cameras at each time with their masks, and inverse
+depth up to scale and offset."""
+
+
+class LlffLoader:
+    """Loads LLFF captures: every eighth frame for evaluation, or the other cameras of NVIDIA's rig."""
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether there is a poses_bounds.npy; without NSFF's folders, a COLMAP model is preferred."""
+        dynamic = any((root / name).is_dir() for name in (MASKS, EVALUATION))
+        return (root / INDEX).is_file() and (dynamic or find_model(root) is None)
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``."""
+        poses, bounds, sizes = _read_poses(root / INDEX)
+        paths = _images(_image_folder(root, factor))
+        if len(paths) != len(poses):
+            raise ValueError(f"{root / INDEX} has {len(poses)} poses, but {paths[0].parent} has {len(paths)} images")
+        lenses = [_lens(root, path, size) for path, size in zip(paths, sizes, strict=True)]
+        names = [path.stem for path in paths]
+        frames = [
+            PosedFrame(
+                path.stem, lens, pose, float(k), partial(read_resized_image, path), *_mask_and_depth(root, path.stem)
+            )
+            for k, (path, lens, pose) in enumerate(zip(paths, lenses, poses, strict=True))
+        ]
+        others = list(_other_cameras(root, frames))
+        val = [frame.name for frame in others] if others else every_eighth(names)
+        options = LoadOptions(1, perturbation, cache_frames)
+        return posed_capture(root, [*frames, *others], frozenset(val), _world(root, poses, bounds), options)
+
+
+class _Poses(NamedTuple):
+    """[N, 3, 4] world-to-camera poses, [N, 2] bounds, and [N, 3] height, width, focal length [px]."""
+
+    poses: Float[np.ndarray, "N 3 4"]
+    bounds: Float[np.ndarray, "N 2"]
+    sizes: Float[np.ndarray, "N 3"]
+
+
+def _read_poses(path: Path) -> _Poses:
+    rows = read_array(path, 17 * MAX_FRAMES).astype(np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or not np.isfinite(rows).all():
+        raise ValueError(f"{path} must hold finite numbers of shape [N, 17] with N > 0, got {list(rows.shape)}")
+    matrices, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
+    down, right, backward, center = (matrices[:, :, k : k + 1] for k in range(4))
+    try:
+        poses = [world_to_camera(pose) for pose in np.concatenate([right, down, -backward, center], 2)]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not ((bounds[:, 0] > 0) & (bounds[:, 1] > bounds[:, 0])).all() or not (matrices[:, :, 4] > 0).all():
+        raise ValueError(f"{path}: bounds, sizes and focal lengths must be positive, and near less than far")
+    return _Poses(np.array(poses), bounds, matrices[:, :, 4])
+
+
+def _image_folder(root: Path, factor: int | None) -> Path:
+    """images_<factor>/; without a factor the only images_<width>x<height>/, which NSFF trains on, or else images/.
+
+    Raises:
+        ValueError: If there is no such folder.
+    """
+    reduced = [path for path in root.glob("images_*x*") if path.is_dir()]
+    if factor is None and len(reduced) == 1:
+        return reduced[0]
+    folder = root / ("images" if factor in (None, 1) else f"images_{factor}")
+    if not folder.is_dir():
+        found = ", ".join(sorted(path.name for path in root.glob("images*"))) or "no images"
+        raise ValueError(f"{folder} is missing: {root} has {found}")
+    return folder
+
+
+def _images(folder: Path) -> list[Path]:
+    suffixes = (".png", ".jpg", ".jpeg")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
+    if not found:
+        raise ValueError(f"{folder} has no images")
+    return sorted(found, key=lambda path: natural_order(path.name))
+
+
+def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
+    """The lens of an image that may have been reduced since its pose was written."""
+    width, height = image_size(path)
+    full_height, full_width, focal = size.tolist()
+    if abs(width * full_height - height * full_width) > 0.01 * width * full_height:
+        raise ValueError(f"{path} is {width}×{height}, which has not the shape of {full_width:g}×{full_height:g}")
+    scale = focal / full_width * width
+    try:
+        return Lens(width, height, (scale, scale), (width / 2, height / 2)).checked()
+    except ValueError as error:
+        raise ValueError(f"{root / INDEX}: {error}") from error
+
+
+def _mask_and_depth(root: Path, name: str) -> tuple[partial | None, partial | None]:
+    mask = first_file([root / MASKS / f"{name}.png"])
+    depth = first_file([root / DEPTHS / f"{name}.npy"])
+    return (
+        None if mask is None else partial(_read_static, mask),
+        None if depth is None else partial(read_depth, depth),
+    )
+
+
+def _read_static(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """The static mask of a file of NSFF, in which dynamic pixels are white."""
+    return ~read_resized_mask(path, size)
+
+
+def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
+    """mv_images/<time>/cam<camera>: what the rig's other cameras saw at the times of the video."""
+    found = []
+    for path in sorted((root / EVALUATION).glob("*/cam*.jpg")) + sorted((root / EVALUATION).glob("*/cam*.png")):
+        number = re.fullmatch(r"cam(\d{1,3})", path.stem)
+        time = int(path.parent.name) if path.parent.name.isdecimal() else -1
+        camera = int(number[1]) - 1 if number else -1
+        if not 0 <= time < len(frames) or not 0 <= camera < min(NUM_CAMERAS, len(frames)):
+            raise ValueError(f"{path} must be a camera from cam01 to cam{NUM_CAMERAS} at the time of a frame")
+        if time % NUM_CAMERAS == camera:
+            continue  # the video itself
+        mask = first_file([root / EVALUATION_MASKS / path.parent.name / f"{path.stem}.png"])
+        source = frames[camera]
+        name = f"{path.parent.name}_{path.stem}"
+        read_mask = None if mask is None else partial(_read_static, mask)
+        found.append(
+            PosedFrame(name, source.lens, source.pose, float(time), partial(read_resized_image, path), read_mask)
+        )
+    return found
+
+
+def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarray, "N 2"]) -> World:
+    """Points of a COLMAP model, if there is one; otherwise units that contain what lies between the bounds."""
+    model = find_model(root)
+    if model is not None:
+        _, points, colors = load_model(model)
+        if len(points):
+            return World(points, colors)
+    centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
+    along = centers[:, None] + bounds[:, :, None] * poses[:, None, 2, :3]
+    return World(np.zeros((0, 3)), units=scene_units(along.reshape(-1, 3), centers))

@@ -1,0 +1,120 @@
+"""nerfstudio: transforms.json, as ns-process-data, Polycam, Record3D, KIRI Engine and instant-ngp write it."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Capture
+from warpgs.data.ply import read_ply_points
+from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
+from warpgs.files import read_numbers
+
+from .posed import (
+    LoadOptions,
+    PosedFrame,
+    World,
+    every_eighth,
+    natural_order,
+    plain_name,
+    points_of_depth,
+    posed_capture,
+    times_of_names,
+)
+from .transforms import Transforms
+
+INDEX = "transforms.json"
+
+MILLIMETRES = 1e-3
+"""World units per unit of a depth file, nerfstudio's default ``depth_unit_scale_factor``."""
+
+
+MAX_TIME = 1e18
+"""Maximum time of a frame: nanoseconds since 1970, and some."""
+
+
+class NerfstudioLoader:
+    """Loads transforms.json with the masks, depth and points that it names."""
+
+    def recognizes(self, root: Path) -> bool:
+        """Whether there is a transforms.json."""
+        return (root / INDEX).is_file()
+
+    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
+        """Opens a capture; arguments and errors as for ``load_capture``."""
+        transforms = Transforms(root / INDEX)
+        entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
+        images = [transforms.image(entry) for entry in entries]
+        names = [plain_name(entry["file_path"]) for entry in entries]
+        times = _times(transforms, entries, names)
+        frames = []
+        for entry, image, name, time in zip(entries, images, names, times, strict=True):
+            mask, depth = transforms.file(entry, "mask_path"), transforms.file(entry, "depth_file_path")
+            unit = _depth_unit(transforms)
+            frames.append(
+                PosedFrame(
+                    name,
+                    transforms.lens(entry, image),
+                    transforms.pose(entry),
+                    time,
+                    partial(read_resized_image, image),
+                    None if mask is None else partial(read_resized_mask, mask),
+                    None if depth is None else partial(read_metric_depth, depth, unit=unit),
+                )
+            )
+        val = _evaluated(transforms, {image.resolve(): name for image, name in zip(images, names, strict=True)})
+        options = LoadOptions(factor, perturbation, cache_frames)
+        kept = [frame for frame in frames if frame.name not in val.ignored]
+        return posed_capture(root, kept, val.names, _world(root, transforms, kept), options)
+
+
+def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:
+    """The field ``time`` (or ``timestamp``) of every frame; without it, the numbers in the names."""
+    for key in ("time", "timestamp"):
+        if all(key in entry for entry in entries):
+            return [float(read_numbers(transforms.path, entry, key, (), MAX_TIME)) for entry in entries]
+    return times_of_names(names)
+
+
+def _depth_unit(transforms: Transforms) -> float:
+    fields = {"depth_unit_scale_factor": MILLIMETRES, **transforms.fields}
+    unit = float(read_numbers(transforms.path, fields, "depth_unit_scale_factor", ()))
+    if unit <= 0:
+        raise ValueError(f"{transforms.path}: depth_unit_scale_factor must be positive, got {unit}")
+    return unit
+
+
+class _Split:
+    """Names of the frames to evaluate on, and of those that a given split does not contain."""
+
+    def __init__(self, names: Sequence[str], ignored: Sequence[str] = ()) -> None:
+        self.names, self.ignored = frozenset(names), frozenset(ignored)
+
+
+def _evaluated(transforms: Transforms, names: dict[Path, str]) -> _Split:
+    """The split of train_filenames, val_filenames and test_filenames; every eighth frame without them."""
+    lists = {key: transforms.fields.get(f"{key}_filenames") for key in ("train", "val", "test")}
+    if all(given is None for given in lists.values()):
+        return _Split(every_eighth([*names.values()]))
+    chosen: dict[str, set[str]] = {}
+    for key, given in lists.items():
+        entries = [{f"{key}_filenames": entry} for entry in given] if isinstance(given, list) else []
+        if given is not None and not isinstance(given, list):
+            raise ValueError(f"{transforms.path}: {key}_filenames must be a list of files")
+        paths = [transforms.file(entry, f"{key}_filenames") for entry in entries]
+        unknown = next((path for path in paths if path is None or path.resolve() not in names), None)
+        if len(paths) and unknown is not None:
+            raise ValueError(f"{transforms.path}: {key}_filenames lists {unknown}, which is not a frame")
+        chosen[key] = {names[path.resolve()] for path in paths if path is not None}
+    held_out = chosen["val"] | chosen["test"]
+    if both := held_out & chosen["train"]:
+        raise ValueError(f"{transforms.path}: frame {min(both)} is listed for both training and evaluation")
+    return _Split([*held_out], [*({*names.values()} - held_out - chosen["train"])])
+
+
+def _world(root: Path, transforms: Transforms, frames: Sequence[PosedFrame]) -> World:
+    """Points of ply_file_path; without it, points of the depth."""
+    path = transforms.file(transforms.fields, "ply_file_path")
+    points, colors = points_of_depth(frames) if path is None else read_ply_points(path)
+    return World(points, colors)

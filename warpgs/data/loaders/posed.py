@@ -1,0 +1,258 @@
+"""What loaders of other programs' layouts share: frames that come with cameras, from any world to scene units.
+
+A loader makes a ``PosedFrame`` of every image, with functions that read its parts in any size, and a ``World``;
+``posed_capture`` makes the ``Capture``.
+"""
+
+import re
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+
+from warpgs.cameras import Camera
+from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Assumption, Capture, Frame
+from warpgs.data.depth_points import DepthView, points_of_views
+from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.data.masks import perturb
+from warpgs.data.units import SceneUnits, scene_units
+
+HOLDOUT = 8
+"""Every eighth frame is for evaluation where the files do not say which ones are."""
+
+MAX_ROTATION_ERROR = 1e-3
+"""Maximum entry of R Rᵀ − 1 for a rotation R; the files have at least six digits."""
+
+MAX_DEPTH_FRAMES, DEPTH_SIDE = 24, 320
+"""Number of frames that points are taken from where there are none, and longest side of their images [px]."""
+
+Size = tuple[int, int]
+"""(width, height) that a part of a frame is read in [px]."""
+
+
+@dataclass(frozen=True)
+class PosedFrame:
+    """A frame of another program's layout.
+
+    Attributes:
+        name: Id, a plain file name.
+        lens: Intrinsics of the full-size image.
+        pose: [3, 4] world to camera, OpenCV axes, in world units.
+        time: Time in any unit.
+        image: Reads the RGB image in a size.
+        static_mask: Reads the static mask; None if the frame has none.
+        inverse_depth: Reads inverse depth, NaN where unknown; None if the frame has none.
+    """
+
+    name: str
+    lens: Lens
+    pose: Float[np.ndarray, "3 4"]
+    time: float
+    image: Callable[[Size], UInt8[np.ndarray, "H W 3"]]
+    static_mask: Callable[[Size], Bool[np.ndarray, "H W"]] | None = None
+    inverse_depth: Callable[[Size], Float[np.ndarray, "H W"]] | None = None
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """[3] centre of the camera in the world."""
+        return -self.pose[:, :3].T @ self.pose[:, 3]
+
+
+@dataclass(frozen=True)
+class World:
+    """The world of a layout.
+
+    Attributes:
+        points: [P, 3] static points, P may be 0.
+        colors: [P, 3] 8-bit RGB; None if unknown.
+        units: Scene units; around points and cameras if None.
+        assumption: What is dynamic where the frames have no masks.
+        own_times: Whether times are in [0, 1] already.
+    """
+
+    points: Float[np.ndarray, "P 3"]
+    colors: UInt8[np.ndarray, "P 3"] | None = None
+    units: SceneUnits | None = None
+    assumption: Assumption = "masks"
+    own_times: bool = False
+
+
+@dataclass(frozen=True)
+class LoadOptions:
+    """Arguments of ``load_capture`` that every loader passes on."""
+
+    factor: int | None
+    perturbation: MaskPerturbation
+    cache_frames: int
+
+
+def posed_capture(
+    root: Path, frames: Sequence[PosedFrame], val: Collection[str], world: World, options: LoadOptions
+) -> Capture:
+    """The capture of posed frames: undistorted, in scene units, with times in [0, 1].
+
+    Args:
+        root: Folder of the capture, for messages.
+        frames: All frames.
+        val: Names of those to evaluate on.
+        world: Points and units.
+        options: ``factor`` scales images down (1 if None).
+
+    Raises:
+        ValueError: If there are no frames, two have one name, or a camera is invalid.
+    """
+    if not frames:
+        raise ValueError(f"{root} has no frames")
+    by_name = {frame.name: frame for frame in frames}
+    if len(by_name) < len(frames):
+        names = [frame.name for frame in frames]
+        raise ValueError(f"{root}: two frames are called {next(name for name in names if names.count(name) > 1)}")
+    centers = np.array([frame.center for frame in frames])
+    units = world.units or scene_units(world.points if len(world.points) else centers, centers)
+    cameras, lenses = _cameras(root, frames, units, world.own_times, options.factor or 1)
+    train = [name for name in by_name if name not in val]
+    reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
+    points = torch.tensor(units.from_world(world.points), dtype=torch.float32)
+    colors = None if world.colors is None else torch.tensor(world.colors)
+    return Capture(
+        root.resolve().name,
+        cameras,
+        train,
+        [name for name in by_name if name in val],
+        points,
+        colors,
+        reader.read,
+        options.cache_frames,
+        world.assumption,
+    )
+
+
+def _cameras(
+    root: Path, frames: Sequence[PosedFrame], units: SceneUnits, own_times: bool, factor: int
+) -> tuple[dict[str, Camera], dict[str, Lens]]:
+    """The pinhole camera of each frame, and the lens of its distorted image."""
+    times = [frame.time for frame in frames]
+    start, length = (0.0, 1.0) if own_times else (min(times), (max(times) - min(times)) or 1.0)
+    cameras, lenses = {}, {}
+    for frame in frames:
+        lenses[frame.name] = reduced(frame.lens, factor)
+        try:
+            cameras[frame.name] = _camera(frame, lenses[frame.name], units, (frame.time - start) / length)
+        except ValueError as error:
+            raise ValueError(f"{root}: frame {frame.name}: {error}") from error
+    return cameras, lenses
+
+
+def reduced(lens: Lens, factor: int) -> Lens:
+    """The lens of images scaled down by a factor; sides are rounded."""
+    return lens.resized(max(1, round(lens.width / factor)), max(1, round(lens.height / factor)))
+
+
+def world_to_camera(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:
+    """The inverse of a rigid [3, 4] camera-to-world matrix.
+
+    Raises:
+        ValueError: If it is not finite, or its first three columns are not a rotation.
+    """
+    rotation = camera_to_world[:, :3].T
+    if not np.isfinite(camera_to_world).all():
+        raise ValueError("the pose is not finite")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+        raise ValueError("the pose is not a rotation and a translation")
+    return np.hstack([rotation, -rotation @ camera_to_world[:, 3:]])
+
+
+def opencv_from_opengl(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:
+    """A camera-to-world matrix with OpenCV axes of one with OpenGL axes (x right, y up, z backward)."""
+    return camera_to_world * np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def every_eighth(names: Sequence[str]) -> list[str]:
+    """The frames for evaluation where the files do not say which ones are: every eighth, from the fifth on."""
+    return list(names[HOLDOUT // 2 :: HOLDOUT])
+
+
+def times_of_names(names: Sequence[str]) -> list[float]:
+    """Time of each frame from the number at the end of its name; from the order of the names if one has none.
+
+    Frames of several cameras with one number have one time.
+    """
+    numbers = [re.search(r"(\d{1,15})$", name) for name in names]
+    found = [float(number[1]) for number in numbers if number]
+    return found if len(found) == len(names) else [float(k) for k in range(len(names))]
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names with numbers by their values."""
+    return [(int(part[:15]), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def plain_name(path: str) -> str:
+    """The id of an image: its path without the suffix, with underscores for slashes."""
+    parts = [part for part in Path(path.replace("\\", "/")).with_suffix("").parts if part not in ("/", "..", ".")]
+    return "_".join(parts).replace("\0", "")
+
+
+def points_of_depth(frames: Sequence[PosedFrame]) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Points and their colours from frames whose depth has the units of their cameras; none without depth.
+
+    Raises:
+        ValueError: If a file of a frame is missing or damaged.
+    """
+    known = [frame for frame in frames if frame.inverse_depth is not None]
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(MAX_DEPTH_FRAMES, len(known))).round().astype(int))
+    return points_of_views([_depth_view(known[k]) for k in chosen])
+
+
+def _depth_view(frame: PosedFrame) -> DepthView:
+    assert frame.inverse_depth is not None
+    lens = reduced(frame.lens, max(1, round(max(frame.lens.width, frame.lens.height) / DEPTH_SIDE)))
+    size = lens.width, lens.height
+    static = np.ones(size[::-1], bool) if frame.static_mask is None else frame.static_mask(size)
+    parts = (undistort(part, lens) for part in (frame.image(size), frame.inverse_depth(size), static))
+    image, inverse_depth, static = parts
+    return DepthView(image, inverse_depth, static, pinhole_matrix(lens), frame.pose)
+
+
+def _camera(frame: PosedFrame, lens: Lens, units: SceneUnits, time: float) -> Camera:
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = frame.pose[:, :3]
+    viewmat[:3, 3] = -frame.pose[:, :3] @ units.from_world(frame.center)
+    K = pinhole_matrix(lens.checked())
+    if not np.isfinite(viewmat.astype(np.float32)).all():
+        raise ValueError("the pose is not finite in scene units")
+    if not 0.0 <= time <= 1.0:
+        raise ValueError(f"the time {time} is not in [0, 1]")
+    viewmat_tensor, K_tensor = (torch.tensor(m, dtype=torch.float32) for m in (viewmat, K))
+    return Camera(viewmat_tensor, K_tensor, lens.width, lens.height, time)
+
+
+@dataclass(frozen=True)
+class _FrameReader:
+    """Reads frames; ``scale`` is the number of scene units per world unit."""
+
+    frames: dict[str, PosedFrame]
+    cameras: dict[str, Camera]
+    lenses: dict[str, Lens]
+    scale: float
+    train: frozenset[str]
+    perturbation: MaskPerturbation
+
+    def read(self, name: str) -> Frame:
+        frame, lens, size = self.frames[name], self.lenses[name], self.cameras[name].size
+        image = undistort(frame.image(size), lens)
+        mask = None if frame.static_mask is None else undistort(frame.static_mask(size), lens)
+        if mask is not None and name in self.train:
+            mask = perturb(mask, self.perturbation, name)
+        depth = None if frame.inverse_depth is None else undistort(frame.inverse_depth(size), lens)
+        return Frame(
+            name,
+            self.cameras[name],
+            torch.from_numpy(np.require(image, requirements=("C", "W"))),
+            None if mask is None else torch.from_numpy(mask),
+            None if depth is None else torch.from_numpy(depth / np.float32(self.scale)),
+        )

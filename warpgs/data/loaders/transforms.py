@@ -1,0 +1,134 @@
+"""Fields of transforms.json files, which nerfstudio, instant-ngp and Blender's datasets share.
+
+``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). Intrinsics are pixels from the
+corner of the image: ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h``, or ``camera_angle_x`` (the horizontal field of
+view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``, ``p2``, ``k3``. Each may
+be given once or per frame.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from warpgs.data.images import image_size
+from warpgs.data.lens import Lens
+from warpgs.files import read_json, read_numbers
+
+from .posed import opencv_from_opengl, world_to_camera
+
+PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+"""Values of ``camera_model`` that can be represented."""
+
+SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+"""Suffixes that ``file_path`` may lack."""
+
+
+class Transforms:
+    """A transforms.json file.
+
+    Attributes:
+        path: The file.
+        fields: Its content.
+        frames: The objects of its frames; there is at least one.
+
+    Raises:
+        ValueError: If the file is missing, damaged or without frames, or its camera model is not supported.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.fields = path, read_json(path)
+        frames = self.fields.get("frames")
+        if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+            raise ValueError(f"{path}: frames must be a list of at least one object")
+        self.frames: list[dict[str, Any]] = frames
+        for frame in frames:
+            model = frame.get("camera_model", self.fields.get("camera_model", "OPENCV"))
+            if model not in PERSPECTIVE:
+                raise ValueError(
+                    f"{path}: the camera model {model} is not supported, expected one of {', '.join(PERSPECTIVE)}; "
+                    "undistort the images first"
+                )
+
+    def file(self, frame: dict[str, Any], key: str) -> Path | None:
+        """The file that a field of a frame names; None if there is no such field.
+
+        Raises:
+            ValueError: If the field is not a name, or there is no such file.
+        """
+        given = frame.get(key)
+        if given is None:
+            return None
+        if not isinstance(given, str) or not given or "\0" in given:
+            raise ValueError(f"{self.path}: {key} must name a file, got {given!r:.60}")
+        found = (self.path.parent / f"{given}{suffix}" for suffix in SUFFIXES)
+        path = next((path for path in found if path.is_file()), None)
+        if path is None:
+            raise ValueError(f"{self.path.parent / given} is missing: {self.path.name} lists it as {key}")
+        return path
+
+    def image(self, frame: dict[str, Any]) -> Path:
+        """The image of a frame; raises as ``file``."""
+        path = self.file(frame, "file_path")
+        if path is None:
+            raise ValueError(f"{self.path}: a frame has no file_path")
+        return path
+
+    def pose(self, frame: dict[str, Any]) -> Float[np.ndarray, "3 4"]:
+        """[3, 4] world-to-camera pose of a frame, OpenCV axes.
+
+        Raises:
+            ValueError: If transform_matrix is missing or not rigid.
+        """
+        given = frame.get("transform_matrix")
+        rows = len(given) if isinstance(given, list) else 4
+        matrix = read_numbers(self.path, frame, "transform_matrix", (3 if rows == 3 else 4, 4))[:3]
+        try:
+            return world_to_camera(opencv_from_opengl(matrix))
+        except ValueError as error:
+            raise ValueError(f"{self.path}: transform_matrix of {frame.get('file_path')!r:.60}: {error}") from error
+
+    def lens(self, frame: dict[str, Any], image: Path) -> Lens:
+        """The lens of a frame's full-size image; its size is that of the image file if it is not given.
+
+        Raises:
+            ValueError: If the focal length is missing, or a number is out of range.
+        """
+        if "w" in self._given(frame) and "h" in self._given(frame):
+            width, height = (round(self._number(frame, key)) for key in ("w", "h"))
+        else:
+            width, height = image_size(image)
+        if (focal := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
+            raise ValueError(f"{self.path} has no fl_x or camera_angle_x")
+        focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
+        center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
+        k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+        if k4:
+            raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
+        lens = Lens(width, height, (focal, focal_y or focal), center, (k1, k2, k3), (p1, p2))
+        try:
+            return lens.checked()
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from error
+
+    def _focal(self, frame: dict[str, Any], key: str, angle_key: str, side: int) -> float | None:
+        given = self._given(frame)
+        if key in given:
+            return self._number(frame, key)
+        if angle_key not in given:
+            return None
+        angle = self._number(frame, angle_key)
+        if not 0 < angle < math.pi:
+            raise ValueError(f"{self.path}: {angle_key} must be between 0 and π, got {angle}")
+        return 0.5 * side / math.tan(0.5 * angle)
+
+    def _given(self, frame: dict[str, Any]) -> dict[str, Any]:
+        return {**self.fields, **frame}
+
+    def _number(self, frame: dict[str, Any], key: str, default: float | None = None) -> float:
+        given = self._given(frame)
+        if default is not None:
+            given.setdefault(key, default)
+        return float(read_numbers(self.path, given, key, ()))

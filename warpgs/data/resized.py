@@ -1,0 +1,103 @@
+"""Images, masks and depth of other programs: of any resolution, resized to that of the camera."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from warpgs.files import read_array
+
+from .images import MAX_PIXELS, decode, fill_transparent, is_bright, to_8_bits
+
+WHITE = 255
+
+
+def read_resized_image(path: Path, size: tuple[int, int], background: int | None = None) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit RGB image, resized to ``size`` (width, height).
+
+    Args:
+        path: PNG or JPEG file.
+        size: Width and height of the result; the file may have any size of about the same shape.
+        background: Level in front of which transparent pixels are composited; None inpaints them.
+
+    Raises:
+        ValueError: If the file is missing, damaged or of another shape.
+    """
+    stored = to_8_bits(decode(path))
+    check_shape(path, "the image", (stored.shape[1], stored.shape[0]), size)
+    if stored.ndim == 2:
+        image = cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
+    elif stored.shape[2] == 4 and background is not None:
+        alpha = stored[..., 3:].astype(np.float32) / 255.0
+        blended = stored[..., 2::-1] * alpha + background * (1.0 - alpha)
+        image = blended.round().astype(np.uint8)
+    else:
+        image = fill_transparent(stored)
+    return resize(image, size)
+
+
+def read_resized_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """True where a mask file is bright, resized to ``size`` (width, height).
+
+    Masks of 0 and 1, 0 and 255, or 0 and 65535. A pixel of a reduced mask is dark if any part of it is.
+
+    Raises:
+        ValueError: If the file is missing, damaged or of another shape.
+    """
+    stored = decode(path)
+    check_shape(path, "the mask", (stored.shape[1], stored.shape[0]), size)
+    return resize_mask(is_bright(stored), size)
+
+
+def read_metric_depth(path: Path, size: tuple[int, int], unit: float) -> Float[np.ndarray, "H W"]:
+    """Inverse depth of a file of depth along the camera's z axis, resized to ``size``; NaN where unknown.
+
+    Args:
+        path: A PNG file of 8 or 16 bits, or a .npy file.
+        size: Width and height of the result.
+        unit: World units per unit of the file.
+
+    Raises:
+        ValueError: If the file is missing, damaged or of another shape.
+    """
+    stored = read_array(path, MAX_PIXELS) if path.suffix == ".npy" else decode(path)
+    stored = stored[..., 0] if stored.ndim == 3 and stored.shape[2] == 1 else stored
+    if stored.ndim != 2:
+        raise ValueError(f"{path}: depth must be one channel, [H, W], got shape {list(stored.shape)}")
+    check_shape(path, "the depth", (stored.shape[1], stored.shape[0]), size)
+    return inverse_of(stored.astype(np.float32) * np.float32(unit), size)
+
+
+def inverse_of(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+    """1 / depth, resized to ``size`` (width, height) without interpolation; NaN where depth is not positive."""
+    depth = depth.astype(np.float32)
+    known = np.isfinite(depth) & (depth > 0)
+    inverse = np.full(depth.shape, np.nan, np.float32)
+    inverse[known] = 1.0 / depth[known]
+    inverse[~np.isfinite(inverse)] = np.nan
+    return cv2.resize(inverse, size, interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def resize(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """The image in another size, averaged over pixels where it shrinks."""
+    return image if image.shape[1::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def resize_mask(static: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """The static mask in another size: dynamic where any part of a pixel is."""
+    if static.shape[1::-1] == size:
+        return static
+    dynamic = cv2.resize(np.where(static, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
+    return dynamic == 0
+
+
+def check_shape(path: Path, what: str, stored: tuple[int, int], size: tuple[int, int]) -> None:
+    """Checks that a (width, height) is a multiple of ``size``, apart from rounding to whole pixels.
+
+    Raises:
+        ValueError: If it is not; the message names the file.
+    """
+    width, height = stored
+    if min(stored) == 0 or abs(width * size[1] - height * size[0]) > 0.5 * (width + height + sum(size)):
+        raise ValueError(f"{path}: {what} is {width}×{height}, which has not the shape of {size[0]}×{size[1]}")
