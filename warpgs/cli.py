@@ -9,7 +9,7 @@ import tyro
 
 from .bench.command import Bench
 from .config import TrainConfig
-from .data.command import Check
+from .data.command import Check, Import
 from .errors import run_command
 from .evaluation.command import Eval
 from .export.command import Export
@@ -33,6 +33,7 @@ COMMANDS: dict[str, Callable[..., Command]] = {
     "check": Check,
     "eval": Eval,
     "export": Export,
+    "import": Import,
     "prepare": Prepare,
     "render": Render,
     "report": Report,

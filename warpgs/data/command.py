@@ -1,4 +1,4 @@
-"""The command ``warpgs check``."""
+"""The commands ``warpgs check`` and ``warpgs import``."""
 
 import json
 from dataclasses import dataclass
@@ -34,3 +34,27 @@ class Check:
         print(json.dumps(report.plain(), indent=2) if self.as_json else report)
         if not report.is_fit:
             raise SystemExit(1)
+
+
+@dataclass(frozen=True)
+class Import:
+    """Copies a capture of any layout into the own one (docs/capture-format.md), undistorted and in scene units."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder of a capture: COLMAP, nerfstudio, D-NeRF, LLFF, NVIDIA, ViPE, MegaSaM, NeRF-DS, HyperNeRF or iPhone."""
+    capture: tyro.conf.Positional[Path]
+    """Folder to write; it must not exist or be empty."""
+    dataset: str | None = None
+    """Layout of the source; recognized from its files by default."""
+    factor: int | None = None
+    """Downscaling factor of the images; that of the layout by default."""
+    holdout: int | None = None
+    """Keep every N-th frame for evaluation, 0 for none; by default those that the source keeps."""
+    quiet: bool = False
+    """Print errors only."""
+
+    def run(self) -> None:
+        from .import_capture import import_capture
+
+        log = None if self.quiet else print
+        import_capture(self.source, self.capture, self.dataset, factor=self.factor, holdout=self.holdout, log=log)

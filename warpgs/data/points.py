@@ -17,7 +17,7 @@ MAX_POINTS = 50_000_000
 
 
 def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UInt8[Tensor, "P 3"] | None]:
-    """Points in scene units and their colours, from points.npy (without colours) or else a COLMAP model in sparse/0.
+    """Points in scene units and their colours, from points.npy and point_colors.npy or else a COLMAP model in sparse/0.
 
     A capture that has neither has zero points.
 
@@ -28,6 +28,7 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
     colors = None
     if path.exists():
         points = read_array(path, 3 * MAX_POINTS).astype(np.float64)
+        colors = _read_colors(root / "point_colors.npy", points.shape)
     elif model.is_dir():
         path = model
         _, points, stored = load_model(model)
@@ -40,3 +41,12 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         return torch.tensor(units.from_world(points), dtype=torch.float32), colors
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _read_colors(path: Path, shape: tuple[int, ...]) -> UInt8[Tensor, "P 3"] | None:
+    if not path.exists():
+        return None
+    colors = read_array(path, 3 * MAX_POINTS)
+    if colors.shape != shape or colors.dtype != np.uint8:
+        raise ValueError(f"{path} must hold bytes of shape {list(shape)}, got {colors.dtype} {list(colors.shape)}")
+    return torch.from_numpy(colors)

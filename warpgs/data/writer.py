@@ -16,6 +16,9 @@ from warpgs.files import write_array, write_json, write_png
 from .lens import Lens
 from .units import SceneUnits
 
+LAYOUT = "nerfds"
+"""Loader of what is written here, which dataset.json names."""
+
 
 def write_image(root: Path, name: str, image: UInt8[np.ndarray, "H W 3"], factors: Sequence[int] = (1,)) -> None:
     """Writes rgb/<factor>x/<name>.png for every downscaling factor.
@@ -40,6 +43,18 @@ def write_mask(root: Path, name: str, static_mask: Bool[np.ndarray, "H W"], fact
     for factor in factors:
         static = cv2.resize(dynamic, _reduced_size(dynamic, factor), interpolation=cv2.INTER_AREA) == 0
         write_png(root / f"resized_mask/{factor}x/{name}.png.png", static.astype(np.uint8) * 255)
+
+
+def write_covisible(root: Path, name: str, covisible: Bool[np.ndarray, "H W"], factors: Sequence[int] = (1,)) -> None:
+    """Writes covisible/<factor>x/val/<name>.png for every downscaling factor: 255 where masked metrics are computed.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    for factor in factors:
+        bright = covisible.astype(np.uint8) * 255
+        reduced = cv2.resize(bright, _reduced_size(bright, factor), interpolation=cv2.INTER_AREA) == 255
+        write_png(root / f"covisible/{factor}x/val/{name}.png", reduced.astype(np.uint8) * 255)
 
 
 def write_depth(root: Path, name: str, inverse_depth: Shaped[np.ndarray, "H W"]) -> None:
@@ -83,14 +98,22 @@ def write_camera(
     write_json(root / f"camera/{name}.json", fields)
 
 
-def write_scene(root: Path, units: SceneUnits, points: Float[np.ndarray, "P 3"], near: float, far: float) -> None:
-    """Writes scene.json and points.npy.
+def write_scene(
+    root: Path,
+    units: SceneUnits,
+    points: Float[np.ndarray, "P 3"],
+    near: float,
+    far: float,
+    colors: UInt8[np.ndarray, "P 3"] | None = None,
+) -> None:
+    """Writes scene.json, points.npy if there are points, and point_colors.npy if they have colours.
 
     Args:
         root: Folder of the capture.
         units: Scene units of the capture.
         points: [P, 3] sparse static points in the world.
         near, far: Depth range [scene units].
+        colors: [P, 3] 8-bit RGB of the points; None if unknown.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
@@ -98,7 +121,19 @@ def write_scene(root: Path, units: SceneUnits, points: Float[np.ndarray, "P 3"],
     bbox = [[-1, -1, -1], [1, 1, 1]]
     scene = {"center": units.center.tolist(), "scale": units.scale, "bbox": bbox, "near": near, "far": far}
     write_json(root / "scene.json", scene)
+    if len(points):
+        write_points(root, points, colors)
+
+
+def write_points(root: Path, points: Float[np.ndarray, "P 3"], colors: UInt8[np.ndarray, "P 3"] | None = None) -> None:
+    """Writes points.npy, and point_colors.npy if the points have colours; see ``write_scene``.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
     write_array(root / "points.npy", points)
+    if colors is not None:
+        write_array(root / "point_colors.npy", colors)
 
 
 def write_index(
@@ -126,7 +161,8 @@ def write_index(
     write_json(root / "metadata.json", metadata)
     train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
     counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}
-    write_json(root / "dataset.json", {**counts, "ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids})
+    splits = {"ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids}
+    write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **splits})
 
 
 def _reduced_size(image: np.ndarray, factor: int) -> tuple[int, int]:

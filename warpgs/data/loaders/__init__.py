@@ -10,6 +10,7 @@ from typing import Protocol
 from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.masks import check_perturbation
+from warpgs.files import read_json
 
 from .blender import BlenderLoader
 from .colmap import ColmapLoader
@@ -85,5 +86,11 @@ def load_capture(
 
 
 def recognize(root: Path) -> str:
-    """The dataset whose files ``root`` has, as a key of ``LOADERS``."""
+    """The layout of a capture, as a key of ``LOADERS``: ``layout`` in its dataset.json, or that of its files."""
+    try:
+        named = read_json(root / "dataset.json").get("layout")
+    except ValueError:  # no file, or one that the loader reports
+        named = None
+    if isinstance(named, str) and named in LOADERS:
+        return named
     return next((name for name, loader in LOADERS.items() if loader.recognizes(root)), FALLBACK)

@@ -1,0 +1,134 @@
+"""``warpgs import``: the copy in the own layout is the same capture."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.data import captures, layouts
+from warpgs.cli import main
+from warpgs.data.capture import Capture
+from warpgs.data.import_capture import import_capture, time_steps
+from warpgs.data.loaders import load_capture, recognize
+
+SOURCES = {
+    **layouts.WRITERS,
+    **{name: lambda root, name=name: captures.write_capture(root, name) for name in captures.FACTORS},
+}
+
+
+def assert_equal(copy: Capture, source: Capture) -> None:
+    assert sorted(copy.train) == sorted(source.train)
+    assert sorted(copy.val) == sorted(source.val)
+    assert torch.allclose(copy.points, source.points, atol=1e-6)
+    assert (copy.point_colors is None) == (source.point_colors is None)
+    for name in (source.train[0], source.train[-1], *source.val[-1:]):
+        a, b = copy.frame(name), source.frame(name)
+        assert a.camera.time == pytest.approx(b.camera.time)
+        assert torch.allclose(a.camera.viewmat, b.camera.viewmat, atol=1e-6)
+        assert torch.allclose(a.camera.K, b.camera.K, rtol=1e-6)
+        assert torch.equal(a.image, b.image)
+        assert (a.covisible is None) == (b.covisible is None)
+        if source.assumption == "masks":
+            assert (a.static_mask is None) == (b.static_mask is None)
+        if b.static_mask is not None and source.assumption == "masks":
+            assert torch.equal(a.static_mask, b.static_mask)
+        assert (a.inverse_depth is None) == (b.inverse_depth is None)
+        if b.inverse_depth is not None:
+            assert torch.allclose(a.inverse_depth, b.inverse_depth, rtol=1e-3, equal_nan=True)
+
+
+@pytest.mark.parametrize("layout", SOURCES)
+def test_the_copy_is_the_same_capture(tmp_path, layout):
+    source = SOURCES[layout](tmp_path / "source")
+    import_capture(source, tmp_path / "copy")
+    assert recognize(tmp_path / "copy") == "nerfds"
+    original = load_capture(source)
+    if layout == "blender":  # whose times need not begin at 0 and end at 1
+        names, last = [*original.train, *original.val], max(c.time for c in original.cameras.values())
+        copied = load_capture(tmp_path / "copy")
+        assert all(copied.cameras[n].time == pytest.approx(original.cameras[n].time / last, abs=1e-5) for n in names)
+    else:
+        assert_equal(load_capture(tmp_path / "copy"), original)
+
+
+def test_the_command_says_what_it_read(tmp_path, capsys):
+    source = layouts.write_colmap(tmp_path / "source")
+    assert main(["import", str(source), str(tmp_path / "copy"), "--holdout", "6"]) == 0
+    out = capsys.readouterr().out
+    assert "is read as colmap: 12 frames, 12 with masks, 12 with depth, 2 for evaluation, 60 points" in out
+    assert load_capture(tmp_path / "copy").val == ("frame_00003", "frame_00009")
+    assert main(["import", str(source), str(tmp_path / "copy")]) == 2
+    assert "is not an empty folder" in capsys.readouterr().err
+
+
+def test_all_frames_are_for_training_on_request(tmp_path):
+    import_capture(layouts.write_megasam(tmp_path / "source"), tmp_path / "copy", holdout=0)
+    assert len(load_capture(tmp_path / "copy").train) == layouts.COUNT
+
+
+def test_dnerf_says_that_everything_is_dynamic(tmp_path, capsys):
+    main(["import", str(layouts.write_blender(tmp_path / "source")), str(tmp_path / "copy")])
+    assert "--assume dynamic" in capsys.readouterr().out
+    assert load_capture(tmp_path / "copy").frame("train_r_000").static_mask is None
+
+
+@pytest.mark.parametrize("holdout", [-1, 1, 24])
+def test_an_impossible_holdout_is_refused(tmp_path, holdout):
+    with pytest.raises(ValueError, match="--holdout must be"):
+        import_capture(layouts.write_megasam(tmp_path / "source"), tmp_path / "copy", holdout=holdout)
+
+
+def test_a_source_with_a_damaged_frame_leaves_nothing_behind(tmp_path):
+    source = layouts.write_colmap(tmp_path / "source")
+    (source / "images/frame_00007.png").write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"frame_00007\.png is not a PNG"):
+        import_capture(source, tmp_path / "copy")
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+@pytest.mark.parametrize(
+    ("times", "steps"),
+    [([0.0, 0.5, 1.0], [0, 1, 2]), ([0.2, 0.3, 0.6], [0, 1, 4]), ([0.5], [0]), ([0.0, 0.0, 1.0], [0, 0, 1])],
+)
+def test_time_steps_are_the_smallest_whole_numbers(times, steps):
+    assert time_steps(times) == steps
+
+
+def test_irregular_times_keep_six_digits():
+    times = [0.0, 0.1234567, 0.3, 1.0]
+    assert np.allclose(np.array(time_steps(times)) / 10**6, times, atol=1e-6)
+
+
+def test_point_colors_that_do_not_fit_the_points_are_refused(tmp_path):
+    root = captures.write_capture(tmp_path / "toy")
+    captures.write_array(root / "point_colors.npy", np.zeros((3, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"point_colors\.npy must hold bytes of shape \[10, 3\]"):
+        load_capture(root)
+
+
+def test_the_layout_named_in_the_index_comes_first(tmp_path):
+    root = captures.write_capture(tmp_path / "toy", "iphone")
+    assert recognize(root) == "iphone"
+    captures.edit_json(root / "dataset.json", layout="nerfds")
+    assert recognize(root) == "nerfds"
+    for other in ("polaroid", 7, None):
+        captures.edit_json(root / "dataset.json", layout=other)
+        assert recognize(root) == "iphone"
+
+
+def test_masks_in_every_size_do_not_make_a_hypernerf_capture_one_of_nerfds(tmp_path):
+    root = captures.write_capture(tmp_path / "toy", "hypernerf")
+    for size in ("1x", "4x", "8x"):
+        (root / "rgb" / size).mkdir()
+    for size in ("1x", "2x", "4x"):
+        (root / "resized_mask" / size).mkdir(parents=True)
+    assert recognize(root) == "hypernerf"
+
+
+def test_the_index_is_complete(tmp_path):
+    import_capture(layouts.write_llff(tmp_path / "source"), tmp_path / "copy")
+    metadata = json.loads((tmp_path / "copy/metadata.json").read_text())
+    assert metadata["00007_cam02"] == {"time_id": 7, "warp_id": 7, "appearance_id": 7, "camera_id": 1}
+    assert metadata["frame_00007"]["camera_id"] == 0

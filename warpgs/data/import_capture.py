@@ -1,0 +1,148 @@
+"""Copies a capture of any layout into the own one, undistorted and in scene units."""
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from warpgs.progress import progress
+
+from . import writer
+from .capture import Capture, Frame
+from .lens import Lens
+from .loaders import load_capture, recognize
+from .units import SceneUnits
+
+FACTORS = (1, 2)
+"""Downscaling factors of the images and masks that are written."""
+
+MAX_STEPS = 10**6
+"""Time steps from the first to the last frame, unless fewer represent all times."""
+
+MAX_HALF = 6e4
+"""Maximum of the stored inverse depth; half floats end at 65504."""
+
+
+def import_capture(
+    source: Path,
+    target: Path,
+    dataset: str | None = None,
+    *,
+    factor: int | None = None,
+    holdout: int | None = None,
+    log: Callable[[str], None] | None = None,
+) -> None:
+    """Writes a copy of a capture in the own layout (docs/capture-format.md).
+
+    Args:
+        source: Folder of the capture.
+        target: Folder to write; it must not exist or be empty.
+        dataset: Layout of the source, a key of ``LOADERS``; recognized from its files if None.
+        factor: Downscaling factor of the images; that of the layout if None.
+        holdout: Every N-th frame is for evaluation, 0 for none; the split of the source if None.
+        log: Receives lines for the user; None shows nothing, the progress bar included.
+
+    Raises:
+        ValueError: If the source is damaged, the target is not empty, or there is nothing to hold out.
+        OSError: If a file cannot be written; the message names it.
+    """
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
+    capture = load_capture(source, dataset, factor=factor, cache_frames=2)
+    names = sorted((*capture.train, *capture.val), key=lambda name: (capture.cameras[name].time, name))
+    val = list(capture.val) if holdout is None else _held_out(names, holdout)
+    with _complete_or_absent(target) as folder:
+        counts = _write_frames(folder, capture, progress(names, "importing", log is None))
+        _write_index(folder, capture, names, val)
+    if log is not None:
+        log(
+            f"{source} is read as {dataset or recognize(source)}: {len(names)} frames, {counts[0]} with masks, "
+            f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
+        )
+        if capture.assumption == "dynamic":
+            log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
+        log(f"{target} is finished: next run warpgs check {target}")
+
+
+def _held_out(names: list[str], holdout: int) -> list[str]:
+    if holdout < 0 or holdout == 1 or holdout // 2 >= len(names):
+        raise ValueError(f"--holdout must be 0 (none) or at least 2 for {len(names)} frames, got {holdout}")
+    return names[holdout // 2 :: holdout] if holdout else []
+
+
+def _write_frames(folder: Path, capture: Capture, names: Iterable[str]) -> tuple[int, int]:
+    """Writes the frames; returns the numbers of those with masks and with depth."""
+    num_masks = num_depths = 0
+    for name in names:
+        frame = capture.frame(name)
+        if frame.static_mask is not None and capture.assumption == "masks":
+            writer.write_mask(folder, name, frame.static_mask.numpy(), FACTORS)
+            num_masks += 1
+        if frame.inverse_depth is not None:
+            writer.write_depth(folder, name, np.minimum(frame.inverse_depth.numpy(), MAX_HALF).astype(np.float16))
+            num_depths += 1
+        if frame.covisible is not None:
+            writer.write_covisible(folder, name, frame.covisible.numpy(), FACTORS)
+        _write_view(folder, frame)
+    return num_masks, num_depths
+
+
+def _write_view(folder: Path, frame: Frame) -> None:
+    (fx, _, cx), (_, fy, cy), _ = frame.camera.K.double().tolist()
+    lens = Lens(frame.camera.width, frame.camera.height, (fx, fy), (cx, cy))
+    rotation, position = frame.camera.viewmat[:3, :3].double(), frame.camera.position.double()
+    writer.write_image(folder, frame.name, frame.image.numpy(), FACTORS)
+    writer.write_camera(folder, frame.name, lens, rotation.numpy(), position.numpy())
+
+
+def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str]) -> None:
+    points = capture.points.double().numpy()
+    colors = None if capture.point_colors is None else capture.point_colors.numpy()
+    near, far = _depth_range(capture)
+    writer.write_scene(folder, SceneUnits(np.zeros(3), 1.0), points, near, far, colors)
+    times = [capture.cameras[name].time for name in names]
+    steps = dict(zip(names, time_steps(times), strict=True))
+    trained = {steps[name] for name in names if name not in val}
+    other_camera = {name: int(name in val and steps[name] in trained) for name in names}
+    writer.write_index(folder, steps, val, other_camera)
+
+
+def _depth_range(capture: Capture) -> tuple[float, float]:
+    """Near and far that contain nearly all points with a margin [scene units]."""
+    cameras = [capture.cameras[name] for name in capture.train[:: max(1, len(capture.train) // 20)]]
+    depths = np.concatenate([camera.project(capture.points)[2].numpy() for camera in cameras])
+    depths = depths[depths > 0]
+    if len(depths) == 0:
+        return 0.01, 10.0
+    near, far = np.quantile(depths, [0.001, 0.999]).tolist()
+    return 0.5 * near, 2.0 * far
+
+
+def time_steps(times: list[float]) -> list[int]:
+    """Whole numbers in proportion to some times, from 0 on: as few as represent all of them, if that is possible."""
+    low, high = min(times), max(times)
+    distinct = np.unique(times)
+    if len(distinct) == 1:
+        return [0] * len(times)
+    relative = (np.array(times) - low) / (high - low)
+    smallest = np.diff(distinct).min() / (high - low)
+    fewest = round(1.0 / smallest) if smallest > 1.0 / MAX_STEPS else MAX_STEPS
+    exact = np.abs(relative * fewest - (relative * fewest).round()).max() < 0.01
+    return (relative * (fewest if exact else MAX_STEPS)).round().astype(int).tolist()
+
+
+@contextmanager
+def _complete_or_absent(target: Path) -> Iterator[Path]:
+    """A folder beside the target, renamed to it on success and removed after any error or Ctrl-C."""
+    partial = target.with_name(f"{target.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        if target.exists():
+            target.rmdir()
+        partial.rename(target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
