@@ -13,13 +13,16 @@ from .options import LensModel, Options, Selection
 class Prepare:
     """Makes a capture in the NeRF-DS layout from a video or a folder of frames in temporal order.
 
-    After an interruption or an error, the same command continues with the first unfinished step.
+    After an interruption or an error, the same command continues with the first unfinished step. With ``--add``, adds
+    what a capture lacks, with its own cameras: ``warpgs prepare CAPTURE --add masks,depth,points``.
     """
 
     source: tyro.conf.Positional[Path]
-    """Video, or folder of PNG or JPEG frames of one size."""
-    capture: tyro.conf.Positional[Path]
-    """Folder to write the capture to."""
+    """Video, or folder of PNG or JPEG frames of one size; with --add the capture."""
+    capture: tyro.conf.Positional[Path | None] = None
+    """Folder to write the capture to; not with --add."""
+    add: str | None = None
+    """Add these to a capture that lacks them: masks, depth and points, separated by commas."""
     fps: float | None = None
     """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
@@ -43,11 +46,20 @@ class Prepare:
     """Print errors only."""
 
     def run(self) -> None:
+        log = None if self.quiet else partial(print, flush=True)
+        if self.add is not None:
+            from .add import AddOptions, add_parts
+
+            if self.capture is not None:
+                raise ValueError(f"with --add, give the capture only, without {self.capture}")
+            add_parts(self.source, AddOptions(self.add.split(","), self.masks, self.depth, self.weights), log)
+            return
+        if self.capture is None:
+            raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
         from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
 
         selection = Selection(self.fps, self.count, self.longest_side)
         options = Options(selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
-        log = None if self.quiet else partial(print, flush=True)
         try:
             prepare(self.source, self.capture, options, force=self.force, log=log)
         except KeyboardInterrupt:

@@ -43,7 +43,7 @@ class PosedFrames:
     ) -> None:
         self.images, self.lens, self.poses = images, lens, poses
         self.points = points[:: max(1, len(points) // 400)]
-        self.rays = _rays(lens)
+        self.rays = pixel_rays(lens)
         self._ray_planes = np.ascontiguousarray(self.rays.transpose(2, 0, 1))
         self.neighbours = [self._neighbours(frame) for frame in range(len(poses))]
 
@@ -116,7 +116,8 @@ def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: flo
     return PosedFrames(images, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
 
 
-def _rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
+def pixel_rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
+    """[H, W, 2] x, y on the plane z = 1 of the centre of every pixel of a distorted image."""
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     K = np.array([[lens.focal[0], 0, lens.center[0]], [0, lens.focal[1], lens.center[1]], [0, 0, 1.0]])
     k1, k2, k3 = lens.radial

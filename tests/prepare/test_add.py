@@ -1,0 +1,157 @@
+"""``warpgs prepare CAPTURE --add``: what a capture lacks is made with its own cameras."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data import captures, layouts
+from tests.data.captures import edit_json
+from tests.prepare import boards
+from warpgs.cli import main
+from warpgs.data.images import decode, read_depth
+from warpgs.data.loaders import load_capture, recognize
+from warpgs.prepare import masks
+from warpgs.prepare.add import AddOptions, add_parts
+from warpgs.prepare.methods import Masker
+
+COUNT = 12
+NAMES = [f"shot{k:03d}" for k in range(COUNT)]
+
+
+def is_red(image):
+    """The moving board is the only red thing."""
+    red, green, blue = image.astype(int).transpose(2, 0, 1)
+    return (red > 1.6 * green) & (red > 1.6 * blue)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    root = boards.write_capture(tmp_path_factory.mktemp("add") / "capture", COUNT, holdout=6)
+    shutil.rmtree(root / "frames")
+    shutil.rmtree(root / "resized_mask")
+    return root
+
+
+@pytest.fixture
+def root(original, tmp_path):
+    return shutil.copytree(original, tmp_path / "capture")
+
+
+@pytest.fixture
+def red(monkeypatch):
+    """A masker that finds what is red."""
+    monkeypatch.setitem(masks.MASKERS, "red", Masker(lambda frames, weights, quiet: [is_red(i) for i in frames.images]))
+
+
+def written_mask(root, name, size="1x"):
+    return decode(root / f"resized_mask/{size}/{name}.png.png") == 0
+
+
+def overlap(a, b) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+@pytest.mark.usefixtures("red")
+def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
+    for k, name in enumerate(NAMES):
+        lens = {"focal_length": boards.FOCAL + 3.0 * k, "radial_distortion": [0.02 * k, 0.0, 0.0]}
+        edit_json(root / f"camera/{name}.json", **lens)
+    assert main(["prepare", str(root), "--add", "masks", "--masks", "red"]) == 0
+    assert "masks: 12 frames" in capsys.readouterr().out
+    for name in NAMES:
+        image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
+        assert overlap(written_mask(root, name), is_red(image)) > 0.9, name
+        assert written_mask(root, name, "2x").shape == (96, 128)
+    capture = load_capture(root)
+    assert all(capture.frame(name).static_mask is not None for name in NAMES)
+    assert (root / "masks.png").is_file()
+
+
+@pytest.mark.usefixtures("red")
+def test_masks_that_are_there_stay(root):
+    mask = np.full((192, 256), 255, np.uint8)
+    captures.write_png(root / "resized_mask/1x/shot003.png.png", mask)
+    for name in NAMES:
+        if name != "shot003":
+            captures.write_png(root / f"resized_mask/1x/{name}.png.png", mask)
+    lines = []
+    add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
+    assert lines == ["masks: all frames have them"]
+    assert not written_mask(root, "shot003").any()
+
+
+def test_depth_and_points_are_those_of_the_scene(root):
+    points = np.load(root / "points.npy")
+    (root / "points.npy").unlink()
+    add_parts(root, AddOptions(["depth", "points"]))
+    found = np.load(root / "points.npy")
+    colors = np.load(root / "point_colors.npy")
+    assert len(found) > 1000
+    assert colors.shape == found.shape
+    planes = np.array([center[2] for center, _ in boards.PLANES])
+    distance = np.abs(found[:, 2:] - planes).min(1)
+    assert np.median(distance) < 0.1
+    assert points[:, 2].min() - 0.5 < np.median(found[:, 2]) < points[:, 2].max() + 0.5
+    for k in (0, 5, 11):
+        depth = read_depth(root / f"depth/1x/{NAMES[k]}.npy", boards.SIZE)
+        truth = 1.0 / boards.depth(boards.poses(COUNT)[k])
+        known = np.isfinite(depth)
+        assert known.mean() > 0.3
+        ratio = depth[known] / truth[known]
+        assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.03
+
+
+@pytest.mark.usefixtures("red")
+def test_a_hypernerf_capture_stays_one(tmp_path):
+    root = captures.write_capture(tmp_path / "toy", "hypernerf")
+    for path in (root / "rgb/2x").iterdir():
+        captures.write_png(root / "rgb/1x" / path.name, np.zeros((24, 40, 3), np.uint8))
+    more = {f"left_{k:06d}": k for k in range(4, 12)}
+    metadata = json.loads((root / "metadata.json").read_text())
+    for name, k in more.items():
+        metadata[name] = {"time_id": k}
+        captures.write_json(root / f"camera/{name}.json", captures.camera_fields(k))
+        for size in ("1x", "2x"):
+            shutil.copy(root / f"rgb/{size}/left_000000.png", root / f"rgb/{size}/{name}.png")
+    captures.write_json(root / "metadata.json", metadata)
+    edit_json(root / "dataset.json", train_ids=sorted([*captures.ids_of("hypernerf")[0], *more]))
+    add_parts(root, AddOptions(["masks"], masks="red"))
+    assert recognize(root) == "hypernerf"
+    assert load_capture(root).frame("left_000011").static_mask.shape == (12, 20)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--add", "masks,colours"], "--add must be one or more of masks, depth, points, got masks,colours"),
+        (["--add", ""], "--add must be one or more"),
+        (["--add", "masks", "--masks", "none"], "--masks must be one of motion, sam2 to add it, got none"),
+        (["--add", "depth", "--depth", "none"], "--depth must be one of flow, anything to add it, got none"),
+        (["elsewhere", "--add", "depth"], "with --add, give the capture only"),
+        ([], "prepare needs a source and a folder for the capture"),
+    ],
+)
+def test_wrong_options_are_refused(root, arguments, message, capsys):
+    assert main(["prepare", str(root), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_other_layouts_are_to_be_imported_first(tmp_path):
+    root = layouts.write_colmap(tmp_path / "colmap")
+    with pytest.raises(ValueError, match="has the layout colmap: first copy it with warpgs import"):
+        add_parts(root, AddOptions(["depth"]))
+
+
+def test_the_depth_of_iphone_captures_is_that_of_the_sensor(tmp_path):
+    root = captures.write_capture(tmp_path / "toy", "iphone")
+    with pytest.raises(ValueError, match="is an iPhone capture, whose depth is that of its sensor"):
+        add_parts(root, AddOptions(["depth"]))
+
+
+def test_too_few_frames_for_masks_are_refused(tmp_path):
+    root = captures.write_capture(tmp_path / "toy", "hypernerf")
+    with pytest.raises(ValueError, match="4 frames are too few to find what moves"):
+        add_parts(root, AddOptions(["masks"]))

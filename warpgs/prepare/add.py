@@ -1,0 +1,254 @@
+"""Adds what a capture lacks, with its own cameras: masks, depth, points.
+
+Frames of a capture may have lenses of their own. They are resampled to one pinhole camera, on which the methods of
+``masks`` and ``depth`` work; results are resampled to each frame as its file has it, with its distortion.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from warpgs.data import writer
+from warpgs.data.camera_files import read_camera
+from warpgs.data.capture import Capture
+from warpgs.data.depth_points import DepthView, points_of_views
+from warpgs.data.lens import Lens
+from warpgs.data.loaders import LOADERS, load_capture, recognize
+from warpgs.data.loaders.nerfies import NerfiesLoader
+from warpgs.data.units import SceneUnits, read_units
+from warpgs.files import read_json, write_json, write_png
+from warpgs.progress import progress
+
+from .checks import MIN_FOR_MOTION
+from .contact_sheet import choose_evenly, colored_depth, contact_sheet, overlay_mask
+from .depth import DEPTHS, MAX_SIDE, as_half
+from .images import resize_to_side
+from .masks import MASKERS, WORKING_SIDE
+from .posed_frames import PosedFrames, pixel_rays
+from .weights import find_weights
+
+PARTS = ("masks", "depth", "points")
+"""What can be added."""
+
+MAX_POINT_FRAMES = 40
+"""Number of frames, evenly spread, that points are taken from."""
+
+
+@dataclass(frozen=True)
+class AddOptions:
+    """How to add parts.
+
+    Attributes:
+        parts: Members of ``PARTS``.
+        masks: A name in ``masks.MASKERS``, not "none".
+        depth: A name in ``depth.DEPTHS``, not "none".
+        weights: Folder with the weights of the networks; None for the Hugging Face cache.
+    """
+
+    parts: Sequence[str]
+    masks: str = "motion"
+    depth: str = "flow"
+    weights: Path | None = None
+
+
+def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None = None) -> None:
+    """Adds masks, depth or points that a capture lacks; what it has stays as it is.
+
+    Args:
+        root: Capture in the own layout, or of NeRF-DS, HyperNeRF or DyCheck.
+        options: What to add and how.
+        log: Receives a line per part; None shows nothing, progress bars included.
+
+    Raises:
+        ValueError: If an option is invalid, the capture is damaged, of another layout or unsuitable.
+        ImportError: If the package of a network is missing.
+        OSError: If a file cannot be written; the message names it.
+    """
+    _check_options(options)
+    layout = recognize(root)
+    if not isinstance(LOADERS[layout], NerfiesLoader):
+        raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
+    if layout == "iphone" and "depth" in options.parts:
+        raise ValueError(f"{root} is an iPhone capture, whose depth is that of its sensor; add masks or points only")
+    job = _Job(root, load_capture(root), read_units(root / "scene.json"), options, log)
+    for part in PARTS:
+        if part in options.parts:
+            getattr(job, f"add_{part}")()
+    if recognize(root) != layout:  # masks in full size would make another dataset of it
+        write_json(root / "dataset.json", {**read_json(root / "dataset.json"), "layout": layout})
+
+
+def _check_options(options: AddOptions) -> None:
+    if not options.parts or not set(options.parts) <= set(PARTS):
+        raise ValueError(f"--add must be one or more of {', '.join(PARTS)}, got {','.join(options.parts) or 'nothing'}")
+    for name, value, methods in (("masks", options.masks, MASKERS), ("depth", options.depth, DEPTHS)):
+        known = [method for method, implementation in methods.items() if implementation is not None]
+        if value not in known:
+            raise ValueError(f"--{name} must be one of {', '.join(known)} to add it, got {value}")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One call of ``add_parts``; ``estimated`` holds frames and depth by the method's name."""
+
+    root: Path
+    capture: Capture
+    units: SceneUnits
+    options: AddOptions
+    log: Callable[[str], None] | None
+    estimated: dict[str, tuple[PosedFrames, Sequence[np.ndarray]]] = field(default_factory=dict)
+
+    def add_masks(self) -> None:
+        """Writes masks of the frames that lack them, and masks.png."""
+        names = self._names()
+        missing = [name for name in names if self.capture.frame(name).static_mask is None]
+        if not missing:
+            self._say("masks: all frames have them")
+            return
+        if len(names) < MIN_FOR_MOTION:
+            raise ValueError(
+                f"{len(names)} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
+            )
+        method = MASKERS[self.options.masks]
+        assert method is not None
+        folder = find_weights(method.network, self.options.weights) if method.network is not None else None
+        frames = self._posed(names, WORKING_SIDE)
+        masks = method.find(frames, folder, self.log is None)
+        factors = sorted(int(p.name[:-1]) for p in (self.root / "rgb").glob("*x") if p.name[:-1].isdecimal())
+        for name, mask in zip(names, masks, strict=True):
+            if name in missing:
+                lens = self._lens(name)
+                dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
+                writer.write_mask(self.root, name, ~dynamic, factors)
+        shown = choose_evenly(len(names))
+        painted = [overlay_mask(frames.images[k], masks[k]) for k in shown]
+        write_png(self.root / "masks.png", contact_sheet(painted, [names[k] for k in shown]))
+        fraction = float(np.mean([mask.mean() for mask in masks]))
+        self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
+
+    def add_depth(self) -> None:
+        """Writes depth of the frames that lack it, and depth.png."""
+        names = self._names()
+        missing = [name for name in names if self.capture.frame(name).inverse_depth is None]
+        if not missing:
+            self._say("depth: all frames have it")
+            return
+        frames, planes = self._planes(names)
+        for name, plane in zip(names, planes, strict=True):
+            if name in missing:
+                lens = self._lens(name)
+                lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
+                writer.write_depth(self.root, name, as_half(_resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)))
+        shown = choose_evenly(len(names))
+        sheet = contact_sheet([colored_depth(planes[k]) for k in shown], [names[k] for k in shown])
+        write_png(self.root / "depth.png", sheet)
+        known = float(np.mean([np.isfinite(plane).mean() for plane in planes]))
+        self._say(f"depth: {len(missing)} frames, known on {known:.0%} of the pixels: look at depth.png")
+
+    def add_points(self) -> None:
+        """Writes points.npy and point_colors.npy, from optical flow, if the capture has no points."""
+        if len(self.capture.points):
+            self._say(f"points: {len(self.capture.points)} are there")
+            return
+        names = self._names()
+        frames, planes = self._planes(names, "flow")
+        fx, fy, (cx, cy) = *frames.lens.focal, frames.lens.center
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        static = self._static(names, frames.lens)
+        chosen = np.unique(np.linspace(0, len(names) - 1, min(MAX_POINT_FRAMES, len(names))).round().astype(int))
+        views = [DepthView(frames.images[k], planes[k], static[k], K, frames.poses[k]) for k in chosen]
+        points, colors = points_of_views(views)
+        if len(points) == 0:
+            raise ValueError(f"{self.root}: no points were found: the camera hardly moves, or its poses are wrong")
+        writer.write_points(self.root, points / self.units.scale + self.units.center, colors)
+        self._say(f"points: {len(points)}")
+
+    def _planes(self, names: list[str], depth: str | None = None) -> tuple[PosedFrames, Sequence[np.ndarray]]:
+        """Frames at working size and their inverse depth; the same for depth and points."""
+        name = depth or self.options.depth
+        if name in self.estimated:
+            return self.estimated[name]
+        method = DEPTHS[name]
+        assert method is not None
+        folder = find_weights(method.network, self.options.weights) if method.network is not None else None
+        frames = self._posed(names, MAX_SIDE, max_factor=1.0)
+        dynamic = [~static for static in self._static(names, frames.lens)]
+        self.estimated[name] = frames, method.estimate(frames, dynamic, folder, self.log is None)
+        return self.estimated[name]
+
+    def _names(self) -> list[str]:
+        """Training frames, and evaluation frames at times of their own (not those of another camera), by time."""
+        cameras = self.capture.cameras
+        trained = {cameras[name].time for name in self.capture.train}
+        names = [*self.capture.train, *(name for name in self.capture.val if cameras[name].time not in trained)]
+        return sorted(names, key=lambda name: (cameras[name].time, name))
+
+    def _posed(self, names: list[str], side: int, max_factor: float = np.inf) -> PosedFrames:
+        """The frames as one pinhole camera sees them, with the longer side resized to ``side``."""
+        if len({self.capture.cameras[name].size for name in names}) > 1:
+            raise ValueError(f"{self.root} has images of several sizes, which cannot be compared")
+        K = np.median([self.capture.cameras[name].K.double().numpy() for name in names], axis=0)
+        common = _pinhole(K, self.capture.cameras[names[0]].size)
+        images = []
+        for name in progress(names, "reading images", self.log is None):
+            frame = self.capture.frame(name)
+            small = resize_to_side(frame.image.numpy(), side, max_factor)
+            height, width = small.shape[:2]
+            own = _pinhole(frame.camera.K.double().numpy(), frame.camera.size).resized(width, height)
+            images.append(_resampled(small, own, common.resized(width, height), cv2.INTER_LINEAR))
+        poses = np.array([self.capture.cameras[name].viewmat[:3].double().numpy() for name in names])
+        height, width = images[0].shape[:2]
+        return PosedFrames(images, common.resized(width, height), poses, self._points(names))
+
+    def _points(self, names: list[str]) -> Float[np.ndarray, "P 3"]:
+        """The capture's points; without any, positions before the cameras, as far away as the scene's center."""
+        if len(self.capture.points):
+            return self.capture.points.double().numpy()
+        cameras = [self.capture.cameras[name] for name in names[:: max(1, len(names) // 20)]]
+        forward = [camera.viewmat[2, :3].double().numpy() for camera in cameras]
+        centers = [camera.position.double().numpy() for camera in cameras]
+        distance = max(0.1, float(np.median(np.linalg.norm(centers, axis=1))))
+        return np.array([center + distance * axis for center, axis in zip(centers, forward, strict=True)])
+
+    def _static(self, names: list[str], lens: Lens) -> list[Bool[np.ndarray, "H W"]]:
+        """Static masks of the frames as the common camera sees them; all true where there is none."""
+        found = []
+        capture = load_capture(self.root)  # with the masks that were added
+        for name in names:
+            frame = capture.frame(name)
+            if frame.static_mask is None:
+                found.append(np.ones((lens.height, lens.width), bool))
+                continue
+            own = _pinhole(frame.camera.K.double().numpy(), frame.camera.size)
+            dynamic = (~frame.static_mask.numpy()).astype(np.float32)
+            found.append(_resampled(dynamic, own, lens, cv2.INTER_LINEAR) < 0.5)
+        return found
+
+    def _lens(self, name: str) -> Lens:
+        """The lens of a frame's full-size file."""
+        return read_camera(self.root / f"camera/{name}.json", self.units, 1, 0.0)[1]
+
+    def _say(self, line: str) -> None:
+        if self.log is not None:
+            self.log(line)
+
+
+def _pinhole(K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> Lens:
+    return Lens(*size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])))
+
+
+def _resampled(
+    image: Float[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"], source: Lens, target: Lens, interpolation: int
+) -> Float[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]:
+    """What a camera with the lens ``target`` sees of the image of a pinhole camera at the same place."""
+    if source == target:
+        return image
+    rays = pixel_rays(target)
+    x = source.focal[0] * rays[..., 0] + source.center[0] - 0.5
+    y = source.focal[1] * rays[..., 1] + source.center[1] - 0.5
+    maps = x.astype(np.float32), y.astype(np.float32)
+    return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
