@@ -8,11 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from tests.data import captures
+from tests.data import captures, layouts
 from tests.data.captures import edit_json, write_array
 from tests.prepare import boards
-from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
 
@@ -128,7 +129,60 @@ def test_inverse_depth_of_any_scale_is_fit(root):
 
 def test_depth_instead_of_inverse_depth_is_a_warning(root):
     write_depth(root, lambda depth: depth)
-    assert "the depth of 12 of 12 frames cannot be aligned" in texts(check_capture(root), "warning")
+    assert "the depth of 12 of 12 frames cannot be aligned to the points: it grows" in texts(
+        check_capture(root), "warning"
+    )
+
+
+@pytest.mark.parametrize(
+    ("convert", "problem"),
+    [
+        (lambda depth: np.full_like(depth, np.nan), "is known nowhere"),
+        (lambda depth: np.full_like(depth, 3.0), "is the same at all points"),
+        (lambda depth: np.where(np.arange(256) < 2, depth, np.nan), "is known at fewer than 16 of the points"),
+    ],
+)
+def test_problems_of_depth_are_told_apart(root, convert, problem):
+    write_depth(root, convert)
+    assert texts(check_capture(root), "warning") == f"the depth of 12 of 12 frames {problem}" + next(
+        text.removeprefix(problem) for text in DEPTH_PROBLEMS.values() if text.startswith(problem)
+    )
+
+
+def test_depth_that_is_known_nowhere_is_found_without_points(root):
+    write_depth(root, lambda depth: np.full_like(depth, np.nan))
+    (root / "points.npy").unlink()
+    assert "is known nowhere" in texts(check_capture(root), "warning")
+
+
+def test_flow_between_cameras_that_look_in_different_directions_is_no_evidence(root):
+    """Every second camera looks to the right: its images are right, but show something else."""
+    turn = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    noise = np.random.default_rng(0)
+    for name in [f"shot{k:03d}" for k in range(1, 16, 2)]:
+        rotation = np.array(json.loads((root / f"camera/{name}.json").read_text())["orientation"])
+        edit_json(root / f"camera/{name}.json", orientation=(turn @ rotation).tolist())
+        blurred = cv2.resize(noise.integers(0, 255, (48, 64, 3), np.uint8), (256, 192))
+        captures.write_png(root / f"rgb/1x/{name}.png", blurred)
+    report = check_capture(root)
+    assert report.is_fit
+    assert "may not match" not in str(report)
+    assert "inverted" not in str(report)
+    assert "from cameras too far apart" in texts(report, "note")
+
+
+def test_pixels_whose_flow_does_not_lead_back_do_not_count(original):
+    capture = load_capture(original)
+    first, second = (capture.frame(name) for name in capture.train[:2])
+    other = torch.from_numpy(captures.image_of("other", (256, 192)))
+    assert motion_between(first, replace(second, image=other)) is None
+
+
+def test_a_capture_in_which_everything_is_dynamic_is_fit(tmp_path):
+    report = check_capture(layouts.write_blender(tmp_path / "scene"))
+    assert report.is_fit
+    assert "everything is taken as dynamic" in texts(report, "note")
+    assert "read as blender" in texts(report, "note")
 
 
 def test_depth_is_not_checked_without_points(root):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,9 +16,9 @@ from warpgs.cameras import Camera
 from warpgs.errors import visible
 
 from .capture import MIN_EXTENT, Capture, Frame
-from .depth_alignment import align_to_points, is_unusable, relative_errors
+from .depth_alignment import DepthProblem, align_to_points, alignment_problem, is_unusable, relative_errors
 from .loaders import load_capture, recognize
-from .motion_check import motion_between
+from .motion_check import are_comparable, motion_between
 
 Level = Literal["error", "warning", "note"]
 
@@ -39,6 +40,14 @@ MAX_DYNAMIC_FRACTION = 0.4
 MAX_EPIPOLAR_DISTANCE = 3.0
 """Maximum median distance of static pixels from their epipolar lines [px]; more means that cameras and images do not
 match."""
+
+DEPTH_PROBLEMS: dict[DepthProblem, str] = {
+    "unknown": "is known nowhere: its files hold no finite positive numbers",
+    "few points": "is known at fewer than 16 of the points that they see, which is too few to align it",
+    "constant": "is the same at all points",
+    "inverted": "cannot be aligned to the points: it grows with distance, but must be inverse depth, larger is closer",
+}
+"""What is wrong with depth that cannot be aligned."""
 
 SAMPLES = 12
 """Frames whose content is checked, evenly spread over the capture; all frames are read."""
@@ -126,7 +135,7 @@ def _counts(capture: Capture) -> Iterator[Finding]:
     distinct = len(set(times))
     yield Finding("note", "time", f"times from {times[0]:.3f} to {times[-1]:.3f}, {distinct} distinct")
     if distinct == 1 and len(times) > 1:
-        text = "all training frames have one time: time_id (or warp_id) in metadata.json is wrong"
+        text = "all training frames have one time: time_id in metadata.json, or what the layout has for it, is wrong"
         if capture.assumption == "static":
             yield Finding("warning", "time", text)
         else:
@@ -150,11 +159,13 @@ def _files(capture: Capture) -> Iterator[Finding]:
             yield Finding("error", "files", str(error))
             continue
         num_depths += frame.inverse_depth is not None
-        if frame.static_mask is not None:
+        if frame.static_mask is not None and capture.assumption == "masks":
             dynamic.append(1.0 - float(frame.static_mask.float().mean()))
     count = len(capture.train) + len(capture.val)
     yield Finding("note", "files", f"{len(dynamic)} of {count} frames have masks, {num_depths} have depth")
-    if not dynamic:
+    if capture.assumption == "dynamic":
+        yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
+    elif not dynamic:
         yield Finding("warning", "masks", "there are no masks; training needs them, or --assume static or dynamic")
     elif max(dynamic) == 0.0:
         yield Finding("warning", "masks", "the masks mark nothing as dynamic")
@@ -221,9 +232,8 @@ def _contrast_at_points(frame: Frame, points: torch.Tensor) -> float | None:
 
 def _depth(capture: Capture) -> Iterator[Finding]:
     """Aligns the depth of the sampled frames to the points and measures its error."""
-    if len(capture.points) == 0:
-        return
-    errors, failed, unusable, count = [], 0, 0, 0
+    errors, unusable, count = [], 0, 0
+    problems: Counter[DepthProblem] = Counter()
     for name in _sampled(capture.train, SAMPLES):
         frame = capture.frame(name)
         if frame.inverse_depth is None:
@@ -232,15 +242,15 @@ def _depth(capture: Capture) -> Iterator[Finding]:
         everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
         static = everywhere if frame.static_mask is None else frame.static_mask
         sources = (frame.inverse_depth, static, frame.camera, capture.points)
-        found = relative_errors(*sources, align_to_points(*sources))
-        if not bool(found.isfinite().all()):
-            failed += 1
-            continue
-        errors.append(float(found[0]))
-        unusable += int(is_unusable(found))
-    if failed:
-        text = f"the depth of {failed} of {count} frames cannot be aligned to the points"
-        yield Finding("warning", "depth", f"{text}: it must be inverse depth, larger is closer")
+        if problem := alignment_problem(*sources):
+            problems[problem] += 1
+        else:
+            found = relative_errors(*sources, align_to_points(*sources))
+            errors.append(float(found[0]))
+            unusable += int(is_unusable(found))
+    for problem, number in problems.items():
+        if problem != "few points" or len(capture.points):  # without points, there is a warning already
+            yield Finding("warning", "depth", f"the depth of {number} of {count} frames {DEPTH_PROBLEMS[problem]}")
     if errors:
         median = float(np.median(errors))
         yield Finding("note", "depth", f"aligned depth is {median:.1%} off at the points (median)")
@@ -259,6 +269,8 @@ def _motion(capture: Capture) -> Iterator[Finding]:
         if found.dynamic is not None:
             inside.append(found.dynamic - found.static)
     if not outside:
+        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
+        yield Finding("note", "cameras", f"{text}, to compare their motion")
         return
     static = float(np.median(outside))
     level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
@@ -278,7 +290,10 @@ def _motion(capture: Capture) -> Iterator[Finding]:
 
 
 def _pairs(capture: Capture) -> list[tuple[str, str]]:
-    """Frames that follow each other in time, of any camera, evenly spread over the capture."""
-    names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
-    pairs = list(itertools.pairwise(names))
+    """Frames that follow each other in time, of cameras that are not far apart, evenly spread over the capture."""
+    cameras = capture.cameras
+    names = sorted(capture.train, key=lambda name: cameras[name].time)
+    pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
+    if not pairs:
+        return []
     return [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, min(SAMPLES, len(pairs))).astype(int))]

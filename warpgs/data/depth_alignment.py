@@ -3,6 +3,7 @@ paper, a smooth factor over the image, because the errors of depth networks vary
 
 import math
 from functools import partial
+from typing import Literal
 
 import cv2
 import torch
@@ -73,6 +74,30 @@ def align_to_points(
     values = inverse_depth[row, column]
     known = inside & values.isfinite() & static[row, column]
     return fit_scale_offset(values[known], 1.0 / z[known])
+
+
+DepthProblem = Literal["unknown", "few points", "constant", "inverted"]
+"""Why a frame's depth cannot be aligned: no finite value, too few points at which it is known, one value at all of
+them, or a value that grows with distance."""
+
+
+def alignment_problem(
+    inverse_depth: Float[Tensor, "H W"],
+    static: Tensor,
+    camera: Camera,
+    points: Float[Tensor, "P 3"],
+) -> DepthProblem | None:
+    """Why ``align_to_points`` finds no alignment of a frame; None if it finds one."""
+    if not bool(inverse_depth.isfinite().any()):
+        return "unknown"
+    row, column, z, inside = camera.project(points)
+    values = inverse_depth[row, column]
+    known = inside & values.isfinite() & static[row, column]
+    if int(known.sum()) < MIN_SAMPLES:
+        return "few points"
+    if bool(fit_scale_offset(values[known], 1.0 / z[known]).isfinite().all()):
+        return None
+    return "constant" if float(values[known].max()) == float(values[known].min()) else "inverted"
 
 
 def relative_errors(

@@ -1,10 +1,13 @@
 """Motion between two frames that their cameras do not explain, inside and outside the mask."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+
+from warpgs.cameras import Camera
 
 from .capture import Frame
 
@@ -16,6 +19,14 @@ COMPARED_SIDE = 512
 
 MIN_PIXELS = 200
 """Minimum number of pixels of a median."""
+
+MIN_AGREEING = 0.4
+"""Minimum fraction of the textured pixels whose flow leads back: 0.05 to 0.25 between unrelated images, 0.9 between
+frames of a slow video."""
+
+MAX_ANGLE = 30.0
+"""Maximum angle between the orientations of two cameras; optical flow between views farther apart is no evidence
+[degrees]."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +45,27 @@ class Motion:
 def motion_between(first: Frame, second: Frame) -> Motion | None:
     """Compares the optical flow (DIS) from the first frame to the second with the epipolar lines of their cameras.
 
+    Only pixels count whose flow back leads to where they came from.
+
     Returns:
-        The motion; None if too few pixels have texture, or the images are too small for optical flow.
+        The motion; None if too few pixels have texture and flow, the cameras are too far apart (``are_comparable``), or
+        the images are too small for optical flow.
     """
     height, width = first.image.shape[:2]
     factor = min(1.0, COMPARED_SIDE / max(height, width))
     size = round(width * factor), round(height * factor)
-    if min(size) < MIN_SIDE:
+    if min(size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
     a, b = (_grey(frame, size) for frame in (first, second))
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(a, b, None)
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = method.calc(a, b, None)
+    agrees = _leads_back(flow, method.calc(b, a, None))
     distance = _epipolar_distance(first, second, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
     textured = gradient > max(np.quantile(gradient, 0.6), 8.0)
+    if agrees[textured].sum() < MIN_AGREEING * textured.sum():
+        return None
+    textured &= agrees
     static = np.ones(a.shape, bool)
     if first.static_mask is not None:
         mask = first.static_mask.numpy().astype(np.uint8)
@@ -56,6 +75,22 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
         return None
     dynamic = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
     return Motion(float(np.median(values[0])), dynamic)
+
+
+def are_comparable(first: Camera, second: Camera) -> bool:
+    """Whether the orientations of two cameras are at most ``MAX_ANGLE`` apart."""
+    relative = second.viewmat[:3, :3].double() @ first.viewmat[:3, :3].double().T
+    return float(relative.trace()) >= 1.0 + 2.0 * math.cos(math.radians(MAX_ANGLE))
+
+
+def _leads_back(forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray, "H W 2"]) -> Bool[np.ndarray, "H W"]:
+    """Whether the backward flow at the end of the forward flow is its opposite, up to a pixel and 5 % of its length."""
+    height, width = forward.shape[:2]
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    far = (1e4,) * 4
+    target = x + forward[..., 0], y + forward[..., 1]
+    returned = cv2.remap(backward, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=far)
+    return np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
 
 
 def _grey(frame: Frame, size: tuple[int, int]) -> np.ndarray:
