@@ -105,6 +105,7 @@ DAMAGES = [
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[3]), "frames must be a list"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE is not"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", is_fisheye=True), "fisheye lenses are not supported"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w="wide"), "w must hold numbers"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w=-3), "expected 1 to"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", k4=0.1), "k4 must be 0"),

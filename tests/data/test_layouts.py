@@ -12,7 +12,7 @@ from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json, write_png
 from warpgs.config import MaskPerturbation
 from warpgs.data.loaders import load_capture, recognize
-from warpgs.data.loaders.posed import plain_name, times_of_names
+from warpgs.data.loaders.posed import plain_names, times_of_names
 
 ALL = {**layouts.WRITERS, "colmap as text": layouts.write_text_colmap}
 LAYOUTS = pytest.mark.parametrize("layout", ALL)
@@ -212,9 +212,9 @@ def test_distorted_nerfstudio_images_are_undistorted(edited):
     root = edited("nerfstudio")
     layouts.edit_transforms(root / "transforms.json", k1=0.6)
     capture = load_capture(root)
-    bent = "images_" + layouts.NAMES[-1]  # frames are listed in reverse
+    bent = layouts.NAMES[-1]  # frames are listed in reverse
     assert capture.cameras[bent].K[0, 0] > layouts.FOCAL
-    assert capture.cameras["images_" + layouts.NAMES[1]].K[0, 0] == layouts.FOCAL
+    assert capture.cameras[layouts.NAMES[1]].K[0, 0] == layouts.FOCAL
 
 
 def test_nerfstudio_splits_and_times_are_used(edited):
@@ -225,10 +225,10 @@ def test_nerfstudio_splits_and_times_are_used(edited):
     files = [f"images/{name}.png" for name in layouts.NAMES]
     write_json(root / "transforms.json", {**values, "train_filenames": files[:6], "test_filenames": files[8:]})
     capture = load_capture(root)
-    assert capture.train == tuple(f"images_{name}" for name in layouts.NAMES[:6])
-    assert capture.val == tuple(f"images_{name}" for name in layouts.NAMES[8:])
-    assert capture.cameras["images_frame_00000"].time == 1.0
-    assert capture.cameras["images_frame_00011"].time == 0.0
+    assert capture.train == tuple(layouts.NAMES[:6])
+    assert capture.val == tuple(layouts.NAMES[8:])
+    assert capture.cameras["frame_00000"].time == 1.0
+    assert capture.cameras["frame_00011"].time == 0.0
 
 
 def test_nerfstudio_depth_is_where_points_come_from_if_there_is_no_ply(edited):
@@ -245,7 +245,7 @@ def test_intrinsics_may_be_a_field_of_view_and_the_size_that_of_the_image(edited
             del entry[key]
     fields = {key: value for key, value in values.items() if key not in ("w", "h", "camera_model")}
     write_json(root / "transforms.json", {**fields, "camera_angle_x": 2 * np.arctan(20 / 45)})
-    K = load_capture(root).cameras["images_frame_00000"].K
+    K = load_capture(root).cameras["frame_00000"].K
     assert torch.allclose(K, torch.tensor([[45.0, 0, 20], [0, 45, 12], [0, 0, 1]]))
 
 
@@ -280,5 +280,13 @@ def test_times_are_the_numbers_at_the_end_of_all_names_or_their_order(names, tim
     assert times_of_names(names) == times
 
 
-def test_names_of_images_in_folders_are_plain():
-    assert [plain_name(n) for n in ("a/b.png", "./c.jpg", "../d.e.png")] == ["a_b", "c", "d.e"]
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["images/b.png", "./images/c.d.jpg"], ["b", "c.d"]),
+        (["../x/cam0/1.png", "../x/cam1/1.png"], ["cam0_1", "cam1_1"]),
+        (["a.png", "b/a.png"], ["a", "b_a"]),
+    ],
+)
+def test_names_of_images_in_folders_are_plain(paths, names):
+    assert plain_names(paths) == names

@@ -96,6 +96,4 @@ def pinhole_lens(lens: Lens) -> Lens:
 
 def resized_lens(lens: Lens, width: int, height: int) -> Lens:
     """The lens of images that were resized to another size."""
-    x, y = width / lens.width, height / lens.height
-    focal, center = (lens.focal[0] * x, lens.focal[1] * y), (lens.center[0] * x, lens.center[1] * y)
-    return dataclasses.replace(lens, width=width, height=height, focal=focal, center=center)
+    return lens.resized(width, height)

@@ -16,7 +16,7 @@ from .posed import (
     World,
     every_eighth,
     natural_order,
-    plain_name,
+    plain_names,
     posed_capture,
     times_of_names,
 )
@@ -42,7 +42,7 @@ class ColmapLoader:
             raise ValueError(f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}")
         model = load_model(folder)
         images = sorted(model.images, key=lambda image: natural_order(image.name))
-        names = [plain_name(image.name) for image in images]
+        names = plain_names([image.name for image in images])
         times = times_of_names(names)
         files = _Files(root, factor or 1)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]

@@ -17,7 +17,7 @@ from .posed import (
     World,
     every_eighth,
     natural_order,
-    plain_name,
+    plain_names,
     points_of_depth,
     posed_capture,
     times_of_names,
@@ -46,7 +46,7 @@ class NerfstudioLoader:
         transforms = Transforms(root / INDEX)
         entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
         images = [transforms.image(entry) for entry in entries]
-        names = [plain_name(entry["file_path"]) for entry in entries]
+        names = plain_names([entry["file_path"] for entry in entries])
         times = _times(transforms, entries, names)
         frames = []
         for entry, image, name, time in zip(entries, images, names, times, strict=True):

@@ -191,10 +191,15 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     return [(int(part[:15]), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def plain_name(path: str) -> str:
-    """The id of an image: its path without the suffix, with underscores for slashes."""
-    parts = [part for part in Path(path.replace("\\", "/")).with_suffix("").parts if part not in ("/", "..", ".")]
-    return "_".join(parts).replace("\0", "")
+def plain_names(paths: Sequence[str]) -> list[str]:
+    """Ids of images: their paths without suffixes and folders that all share, with underscores for slashes."""
+    found = []
+    for path in paths:
+        parts = Path(path.replace("\\", "/").replace("\0", "")).with_suffix("").parts
+        found.append([part for part in parts if part not in ("/", "..", ".")])
+    while all(len(parts) > 1 and parts[0] == found[0][0] for parts in found):
+        found = [parts[1:] for parts in found]
+    return ["_".join(parts) for parts in found]
 
 
 def points_of_depth(frames: Sequence[PosedFrame]) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:

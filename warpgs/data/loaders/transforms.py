@@ -44,6 +44,8 @@ class Transforms:
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
         self.frames: list[dict[str, Any]] = frames
+        if self.fields.get("is_fisheye"):  # instant-ngp
+            raise ValueError(f"{path}: fisheye lenses are not supported; undistort the images first")
         for frame in frames:
             model = frame.get("camera_model", self.fields.get("camera_model", "OPENCV"))
             if model not in PERSPECTIVE:
