@@ -66,8 +66,7 @@ def evaluate_run(
 
     align = partial(_align, scene, capture.extent) if run.config.optim.poses else None
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
-    times = [capture.cameras[name].time for name in capture.train]
-    values = {**evaluation.summary(), "jitter": jitter(scene.splats, times), **_training(scene)}
+    values = {**evaluation.summary(), **_motion(scene, capture), **_training(scene)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
@@ -76,6 +75,10 @@ def evaluate_run(
 
 def _align(scene: TrainedScene, extent: float, camera: Camera, truth: torch.Tensor) -> Camera:
     return aligned_camera(scene.splats(camera.time), camera, truth, extent, scene.config.antialias)
+
+
+def _motion(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
+    return {"jitter": jitter(scene.splats, [capture.cameras[name].time for name in capture.train])}
 
 
 def _training(scene: TrainedScene) -> dict[str, Any]:
