@@ -27,6 +27,10 @@ class Prepare:
     """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
     """Number of frames to take; by default all frames of a folder and 150 of a video."""
+    start: float = 0.0
+    """Take frames from this time of a video on [s]."""
+    end: float | None = None
+    """Take frames up to this time of a video [s]."""
     longest_side: int = 960
     """Larger frames are scaled down to this [px]."""
     lens: LensModel = "SIMPLE_RADIAL"
@@ -58,7 +62,7 @@ class Prepare:
             raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
         from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
 
-        selection = Selection(self.fps, self.count, self.longest_side)
+        selection = Selection(self.fps, self.count, self.longest_side, self.start, self.end)
         options = Options(selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
         try:
             prepare(self.source, self.capture, options, force=self.force, log=log)

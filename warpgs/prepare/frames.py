@@ -35,12 +35,14 @@ class SourceFrame:
     Attributes:
         name: Its id in the capture.
         source: Its origin, for messages: the name of a file, or the frame number in a video.
-        step: Its index in the source, which is its time.
+        step: Its index in the source.
+        time: Its time: milliseconds in a video, the index in a folder.
     """
 
     name: str
     source: str
     step: int
+    time: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Frames:
     def load(folder: Path) -> "Frames":
         """The frames that ``take_frames`` wrote."""
         index = read_json(folder / INDEX)
-        taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"])) for f in index["frames"]]
+        taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"]), int(f["time"])) for f in index["frames"]]
         return Frames(folder, taken, int(index["width"]), int(index["height"]))
 
     @property
@@ -87,6 +89,10 @@ def check_selection(selection: Selection) -> None:
         raise ValueError(f"--fps must be positive, got {selection.fps}")
     if selection.count is not None and not MIN_FRAMES <= selection.count <= MAX_FRAMES:
         raise ValueError(f"--count must be {MIN_FRAMES} to {MAX_FRAMES}, got {selection.count}")
+    if not 0.0 <= selection.start < math.inf:
+        raise ValueError(f"--start must be at least 0 seconds, got {selection.start}")
+    if selection.end is not None and not selection.start < selection.end < math.inf:
+        raise ValueError(f"--end must be after --start ({selection.start:g} s), got {selection.end}")
     if not MIN_LONGEST_SIDE <= selection.longest_side <= MAX_SIDE:
         raise ValueError(
             f"--longest-side must be {MIN_LONGEST_SIDE} to {MAX_SIDE} pixels, got {selection.longest_side}"
@@ -116,10 +122,10 @@ def take_frames(
     images = read_folder(source, selection, quiet) if source.is_dir() else read_video(source, selection, quiet, notes)
     taken: list[SourceFrame] = []
     size: tuple[int, int] | None = None
-    for step, origin, image in images:
+    for step, time, origin, image in images:
         size = size or image.shape[1::-1]
         image = _checked(image, f"{source}: {origin}", size, selection.longest_side)
-        taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step))
+        taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step, time))
         write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < MIN_FRAMES:
         raise ValueError(
@@ -156,6 +162,8 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     """
     if selection.fps is not None:
         raise ValueError("--fps is for videos: a folder has no frame rate, use --count")
+    if selection.start or selection.end is not None:
+        raise ValueError("--start and --end are for videos: a folder has no times")
     images = (p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     paths = sorted(images, key=_natural_order)
     if not paths:
@@ -166,7 +174,7 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
-        yield int(best[0]), paths[best[0]].name, best[1]
+        yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1])
 
 
 def _natural_order(path: Path) -> tuple[list[str | int], str]:

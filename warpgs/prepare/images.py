@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from warpgs.data.images import decode
 
@@ -28,8 +28,8 @@ def read_images(folder: Path, names: Iterable[str]) -> Iterator[UInt8[np.ndarray
 
 
 def resize_to_side(
-    image: UInt8[np.ndarray, "H W 3"], side: int, max_factor: float = math.inf
-) -> UInt8[np.ndarray, "h w 3"]:
+    image: UInt8[np.ndarray, "H W 3"] | UInt16[np.ndarray, "H W 3"], side: int, max_factor: float = math.inf
+) -> UInt8[np.ndarray, "h w 3"] | UInt16[np.ndarray, "h w 3"]:
     """The image scaled by at most ``max_factor`` so that its longer side has ``side`` pixels."""
     height, width = image.shape[:2]
     factor = min(max_factor, side / max(width, height))
@@ -47,5 +47,9 @@ def brighten(images: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[UInt8[np.ndar
 
 def sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
     """Variance of the Laplacian of an image's grey levels (Pech-Pacheco et al. 2000)."""
-    grey = cv2.cvtColor(resize_to_side(image, SHARPNESS_SIDE, max_factor=1.0), cv2.COLOR_RGB2GRAY)
+    return grey_sharpness(cv2.cvtColor(resize_to_side(image, SHARPNESS_SIDE, max_factor=1.0), cv2.COLOR_RGB2GRAY))
+
+
+def grey_sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
+    """The same of grey levels, whose longer side has at most ``SHARPNESS_SIDE`` pixels."""
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())

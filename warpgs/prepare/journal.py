@@ -19,7 +19,7 @@ OUTPUTS = (
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
-VERSION = 2
+VERSION = 3
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
 
 STATE = "state.json"
@@ -91,17 +91,22 @@ class Journal:
         return "finished" in self._done
 
     def step(self, name: str, work: Callable[[], str]) -> None:
-        """Runs ``work``, which returns a summary of its result, unless the step of this name is finished."""
+        """Runs ``work``, which returns a summary of its result, unless the step of this name is finished.
+
+        The summary is logged, and so are the notes that ``work`` appended.
+        """
         if name in self._done:
-            summary, when = self._done[name]["result"], "finished before"
+            summary, when, noted = self._done[name]["result"], "finished before", len(self.notes)
         else:
-            start = time.perf_counter()
+            start, noted = time.perf_counter(), len(self.notes)
             summary = work()
             seconds = round(time.perf_counter() - start, 1)
             self._done[name] = {"seconds": seconds, "result": summary}
             self._save()
             when = f"{seconds:.1f} s"
         self.log(f"{name}: {summary} ({when})")
+        for note in self.notes[noted:]:
+            self.log(f"note: {note}")
 
     def result(self, name: str, load: Callable[[Path], Result], make: Callable[[Path], str]) -> Result:
         """The result of a step.

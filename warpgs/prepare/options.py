@@ -20,11 +20,14 @@ class Selection:
         fps: Frames per second of a video; None to use ``count``.
         count: Number of frames; None for all frames of a folder and 150 of a video.
         longest_side: Larger frames are scaled down to it [px].
+        start, end: Part of a video to take them from [s from its first frame]; None for its end.
     """
 
     fps: float | None = None
     count: int | None = None
     longest_side: int = 960
+    start: float = 0.0
+    end: float | None = None
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ def prepare(
         with journal.explain_full_disk():
             _run_steps(source, options, journal)
     report = journal.report()
-    for note in report["notes"]:
+    for note in report["notes"] if was_finished else []:  # the steps have logged them otherwise
         journal.log(f"note: {note}")
     sheets = "masks.png" if options.depth == "none" else "masks.png and depth.png"
     done = f"{root} is finished: look at {sheets} in it, then run warpgs check {root}"

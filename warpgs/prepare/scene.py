@@ -52,7 +52,7 @@ def write_capture(root: Path, frames: Frames, cameras: Cameras, masks: Masks, *,
     if omitted:
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)))
-    write_scene(root, cameras, {frame.name: frame.step for frame in frames.taken}, holdout)
+    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
     if fraction > DOUBTFUL_FRACTION:
         notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
@@ -138,13 +138,13 @@ def write_frames(
     return images
 
 
-def write_scene(root: Path, cameras: Cameras, steps: dict[str, int], holdout: int) -> None:
+def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: int) -> None:
     """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
 
     Args:
         root: Folder of the capture.
         cameras: Cameras with static points only.
-        steps: Index in the source of each frame.
+        times: Time of each frame, see ``SourceFrame``.
         holdout: Every N-th frame is for evaluation; 0 for none.
 
     Raises:
@@ -154,6 +154,6 @@ def write_scene(root: Path, cameras: Cameras, steps: dict[str, int], holdout: in
     depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
     near, far = np.quantile(depths[depths > 0], [0.001, 0.999]) * units.scale
     writer.write_scene(root, units, cameras.points, 0.5 * near, 2.0 * far)
-    first = steps[cameras.names[0]]
-    times = {name: steps[name] - first for name in cameras.names}
-    writer.write_index(root, times, held_out(cameras.names, holdout))
+    first = times[cameras.names[0]]
+    time_ids = {name: times[name] - first for name in cameras.names}
+    writer.write_index(root, time_ids, held_out(cameras.names, holdout))

@@ -1,22 +1,25 @@
-"""Reads the frames of a video file: the sharpest frame of each interval."""
+"""Reads the frames of a video file with PyAV: the sharpest frame of each interval, with its time; names cuts."""
 
-import os
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from fractions import Fraction
+from itertools import islice
 from pathlib import Path
+from typing import Any, NamedTuple
 
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # damaged files are reported below, in one line
-import cv2
+import av
 import numpy as np
+from jaxtyping import UInt8
 
 from warpgs.data.images import MAX_SIDE
 from warpgs.files import require_file
 from warpgs.progress import progress
 
-from .images import sharpness
-from .options import MAX_FRAMES, Selection
-
-DEFAULT_FRAMES = 150
-"""Number of frames taken from a video if neither a rate nor a number is given."""
+from .cuts import CutFinder
+from .images import SHARPNESS_SIDE, grey_sharpness
+from .options import Selection
+from .timeline import Timeline, plan_timeline
+from .video_colors import to_rgb
 
 MIN_DECODED_FRACTION = 0.95
 """Fraction of a video's nominal frames below which a note says that it ends early."""
@@ -25,87 +28,144 @@ MAX_BYTES = 1 << 42
 """Maximum size of a video [bytes]; it is decoded frame by frame."""
 
 MAX_COUNTED = 1_000_000
-"""Frames after which counting stops."""
+"""Maximum number of frames of a video; later ones are ignored."""
 
-TakenImage = tuple[int, str, np.ndarray]
-"""Index in the source, origin for messages, and [H, W, 3] RGB image."""
+READ_LOCAL_FILES = {"protocol_whitelist": "file"}
+"""Playlists must not make FFmpeg open addresses."""
+
+
+class TakenImage(NamedTuple):
+    """A frame of a video or a folder.
+
+    Attributes:
+        step: Its index in the source.
+        time: Its time: milliseconds from the first frame of a video, or the index in a folder.
+        origin: Its origin, for messages.
+        image: [H, W, 3] RGB.
+    """
+
+    step: int
+    time: int
+    origin: str
+    image: UInt8[np.ndarray, "H W 3"]
 
 
 def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]) -> Iterator[TakenImage]:
-    """The sharpest frame of each interval of a video.
+    """The sharpest frame of each interval of a video, rotated as it is tagged, in 8-bit sRGB.
 
     Args:
         source: The video.
-        selection: Rate or number of frames.
+        selection: Rate or number of frames, and the part of the video.
         quiet: Whether to show no progress.
-        notes: Messages for the user are appended to it.
+        notes: Messages for the user are appended to it: cuts, and a video that ends early.
 
     Raises:
-        ValueError: If it cannot be decoded, or has too many frames or no rate.
+        ValueError: If it cannot be decoded, has too many frames, no rate, or none in the selected part.
     """
-    video = _open(source)
-    try:
-        total, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), video.get(cv2.CAP_PROP_FPS)
-        if total <= 0:
-            total = _count_frames(source)
-        if selection.fps is not None and not rate > 0:
-            raise ValueError(f"{source} has no frame rate: use --count instead of --fps")
-        wanted = selection.count or DEFAULT_FRAMES
-        interval = rate / selection.fps if selection.fps is not None else total / wanted
-        interval = max(1.0, interval)
-        if total / interval > MAX_FRAMES:
-            raise ValueError(f"{source} gives {int(total / interval)} frames, the maximum is {MAX_FRAMES}")
-        yield from _sharpest(source, video, total, interval, quiet, notes)
-    finally:
-        video.release()
-
-
-def _sharpest(
-    source: Path, video: cv2.VideoCapture, total: int, interval: float, quiet: bool, notes: list[str]
-) -> Iterator[TakenImage]:
-    """The sharpest frame of each interval; keeps only the best and the current frame in memory."""
-    best: tuple[float, int, np.ndarray] | None = None
-    current = 0
-    for step in progress(range(total), "frames", quiet):
-        decoded, image = video.read()
-        if not decoded:
-            if step < MIN_DECODED_FRACTION * total:  # containers often count a few frames too many
-                notes.append(f"{source} should have {total} frames, only {step} could be decoded: is it truncated?")
-            break
-        if int(step / interval) != current and best is not None:
-            yield best[1], f"frame {best[1]}", best[2]
-            best, current = None, int(step / interval)
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-        score = sharpness(image) if interval > 1.0 else 0.0
-        if best is None or score > best[0]:
-            best = (score, step, image)
-    if best is None:
-        raise ValueError(f"{source} is not a video that can be decoded: it has no frames")
-    yield best[1], f"frame {best[1]}", best[2]
-
-
-def _open(source: Path) -> cv2.VideoCapture:
     require_file(source, MAX_BYTES)
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    stamps, nominal = _time_stamps(source, selection)
+    timeline = plan_timeline(str(source), [stamp - stamps[0] for stamp in stamps], selection)
+    cuts, decoded, best, current = CutFinder(), 0, (-1.0, Fraction(0), None), -1
+    with _open(source) as (container, stream):
+        frames = _decode(container, stream, stamps, timeline)
+        for _, (time, frame) in zip(progress(timeline.intervals, "frames", quiet), frames, strict=False):
+            if timeline.intervals[time] != current:
+                if decoded:
+                    yield _taken(best[1], best[2], stream, timeline, selection)
+                current, best = timeline.intervals[time], (-1.0, time, frame)
+            decoded += 1
+            grey = _grey(frame)
+            cuts.add(timeline.steps[time], float(time), grey)
+            best = max(best, (grey_sharpness(grey), time, frame), key=lambda candidate: candidate[0])
+        if not decoded:
+            raise ValueError(f"{source} is not a video that can be decoded: it has no frames")
+        yield _taken(best[1], best[2], stream, timeline, selection)
+    expected = len(timeline.intervals) + max(0, nominal - len(stamps))
+    if decoded < MIN_DECODED_FRACTION * expected:  # containers often count a few frames too many
+        notes.append(f"{source} should have {expected} frames, only {decoded} could be decoded: is it truncated?")
+    notes.extend(
+        f"{source} has a cut at frame {step} ({time:.2f} s): use --start or --end" for step, time in cuts.found
+    )
+
+
+def _taken(time: Fraction, frame: Any, stream: Any, timeline: Timeline, selection: Selection) -> TakenImage:
+    image = to_rgb(frame, int(stream.codec_context.color_trc or 0), selection.longest_side)
+    step = timeline.steps[time]
+    return TakenImage(step, round(1000 * time), f"frame {step}", image)
+
+
+def _grey(frame: Any) -> UInt8[np.ndarray, "h w"]:
+    """[h, w] grey levels of a frame, not rotated, at the size that sharpness is measured at."""
+    factor = min(1.0, SHARPNESS_SIDE / max(frame.width, frame.height))
+    width, height = max(1, round(frame.width * factor)), max(1, round(frame.height * factor))
+    return frame.reformat(width=width, height=height, format="gray", interpolation="AREA").to_ndarray()
+
+
+@contextmanager
+def _open(source: Path) -> Iterator[tuple[Any, Any]]:
+    """The container and its video stream.
+
+    Raises:
+        ValueError: If it is not a video, or its frames are too large.
+    """
+    unusable = ValueError(f"{source} is not a video that can be decoded, and not a folder of frames")
     try:
-        video = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
-    finally:
-        cv2.utils.logging.setLogLevel(before)
-    if not video.isOpened():
-        raise ValueError(f"{source} is not a video that can be decoded, and not a folder of frames")
-    size = [video.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
-    if not 0 < min(size) <= max(size) <= MAX_SIDE:
-        video.release()
-        raise ValueError(f"{source} claims frames of {size[0]:.0f}×{size[1]:.0f} pixels, the maximum is {MAX_SIDE}")
-    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)  # phones store upright videos rotated, with a tag
-    return video
+        container = av.open(str(source), options=READ_LOCAL_FILES)
+    except (av.FFmpegError, ValueError) as error:
+        raise unusable from error
+    with container:
+        if not container.streams.video:
+            raise unusable
+        stream = container.streams.video[0]
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
+            raise ValueError(f"{source} claims frames of {width}×{height} pixels, the maximum is {MAX_SIDE}")
+        stream.thread_type = "AUTO"
+        yield container, stream
 
 
-def _count_frames(source: Path) -> int:
-    """The number of frames of a video that does not state it."""
-    video, count = _open(source), 0
-    while count < MAX_COUNTED and video.grab():
-        count += 1
-    video.release()
-    return count
+def _time_stamps(source: Path, selection: Selection) -> tuple[list[Fraction], int]:
+    """The time stamps of all frames [s], ascending, from the packets, and the number of frames that the file states."""
+    with _open(source) as (container, stream):
+        stamps: list[Fraction | None] = []
+        with suppress(av.FFmpegError):  # the packets before the damage are used
+            for packet in islice(container.demux(stream), MAX_COUNTED):
+                if packet.size and not packet.is_discard:
+                    stamps.append(_seconds(packet.pts if packet.pts is not None else packet.dts, stream))
+        known = {stamp for stamp in stamps if stamp is not None}
+        if len(known) == len(stamps) > 0:
+            return sorted(known), stream.frames
+        rate = stream.average_rate
+        if not stamps:
+            raise ValueError(f"{source} is not a video that can be decoded: it has no frames")
+        if not rate and selection.fps is not None:
+            raise ValueError(f"{source} has no frame rate: use --count instead of --fps")
+        return [Fraction(k) / (Fraction(str(rate)) if rate else 1) for k in range(len(stamps))], stream.frames
+
+
+def _seconds(stamp: int | None, stream: Any) -> Fraction | None:
+    return None if stamp is None else stamp * Fraction(str(stream.time_base))
+
+
+def _decode(container: Any, stream: Any, stamps: list[Fraction], timeline: Timeline) -> Iterator[tuple[Fraction, Any]]:
+    """Times and frames of the selected part, in order; damaged frames are skipped."""
+    begin = next(iter(timeline.intervals))
+    known = set(stamps)
+    if begin > 0:
+        with suppress(av.FFmpegError):  # then it is decoded from its start
+            container.seek(int((begin + stamps[0]) / Fraction(str(stream.time_base))), stream=stream)
+    last, index = Fraction(-1), 0
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            continue
+        for frame in frames:
+            stamp = _seconds(frame.pts, stream)
+            if stamp not in known:  # no usable time stamps: count
+                stamp = stamps[min(index, len(stamps) - 1)]
+            index += 1
+            time = stamp - stamps[0]
+            if time in timeline.intervals and time > last:
+                last = time
+                yield time, frame
