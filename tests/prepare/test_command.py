@@ -1,5 +1,6 @@
 """``warpgs prepare`` on the command line."""
 
+import signal
 import subprocess
 import sys
 
@@ -26,6 +27,17 @@ def test_after_an_interrupt_the_message_says_how_to_continue(tmp_path, capsys, m
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", interrupted)
     assert main(["prepare", str(shots), str(tmp_path / "capture")]) == 130
     assert "run the same command again to continue" in capsys.readouterr().err
+
+
+def test_sigterm_ends_with_one_line_while_colmap_runs(tmp_path):
+    shots = boards.write_folder(tmp_path / "shots", boards.record(24)[0])
+    command = [sys.executable, "-m", "warpgs", "prepare", str(shots), str(tmp_path / "made")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith("frames: 24")
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == "warpgs: interrupted; run the same command again to continue\n"
 
 
 def test_only_existing_contact_sheets_are_mentioned(tmp_path, capsys, monkeypatch):

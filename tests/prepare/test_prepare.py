@@ -17,11 +17,10 @@ from warpgs.data.check import check_capture
 from warpgs.data.lens import undistort
 from warpgs.data.loaders import load_capture
 from warpgs.prepare import pipeline
-from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.cameras import Cameras, NoCamerasError
 from warpgs.prepare.given_masks import read_dynamic
 from warpgs.prepare.journal import Journal
 from warpgs.prepare.options import Options, Selection
-from warpgs.prepare.sfm import NoCamerasError
 
 
 def prepare(source, root, force=False, **options):
@@ -365,7 +364,7 @@ def test_colmap_does_not_start_on_a_full_disk(shots, tmp_path, monkeypatch):
     ("error", "falls_back"), [(NoCamerasError("few features"), True), (ValueError("COLMAP failed"), False)]
 )
 def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, falls_back, shots, tmp_path, monkeypatch):
-    def recover(folder, names, work, settings):
+    def recover(folder, names, work, settings, quiet):
         if settings.masks is not None:
             raise error
         return true_cameras(folder, names)

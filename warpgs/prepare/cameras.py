@@ -15,6 +15,13 @@ from warpgs.files import read_bounded
 MAX_BYTES = 1 << 30
 """Maximum size of a file of cameras and points [bytes]."""
 
+MISLED = 0.7
+"""Reprojection error without dynamic regions over that with them, below which dynamic objects misled the cameras."""
+
+
+class NoCamerasError(ValueError):
+    """The cameras cannot be recovered from the frames."""
+
 
 @dataclass(frozen=True)
 class Cameras:

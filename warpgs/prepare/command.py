@@ -1,8 +1,12 @@
 """The command ``warpgs prepare``."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import FrameType
 
 import tyro
 
@@ -65,6 +69,21 @@ class Prepare:
         selection = Selection(self.fps, self.count, self.longest_side, self.start, self.end)
         options = Options(selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
         try:
-            prepare(self.source, self.capture, options, force=self.force, log=log)
+            with _terminable():
+                prepare(self.source, self.capture, options, force=self.force, log=log)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Lets SIGTERM end the command as Ctrl-C does, so that COLMAP's process ends and the message says how to go on."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

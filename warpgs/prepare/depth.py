@@ -46,8 +46,10 @@ DEPTHS: dict[str, DepthMethod | None] = {
 """Values of ``--depth``. A new method is a new file and a line here."""
 
 
-def add_depth(root: Path, cameras: Cameras, method: DepthMethod, weights: Path | None, quiet: bool) -> str:
-    """Estimates the depth of a capture's frames and writes it, with the contact sheet depth.png; returns a summary.
+def add_depth(
+    root: Path, cameras: Cameras, method: DepthMethod, weights: Path | None, quiet: bool
+) -> tuple[str, list[str]]:
+    """Estimates the depth of a capture's frames and writes it, with the contact sheet depth.png.
 
     Args:
         root: Folder of the capture.
@@ -55,6 +57,9 @@ def add_depth(root: Path, cameras: Cameras, method: DepthMethod, weights: Path |
         method: How to estimate depth.
         weights: Folder with the networks' weights; None for the Hugging Face cache.
         quiet: Whether to show no progress.
+
+    Returns:
+        A summary, and notes: the frames without any known depth.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
@@ -68,7 +73,10 @@ def add_depth(root: Path, cameras: Cameras, method: DepthMethod, weights: Path |
     chosen = choose_evenly(len(planes))
     sheet = contact_sheet([colored_depth(planes[k]) for k in chosen], [cameras.names[k] for k in chosen])
     write_png(root / "depth.png", sheet)
-    return f"known on {np.mean([np.isfinite(plane).mean() for plane in planes]):.0%} of the pixels"
+    known = [float(np.isfinite(plane).mean()) for plane in planes]
+    unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
+    notes = [f"depth is unknown everywhere in {', '.join(unknown)}"] if unknown else []
+    return f"known on {np.mean(known):.0%} of the pixels", notes
 
 
 def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:

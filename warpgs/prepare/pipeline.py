@@ -6,17 +6,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from .cameras import Cameras
+from .cameras import MISLED, Cameras, NoCamerasError
 from .checks import check_options
 from .journal import Journal
 from .masks import MASKERS, Masks
 from .options import Options
 from .scene import DOUBTFUL_FRACTION
-from .sfm import NoCamerasError
 from .steps import Steps, take
-
-MISLED = 0.7
-"""Reprojection error of the second pass over that of the first, below which dynamic objects misled the first pass."""
 
 MAX_DYNAMIC_FRACTION = 0.6
 """Fraction of dynamic pixels above which the cameras must be wrong."""

@@ -11,6 +11,7 @@ from warpgs.data import writer
 from warpgs.data.lens import undistort
 from warpgs.data.units import scene_units
 from warpgs.files import write_png
+from warpgs.progress import progress
 
 from .cameras import Cameras
 from .contact_sheet import choose_evenly, contact_sheet, overlay_mask
@@ -30,7 +31,16 @@ DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
 
 
-def write_capture(root: Path, frames: Frames, cameras: Cameras, masks: Masks, *, holdout: int, notes: list[str]) -> str:
+def write_capture(
+    root: Path,
+    frames: Frames,
+    cameras: Cameras,
+    masks: Masks,
+    *,
+    holdout: int,
+    notes: list[str],
+    quiet: bool = True,
+) -> str:
     """Writes the capture, and the contact sheet masks.png; returns a summary.
 
     Args:
@@ -40,6 +50,7 @@ def write_capture(root: Path, frames: Frames, cameras: Cameras, masks: Masks, *,
         masks: Masks of these frames.
         holdout: Every N-th frame is for evaluation; 0 for none.
         notes: Messages for the user are appended to it.
+        quiet: Whether to show no progress.
 
     Raises:
         ValueError: If too few static points remain, or no frame for evaluation.
@@ -51,7 +62,7 @@ def write_capture(root: Path, frames: Frames, cameras: Cameras, masks: Masks, *,
     omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
     if omitted:
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
-    shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)))
+    shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
     write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
     if fraction > DOUBTFUL_FRACTION:
@@ -109,6 +120,7 @@ def write_frames(
     cameras: Cameras,
     dynamic: Sequence[Bool[np.ndarray, "H W"]],
     shown: Collection[int] = (),
+    quiet: bool = True,
 ) -> dict[int, UInt8[np.ndarray, "H W 3"]]:
     """Writes undistorted images and masks in full and half size, and the camera of every frame.
 
@@ -118,6 +130,7 @@ def write_frames(
         cameras: Cameras of the frames.
         dynamic: [H, W] dynamic mask of each undistorted frame.
         shown: Indices of the images to return.
+        quiet: Whether to show no progress.
 
     Returns:
         [H, W, 3] undistorted images by index.
@@ -127,7 +140,8 @@ def write_frames(
         OSError: If a file cannot be written; the message names it.
     """
     lens, images = cameras.undistorted().lens, {}
-    for k, image in enumerate(read_images(folder, cameras.names)):
+    originals = read_images(folder, cameras.names)
+    for k, image in zip(progress(range(len(cameras.names)), "capture", quiet), originals, strict=True):
         name, pose = cameras.names[k], cameras.poses[k]
         image = undistort(image, cameras.lens)
         writer.write_image(root, name, image, FACTORS)

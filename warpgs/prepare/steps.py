@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from .cameras import Cameras
+from .cameras import Cameras, NoCamerasError
 from .checks import check_count
 from .depth import DEPTHS, add_depth
 from .frames import Frames, take_frames
@@ -14,7 +14,7 @@ from .journal import Journal
 from .masks import MASKERS, Masks, find_masks, write_masks
 from .options import Options
 from .scene import write_capture
-from .sfm import NoCamerasError, Settings, recover_cameras
+from .sfm import Settings, recover_cameras
 
 MIN_SPACE = 100
 """Disk space that is required before any frame is taken [MB]."""
@@ -72,8 +72,10 @@ class Steps:
         return self.journal.result(name, Cameras.load, make)
 
     def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
-        """The cameras of the first pass, recovered again from features outside of the masks."""
-        settings = Settings(self.options.lens, masks.folder, thorough=True, weak_features=first.weak_features)
+        """The cameras of the first pass, refined with the matches outside of the masks."""
+        settings = Settings(
+            self.options.lens, masks.folder, thorough=True, weak_features=first.weak_features, refine=True
+        )
 
         def make(path: Path) -> str:
             try:
@@ -119,8 +121,9 @@ class Steps:
 
         def make() -> str:
             self._require_space(IMAGE_BYTES)
-            root, notes = self.journal.root, self.journal.notes
-            return write_capture(root, self.frames, cameras, masks, holdout=self.options.holdout, notes=notes)
+            root, notes, quiet = self.journal.root, self.journal.notes, self.journal.quiet
+            holdout = self.options.holdout
+            return write_capture(root, self.frames, cameras, masks, holdout=holdout, notes=notes, quiet=quiet)
 
         self.journal.step(name, make)
 
@@ -132,13 +135,17 @@ class Steps:
             if method is None:
                 return "none"
             self._require_space(DEPTH_BYTES)
-            return add_depth(self.journal.root, cameras, method, self.options.weights, self.journal.quiet)
+            journal = self.journal
+            summary, notes = add_depth(journal.root, cameras, method, self.options.weights, journal.quiet)
+            journal.notes.extend(notes)
+            return summary
 
         self.journal.step(name, make)
 
     def _reconstruct(self, names: list[str], settings: Settings) -> Cameras:
         self._require_space(FEATURE_BYTES)
-        return recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings)
+        quiet = self.journal.quiet
+        return recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings, quiet)
 
     def _require_space(self, bytes_per_pixel: int) -> None:
         self.journal.require_space(self.frames.megabytes(bytes_per_pixel))

@@ -1,0 +1,123 @@
+"""COLMAP in a process of its own: what it is asked, what it answers, and how it ends."""
+
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.prepare import boards
+from warpgs.prepare import sfm
+from warpgs.prepare.cameras import NoCamerasError
+from warpgs.prepare.matches import all_pairs, sequence_pairs
+from warpgs.prepare.sfm import Settings, recover_cameras
+
+
+def answer(monkeypatch, code: str) -> None:
+    """Replaces COLMAP's process by some lines of Python."""
+    real = subprocess.Popen
+
+    def start(command, **options):
+        return real([sys.executable, "-c", textwrap.dedent(code)], **options)
+
+    monkeypatch.setattr(sfm.subprocess, "Popen", start)
+
+
+def test_a_crash_is_one_line_with_its_signal(tmp_path, monkeypatch):
+    answer(monkeypatch, 'import os, sys; print(\'{"label": "a", "done": 1, "total": 2}\'); os.abort()')
+    with pytest.raises(ValueError, match=r"^COLMAP failed on .*: its process ended with SIGABRT$"):
+        recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
+
+
+def test_a_full_disk_is_named_as_such(tmp_path, monkeypatch):
+    class Usage:
+        free = 1000
+
+    answer(monkeypatch, "import os; os.abort()")
+    monkeypatch.setattr(sfm.shutil, "disk_usage", lambda path: Usage)
+    with pytest.raises(OSError, match="No space left on device"):
+        recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
+
+
+@pytest.mark.parametrize(("unsuitable", "kind"), [("true", NoCamerasError), ("false", ValueError)])
+def test_errors_come_back_with_their_kind(unsuitable, kind, tmp_path, monkeypatch):
+    answer(monkeypatch, f'print(\'{{"error": "too dark", "unsuitable": {unsuitable}}}\')')
+    with pytest.raises(ValueError, match="too dark") as caught:
+        recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
+    assert type(caught.value) is kind
+
+
+def test_an_interrupt_ends_the_process(tmp_path, monkeypatch):
+    started = []
+    real = subprocess.Popen
+
+    def start(command, **options):
+        started.append(
+            real([sys.executable, "-c", 'print(\'{"label": "a"}\', flush=True); input(); input()'], **options)
+        )
+        return started[0]
+
+    def interrupted(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sfm.subprocess, "Popen", start)
+    monkeypatch.setattr(sfm.json, "loads", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
+    assert started[0].returncode == -signal.SIGKILL
+
+
+def test_colmap_ends_when_the_process_that_started_it_ends(tmp_path):
+    """The input of COLMAP's process closes; it must not go on for minutes."""
+    code = "from warpgs.prepare import colmap; colmap.run = lambda *_: __import__('time').sleep(60); colmap.main()"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    job = '{"folder": "", "names": [], "work": "", "lens": "", "masks": null, "thorough": false, '
+    job += '"weak_features": false, "refine": false}\n'
+    start = time.monotonic()
+    process.communicate(job.encode(), timeout=50)
+    assert time.monotonic() - start < 50
+    assert process.returncode == 1
+
+
+def test_frames_are_matched_with_the_next_ones_and_at_powers_of_two():
+    assert sequence_pairs(3) == all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
+    assert [b for a, b in sequence_pairs(100) if a == 0] == [*range(1, 11), 16, 32, 64]
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory) -> Path:
+    """A camera that pans over a picture."""
+    folder, wide = tmp_path_factory.mktemp("pan"), boards.texture(3, (150, 140, 120), 900, (40, 120))
+    frames = []
+    K = np.array([[boards.FOCAL, 0, 128], [0, boards.FOCAL, 96], [0, 0, 1.0]])
+    start = np.array([[1, 0, -(900 - 256) / 2], [0, 1, -(900 - 192) / 2], [0, 0, 1.0]])
+    for k in range(12):
+        turn = boards.cv2.Rodrigues(np.array([0.01 * np.sin(k), 0.05 * (k - 6), 0.0]))[0]
+        frames.append(boards.cv2.warpPerspective(wide, K @ turn @ np.linalg.inv(K) @ start, boards.SIZE))
+    return boards.write_folder(folder, frames)
+
+
+def test_a_camera_that_only_turns_is_refused_and_named(turning, tmp_path):
+    names = [path.stem for path in sorted(turning.iterdir())]
+    with pytest.raises(NoCamerasError, match=r"the camera only turns: a rotation explains \d+% of the matches"):
+        recover_cameras(turning, names, tmp_path / "work", Settings(thorough=False))
+    assert not (tmp_path / "work/model").exists()  # it was refused before mapping
+
+
+def test_refinement_uses_the_features_of_the_first_pass(tmp_path):
+    images, masks = boards.record(12)
+    frames = boards.write_folder(tmp_path / "shots", images)
+    names = [path.stem for path in sorted(frames.iterdir())]
+    for name, mask in zip(names, masks, strict=True):
+        boards.cv2.imwrite(str(tmp_path / f"{name}.png.png"), np.where(mask, 0, 255).astype(np.uint8))
+    first = recover_cameras(frames, names, tmp_path / "work", Settings(thorough=False))
+    extracted = (tmp_path / "work/features.done").stat().st_mtime_ns
+    refined = recover_cameras(frames, names, tmp_path / "work", Settings(masks=tmp_path, refine=True))
+    assert (tmp_path / "work/features.done").stat().st_mtime_ns == extracted
+    assert refined.names == names
+    assert refined.error < first.error
+    assert abs(refined.lens.focal[0] / boards.FOCAL - 1.0) < 0.03

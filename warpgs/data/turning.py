@@ -1,0 +1,106 @@
+"""Recognises a camera that only turns: one rotation per pair of frames explains how all pixels move.
+
+Without parallax depth is undetermined, whatever a reconstruction says. With the ray r = K⁻¹ (u, v, 1) of a pixel, a
+camera that turns by R moves the pixel to K R r. R is estimated from matches by iteratively reweighted Procrustes
+alignment of unit rays, so that a minority of dynamic matches does not count. An unknown focal length is the one of a
+few that explains most.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+TOLERANCE = 0.003
+"""Distance of a match from where the rotation moves it that counts as explained, relative to the longer side."""
+
+MIN_EXPLAINED = 0.8
+"""Fraction of the matches of a pair that are explained if the camera only turns."""
+
+LEAST_PAIRS = 0.3
+"""Fraction of the pairs that may be explained worse."""
+
+MIN_MATCHES, MIN_PAIRS, MAX_PAIRS = 50, 8, 40
+"""Minimum number of matches of a pair and of pairs, and maximum number of pairs that are examined."""
+
+MIN_DISPLACEMENT = 0.005
+"""Median displacement of the widest pairs, relative to the longer side, below which the camera stands still."""
+
+FOCALS, FINE_FOCALS = np.geomspace(0.4, 5.0, 12), np.geomspace(0.85, 1.18, 7)
+"""Focal lengths that are tried, relative to the longer side, and then relative to the best of these."""
+
+NUM_REWEIGHTINGS = 6
+
+Matches = tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]
+"""Positions of the same points in two frames [px from the image's corner]."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How well turning alone explains the pairs of frames.
+
+    Attributes:
+        explained: Fraction of the matches that a rotation explains, in the pair at the ``LEAST_PAIRS`` quantile.
+        displacement: Median displacement in the examined pairs, relative to the longer side.
+    """
+
+    explained: float
+    displacement: float
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether nothing shows that the camera moves at all."""
+        return self.displacement < MIN_DISPLACEMENT
+
+    @property
+    def only_turns(self) -> bool:
+        """Whether the camera turns without changing its position."""
+        return not self.stands_still and self.explained >= MIN_EXPLAINED
+
+
+def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float | None = None) -> Turning | None:
+    """How well turning explains the widest pairs of frames; None if too few pairs have enough matches.
+
+    Args:
+        pairs: Matches of pairs of frames, inliers of an epipolar geometry.
+        size: (width, height) of the frames [px].
+        focal: Focal length [px]; None if unknown.
+    """
+    longest, center = max(size), np.array(size) / 2.0
+    usable = [(a, b) for a, b in pairs if len(a) >= MIN_MATCHES]
+    if len(usable) < MIN_PAIRS:
+        return None
+    wide = sorted(usable, key=_displacement, reverse=True)[: max(MIN_PAIRS, min(len(usable) // 3, MAX_PAIRS))]
+    displacement = float(np.median([_displacement(pair) for pair in wide])) / longest
+    tolerance = TOLERANCE * longest
+
+    def explained(focal: float, pairs: Sequence[Matches]) -> float:
+        return float(np.quantile([_explained(pair, focal, center, tolerance) for pair in pairs], LEAST_PAIRS))
+
+    if focal is None:
+        coarse = max(FOCALS * longest, key=lambda f: explained(f, wide[::3]))
+        focal = max(coarse * FINE_FOCALS, key=lambda f: explained(f, wide[::3]))
+    return Turning(explained(focal, wide), displacement)
+
+
+def _displacement(pair: Matches) -> float:
+    return float(np.median(np.linalg.norm(pair[0] - pair[1], axis=1)))
+
+
+def _explained(pair: Matches, focal: float, center: np.ndarray, tolerance: float) -> float:
+    """Fraction of the matches that the best rotation explains."""
+    a, b = (_unit_rays(positions, focal, center) for positions in pair)
+    weights = np.ones(len(a))
+    for _ in range(NUM_REWEIGHTINGS):
+        u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
+        turned = a @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
+        expected = focal * turned[:, :2] / np.maximum(turned[:, 2:], 1e-6) + center  # no ray at 90° from the axis
+        errors = np.linalg.norm(expected - pair[1], axis=1)
+        weights = 1.0 / (1.0 + (errors / tolerance) ** 2) ** 2
+    return float((errors < tolerance).mean())
+
+
+def _unit_rays(positions: np.ndarray, focal: float, center: np.ndarray) -> np.ndarray:
+    rays = np.concatenate([(positions - center) / focal, np.ones((len(positions), 1))], 1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -1,0 +1,280 @@
+"""Runs COLMAP (pycolmap) in a process of its own: features, matches, mapping, refinement. ``sfm`` starts it.
+
+The process reads a job as one line of JSON, and ends when its input ends. It writes lines of JSON: progress
+(``label``, ``done``, ``total``), and at last an ``error`` or the ``result``. Features and matches stay in the work
+folder, so that they are computed once, whatever is masked later.
+"""
+
+import json
+import os
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401  pycolmap before OpenCV breaks OpenCV's PNG files: both bring a zlib (seen with 5.0 and 4.2)
+import pycolmap
+
+from warpgs.data.turning import find_turning
+
+from .cameras import MISLED, NoCamerasError
+from .matches import all_pairs, keep_static, revisit_pairs, sequence_pairs, verified_matches
+from .model import cameras_of_model
+
+FALLBACK_FRAMES = 250
+"""Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
+
+MAX_FEATURES = 4096
+"""Maximum number of features per frame; the time for matching grows with its square."""
+
+WEAK_PEAK = 0.002
+"""Minimum contrast of weak features; COLMAP's default is 0.0067."""
+
+MIN_FEATURES = 60
+"""Minimum number of features per frame; with fewer, the frames lack texture."""
+
+ENOUGH = 0.9
+"""Fraction of the frames with cameras below which another way to find them is tried."""
+
+CHUNK = 16
+"""Number of frames whose features are extracted, or that are matched with others, between two reports."""
+
+MAX_ERROR, MIN_TRIANGULATION_ANGLE = 4.0, 1.5
+"""Of the points that are kept while cameras are refined, as in incremental mapping [px, degrees]."""
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do.
+
+    Attributes:
+        folder: Folder of the frames <name>.png.
+        names: Names of the frames.
+        work: Folder for the database and the reconstruction.
+        lens: COLMAP's lens model.
+        masks: Folder of masks <name>.png.png, 0 = dynamic.
+        thorough: Whether to match frames far apart in time that see the same points, and to refine with them.
+        weak_features: Whether to use features of low contrast.
+        refine: Whether to refine the reconstruction in the work folder instead of mapping from nothing, unless that
+            shows that it was misled.
+    """
+
+    folder: str
+    names: list[str]
+    work: str
+    lens: str
+    masks: str | None
+    thorough: bool
+    weak_features: bool
+    refine: bool
+
+    @property
+    def database(self) -> Path:
+        """Database of all features and matches."""
+        return Path(self.work) / ("weak.db" if self.weak_features else "features.db")
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the images."""
+        return [f"{name}.png" for name in self.names]
+
+
+def run(job: Job, report: Report) -> Any:
+    """COLMAP's reconstruction of the frames.
+
+    Raises:
+        NoCamerasError: If the frames are not suitable; the message says why and what to try.
+    """
+    work = Path(job.work)
+    pycolmap.set_random_seed(0)
+    _extract_and_match(job, report)
+    database = _static_database(job)
+    model_folder = work / "model"
+    model = pycolmap.Reconstruction(model_folder) if job.refine else None
+    if model is not None:
+        error = model.compute_mean_reprojection_error()
+        model = _refine(job, model, report)
+        if model.compute_mean_reprojection_error() < MISLED * error:
+            model = None  # dynamic objects had misled the cameras: refined, they stay near what they were
+    if model is None:
+        _check_parallax(job, database)
+        model = _map(job, database, report)
+        if model is not None and job.thorough:
+            model = _refine(job, model, report)
+    if model is None:
+        raise NoCamerasError(
+            "no two frames show enough of the same static surfaces from different positions: move the camera sideways, "
+            "slower and past textured objects, or take frames closer in time (--fps, --count)"
+        )
+    if not job.refine:
+        model_folder.mkdir(exist_ok=True)
+        model.write(model_folder)
+    return model
+
+
+def _extract_and_match(job: Job, report: Report) -> None:
+    """Features and matches along the sequence, unless they are in the database."""
+    finished = job.database.with_suffix(".done")
+    if finished.exists():
+        return
+    job.database.unlink(missing_ok=True)
+    reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reading.camera_model = job.lens
+    extraction.sift.max_num_features = MAX_FEATURES
+    extraction.sift.max_num_orientations = 1
+    if job.weak_features:
+        extraction.sift.peak_threshold = WEAK_PEAK
+    files, single = job.files, pycolmap.CameraMode.SINGLE
+    for start in range(0, len(files), CHUNK):
+        report("features", start, len(files))
+        chunk = files[start : start + CHUNK]
+        pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
+        reading.existing_camera_id = 1
+    _match(job, sequence_pairs(len(files)), report)
+    finished.touch()
+
+
+def _match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
+    """Matches the features of pairs of frames; those that are in the database already are skipped by COLMAP."""
+    listed = job.database.with_suffix(".pairs.txt")
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = listed
+    step = max(1, len(pairs) * CHUNK // max(len(job.names), 1))
+    for start in range(0, len(pairs), step):
+        report("matches", start, len(pairs))
+        lines = [f"{job.files[a]} {job.files[b]}\n" for a, b in pairs[start : start + step]]
+        listed.write_text("".join(lines))
+        pycolmap.match_image_pairs(job.database, pairing_options=options, device=pycolmap.Device.cpu)
+
+
+def _static_database(job: Job) -> Path:
+    """A copy of the database with the matches in static regions of the job's frames."""
+    database = job.database.with_suffix(".static.db")
+    shutil.copyfile(job.database, database)
+    features = keep_static(database, None if job.masks is None else Path(job.masks), job.files)
+    if features < MIN_FEATURES:
+        raise NoCamerasError(
+            f"the frames have hardly any texture in static regions: {features:.0f} features per frame, at least "
+            f"{MIN_FEATURES} are needed; record textured objects, in more light, or check the masks"
+        )
+    return database
+
+
+def _check_parallax(job: Job, database: Path) -> None:
+    turning = find_turning(*verified_matches(database))
+    if turning is None:
+        return
+    if turning.stands_still:
+        raise NoCamerasError(
+            f"the camera stands still: static surfaces move by {turning.displacement:.1%} of the image at most; depth "
+            "is undetermined; move the camera sideways"
+        )
+    if turning.only_turns:
+        raise NoCamerasError(
+            f"the camera only turns: a rotation explains {turning.explained:.0%} of the matches between frames, so "
+            "depth is undetermined; walk around the scene or move the camera sideways instead of turning on the spot"
+        )
+
+
+def _map(job: Job, database: Path, report: Report) -> Any:
+    """The reconstruction with the most frames, by incremental, else global mapping, else with all pairs; or None."""
+    count, attempts = len(job.names), [_map_incrementally(job, database, report)]
+    if _size(attempts[0]) < ENOUGH * count:
+        attempts.append(_map_globally(job, database, report))
+        if max(map(_size, attempts)) < ENOUGH * count <= ENOUGH * FALLBACK_FRAMES:
+            _match(job, all_pairs(count), report)
+            attempts.append(_map_incrementally(job, _static_database(job), report))
+    return max(attempts, key=_size)
+
+
+def _size(model: Any) -> int:
+    return 0 if model is None else int(model.num_reg_images())
+
+
+def _mapping_options() -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    return options
+
+
+def _map_incrementally(job: Job, database: Path, report: Report) -> Any:
+    placed = [1]
+
+    def count() -> None:
+        placed[0] = min(placed[0] + 1, len(job.names))  # a second reconstruction counts from there
+        report("cameras", placed[0], len(job.names))
+
+    report("cameras", 0, len(job.names))
+    models = pycolmap.incremental_mapping(
+        database, job.folder, _empty(job, "mapping"), _mapping_options(), next_image_callback=count
+    )
+    return max(models.values(), key=_size, default=None)
+
+
+def _map_globally(job: Job, database: Path, report: Report) -> Any:
+    report("cameras, by global mapping", 0, len(job.names))
+    try:
+        models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"))
+    except (RuntimeError, ValueError):  # it raises if it finds no geometry
+        return None
+    return max(models.values(), key=_size, default=None)
+
+
+def _refine(job: Job, model: Any, report: Report) -> Any:
+    """The reconstruction with points triangulated again from static matches, revisits included, and adjusted."""
+    if job.thorough:
+        _match(job, revisit_pairs(model, job.files), report)
+    report("refinement", 0, 1)
+    options = _mapping_options()
+    model = pycolmap.triangulate_points(
+        model, _static_database(job), job.folder, _empty(job, "refinement"), clear_points=True, options=options
+    )
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.print_summary = False
+    for _ in range(2):
+        pycolmap.bundle_adjustment(model, adjustment)
+        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_TRIANGULATION_ANGLE)
+    model.normalize()  # adjustment keeps the distance of two cameras, however wrong it was
+    return model
+
+
+def _empty(job: Job, name: str) -> Path:
+    folder = Path(job.work) / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def main() -> None:
+    """Does the job on the standard input; ends when the input ends, because then the parent process has ended."""
+    job = Job(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    pycolmap.logging.minloglevel = 4  # errors are raised as exceptions
+
+    def write(**fields: Any) -> None:
+        sys.stdout.write(json.dumps(fields) + "\n")
+        sys.stdout.flush()
+
+    try:
+        model = run(job, lambda label, done, total: write(label=label, done=done, total=total))
+        cameras_of_model(model, job.names, job.weak_features).save(Path(job.work) / "cameras")
+    except NoCamerasError as error:
+        write(error=str(error), unsuitable=True)
+    except (RuntimeError, IndexError, ValueError, OSError) as error:
+        write(error=str(error), unsuitable=False)
+    else:
+        write(result="cameras")
+
+
+def _end_with_input() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()

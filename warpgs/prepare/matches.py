@@ -1,0 +1,131 @@
+"""Pairs of frames to match, and COLMAP's matches: those in static regions, and those that show parallax."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float
+
+from warpgs.data.turning import Matches
+
+OVERLAP = 10
+"""Number of next frames that each frame is matched with, in addition to those at powers of two."""
+
+NUM_REVISITS = 3
+"""Number of frames far away in time that a frame is matched with, if they see the same points."""
+
+MIN_SHARED = 0.5
+"""Fraction of a frame's points in the image of a frame far away in time, from which on the two are matched."""
+
+Pair = tuple[int, int]
+
+
+def sequence_pairs(count: int) -> list[Pair]:
+    """Pairs of each frame with the next ones and those at powers of two, as indices, the first frame in order."""
+    offsets = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(OVERLAP))})
+    return [(a, a + offset) for a in range(count) for offset in offsets if a + offset < count]
+
+
+def all_pairs(count: int) -> list[Pair]:
+    """All pairs, as indices."""
+    return [(a, b) for a in range(count) for b in range(a + 1, count)]
+
+
+def revisit_pairs(model: Any, names: list[str]) -> list[Pair]:
+    """Pairs of frames far apart in time that see the same points, according to a reconstruction.
+
+    Args:
+        model: COLMAP's reconstruction.
+        names: Names of the images, in temporal order.
+    """
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    points = {key: point.xyz for key, point in model.points3D.items()}
+    frames = [(k, images[name]) for k, name in enumerate(names) if name in images]
+    seen = [[points[p.point3D_id] for p in image.points2D if p.has_point3D()] for _, image in frames]
+    shared = np.zeros((len(frames), len(frames)))
+    for row, positions in enumerate(seen):
+        for column, (_, image) in enumerate(frames):
+            if positions:
+                shared[row, column] = _visible(np.array(positions), image).mean()
+    shared = np.minimum(shared, shared.T)
+    pairs = set()
+    for row, (index, _) in enumerate(frames):
+        score = shared[row].copy()
+        score[[abs(other - index) <= OVERLAP for other, _ in frames]] = 0.0
+        for _ in range(NUM_REVISITS):
+            best = int(score.argmax())
+            if score[best] < MIN_SHARED:
+                break
+            pairs.add((min(index, frames[best][0]), max(index, frames[best][0])))
+            score[[abs(other - frames[best][0]) < OVERLAP // 2 for other, _ in frames]] = 0.0
+    return sorted(pairs)
+
+
+def _visible(points: Float[np.ndarray, "P 3"], image: Any) -> Bool[np.ndarray, " P"]:
+    """[P] whether points project into an image, its distortion neglected."""
+    pose, camera = image.cam_from_world().matrix(), image.camera
+    in_camera = points @ pose[:, :3].T + pose[:, 3]
+    depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.inf)
+    half = np.array([camera.width, camera.height]) / (2.0 * camera.mean_focal_length())
+    return (in_camera[:, 2] > 0) & (np.abs(in_camera[:, :2] / depth[:, None]) < half).all(1)
+
+
+def keep_static(database: Path, masks: Path | None, names: list[str]) -> float:
+    """Removes matches of other images, and those in dynamic regions; returns the mean number of static features.
+
+    Args:
+        database: COLMAP's database, which is changed.
+        masks: Folder of masks <image>.png, 0 = dynamic; None if nothing is.
+        names: Names of the images to keep.
+    """
+    opened = pycolmap.Database.open(database)
+    try:
+        static = {i.image_id: _static(opened, i, masks, i.name in names) for i in opened.read_all_images()}
+        for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(key)
+            matches = np.asarray(geometry.inlier_matches)
+            keep = static[a][matches[:, 0]] & static[b][matches[:, 1]] if len(matches) else np.zeros(0, bool)
+            if not keep.all():
+                geometry.inlier_matches = matches[keep]
+                opened.update_two_view_geometry(a, b, geometry)
+    finally:
+        opened.close()
+    return sum(int(kept.sum()) for kept in static.values()) / len(names)
+
+
+def _static(opened: Any, image: Any, masks: Path | None, is_wanted: bool) -> Bool[np.ndarray, " K"]:
+    """[K] whether each feature of an image is in a static region."""
+    positions = _positions(opened, image.image_id)
+    if not is_wanted or masks is None:
+        return np.full(len(positions), is_wanted)
+    mask = cv2.imread(str(masks / f"{image.name}.png"), cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise ValueError(f"{masks / image.name}.png is missing or damaged")
+    column, row = np.clip(positions.astype(int), 0, [mask.shape[1] - 1, mask.shape[0] - 1]).T
+    return mask[row, column] > 0
+
+
+def verified_matches(database: Path) -> tuple[list[Matches], tuple[int, int]]:
+    """Positions of the matches of every verified pair, and (width, height) of the images."""
+    opened = pycolmap.Database.open(database)
+    try:
+        camera = opened.read_all_cameras()[0]
+        positions = {i.image_id: _positions(opened, i.image_id) for i in opened.read_all_images()}
+        geometries = zip(*opened.read_two_view_geometries(), strict=True)
+        return [_matched(positions, key, g) for key, g in geometries], (camera.width, camera.height)
+    finally:
+        opened.close()
+
+
+def _matched(positions: Mapping[int, np.ndarray], key: int, geometry: Any) -> Matches:
+    a, b = pycolmap.pair_id_to_image_pair(key)
+    matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+    return positions[a][matches[:, 0]], positions[b][matches[:, 1]]
+
+
+def _positions(opened: Any, image: int) -> Float[np.ndarray, "K 2"]:
+    features = np.asarray(opened.read_keypoints(image), np.float64)
+    return features[:, :2] if features.size else np.zeros((0, 2))

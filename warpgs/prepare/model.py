@@ -1,0 +1,85 @@
+"""COLMAP's reconstruction as cameras, if it is good enough to train on."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpgs.data.lens import Lens
+
+from .cameras import Cameras, NoCamerasError
+
+MIN_REGISTERED = 0.5
+"""Minimum fraction of the frames that get a camera."""
+
+MIN_ANGLE = 1.0
+"""Minimum of the median triangulation angle [degrees]; with less, depth is undetermined."""
+
+MIN_POINTS = 100
+"""Minimum number of points; a camera that only rotates gives some by chance."""
+
+MAX_ERROR = 2.0
+"""Maximum mean reprojection error of a point [px]; others are omitted."""
+
+
+def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Cameras:
+    """The cameras and the reliable points of a reconstruction.
+
+    Args:
+        model: COLMAP's reconstruction.
+        names: Frames that cameras were wanted for.
+        weak_features: Whether features of low contrast were used.
+
+    Raises:
+        NoCamerasError: If there are too few, or the camera hardly moves.
+    """
+    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
+    if len(images) < max(MIN_REGISTERED * len(names), 3):
+        raise NoCamerasError(
+            f"cameras were found for only {len(images)} of {len(names)} frames: too much moves, the camera moves too "
+            "fast, or the frames have too little texture; try more frames (--fps, --count), a slower part of the "
+            "video, or masks of what moves (--masks FOLDER)"
+        )
+    poses = np.array([i.cam_from_world().matrix() for i in images])
+    points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= MAX_ERROR]
+    found = Cameras(
+        [Path(i.name).stem for i in images],
+        _lens(images[0].camera),
+        poses,
+        np.array([p.xyz for p in points]).reshape(-1, 3),
+        float(model.compute_mean_reprojection_error()),
+        _angle(model, points),
+        weak_features,
+    )
+    if found.angle < MIN_ANGLE or len(points) < MIN_POINTS:
+        raise NoCamerasError(
+            f"the camera hardly moves: {len(points)} points at a median triangulation angle of {found.angle:.1f}° were "
+            f"found; at least {MIN_POINTS} and {MIN_ANGLE}° are needed; walk around the scene instead of turning on "
+            "the spot"
+        )
+    return found
+
+
+def _angle(model: Any, points: list[Any]) -> float:
+    """Median triangulation angle of some points [degrees]: the largest angle between two rays to a point."""
+    largest = []
+    for point in points[:: max(1, len(points) // 500)]:
+        centers = [model.images[e.image_id].projection_center() for e in point.track.elements]
+        rays = np.array(centers) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        largest.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
+    return float(np.median(largest)) if largest else 0.0
+
+
+def _lens(camera: Any) -> Lens:
+    """COLMAP's camera as a lens; both measure from the corner of the image."""
+    v: dict[str, float] = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
+    focal = v.get("fx", v.get("f", 0.0))
+    return Lens(
+        camera.width,
+        camera.height,
+        (focal, v.get("fy", focal)),
+        (v["cx"], v["cy"]),
+        (v.get("k1", v.get("k", 0.0)), v.get("k2", 0.0), 0.0),
+        (v.get("p1", 0.0), v.get("p2", 0.0)),
+    )
