@@ -5,10 +5,12 @@ import pytest
 
 from tests.prepare import boards
 from warpgs.data.writer import write_depth
-from warpgs.prepare.depth import as_half
+from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.depth import add_depth, as_half
 from warpgs.prepare.flow import Flows
 from warpgs.prepare.flow_depth import static_depth
 from warpgs.prepare.images import brighten
+from warpgs.prepare.methods import DepthMethod
 from warpgs.prepare.motion_masks import clean, find_dynamic, outline, vote
 from warpgs.prepare.posed_frames import PosedFrames
 from warpgs.prepare.triangulation import Observation, fill_unknown, triangulate
@@ -80,7 +82,7 @@ def test_neighbours_are_near_and_in_both_directions(frames):
 
 def test_a_flow_is_computed_once_until_both_frames_are_released(video, monkeypatch):
     flows, computed = Flows(video[0][:3]), []
-    monkeypatch.setattr(flows, "compute", lambda a, b: computed.append(1) or np.zeros((*a.shape, 2), np.float32))
+    monkeypatch.setattr(flows, "compute", lambda a, b, start: computed.append(1) or np.zeros((*a.shape, 2), np.float32))
     for pair in ((0, 1), (1, 2), (0, 1), (2, 0), (0, 1)):
         flows.flow(*pair)
     assert len(computed) == 3
@@ -94,15 +96,41 @@ def test_a_flow_is_computed_once_until_both_frames_are_released(video, monkeypat
     assert len(computed) == 4
 
 
+def test_flow_that_starts_where_the_cameras_say_is_right_over_wide_steps(video, frames):
+    """Eight frames apart, the wall moves by a fifth of the image."""
+    truth = np.stack([boards.depth(boards.pose(k / 23)) for k in range(24)])
+    agreeing = {}
+    for expected in (None, frames.expected_flow):
+        flows = Flows(brighten(frames.images), expected)
+        shares = []
+        for a, b in ((2, 10), (8, 16), (14, 22)):
+            rotation, translation = frames.relative(a, b)
+            points = frames.rotated_rays(rotation) * truth[a] + translation[:, None, None]
+            column, row = frames.lens.image(points[0] / points[2], points[1] / points[2])
+            x, y, _ = flows.track(a, b)
+            inside = (column > 0) & (column < 256) & (row > 0) & (row < 192) & ~video[1][a]
+            shares.append((np.hypot(x + 0.5 - column, y + 0.5 - row) < 1.0)[inside].mean())
+        agreeing[expected is None] = np.mean(shares)
+    assert agreeing[False] > 0.6
+    assert agreeing[False] > agreeing[True] + 0.1
+
+
+def test_expected_flow_is_exact_on_a_plane_at_the_median_depth():
+    poses = np.stack([np.eye(4)[:3], np.eye(4)[:3]])
+    poses[1, 0, 3] = -0.5
+    plane = PosedFrames([np.zeros((192, 256, 3), np.uint8)] * 2, boards.lens(), poses, np.array([[0.0, 0.0, 5.0]] * 5))
+    assert np.allclose(plane.expected_flow(0, 1), [-0.5 * boards.FOCAL / 5.0, 0.0], atol=1e-3)
+
+
 @pytest.mark.parametrize("estimate", ["masks", "depth"])
 def test_every_flow_is_computed_once(estimate, video, frames, monkeypatch):
     compute, pairs = Flows.compute, []
 
-    def counted(self, a, b):
+    def counted(self, a, b, *start):
         indices = [next((k for k, plane in enumerate(self.planes) if plane is image), None) for image in (a, b)]
         if None not in indices:  # else the image is warped, see ``Revisits``
             pairs.append(tuple(indices))
-        return compute(self, a, b)
+        return compute(self, a, b, *start)
 
     monkeypatch.setattr(Flows, "compute", counted)
     find_dynamic(frames) if estimate == "masks" else static_depth(frames, video[1])
@@ -143,6 +171,19 @@ def test_depth_is_unknown_in_dynamic_regions(video, frames):
 def test_depth_without_a_known_pixel_is_written_as_unknown(tmp_path):
     write_depth(tmp_path, "a", as_half(np.full((4, 5), np.nan, np.float32)))
     assert np.isnan(np.load(tmp_path / "depth/1x/a.npy")).all()
+
+
+def test_a_frame_without_any_depth_is_named(tmp_path):
+    boards.write_capture(tmp_path, 4)
+    names = [f"shot{k:03d}" for k in range(4)]
+    cameras = Cameras(names, boards.lens(), boards.poses(4), boards.points(), 0.1, 10.0)
+
+    def estimate(frames: PosedFrames, dynamic: object, weights: None, quiet: bool) -> list[np.ndarray]:
+        return [np.full((192, 256), np.nan if k == 2 else 0.5, np.float32) for k in range(4)]
+
+    summary, notes = add_depth(tmp_path, cameras, DepthMethod(estimate), None, True)
+    assert summary == "known on 75% of the pixels"
+    assert notes == ["depth is unknown everywhere in shot002"]
 
 
 def test_dark_images_are_brightened_to_middle_grey_and_black_ones_stay_black(video):

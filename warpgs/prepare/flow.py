@@ -1,7 +1,7 @@
 """Dense optical flow between the frames of a video."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -14,7 +14,8 @@ class Flows:
     """Optical flow (DIS, Kroeger et al. 2016) between frames of one size. It is thread-safe.
 
     The flow between two frames is needed only while one of them is processed; it is computed once and kept until
-    ``release`` was called for both.
+    ``release`` was called for both. DIS searches near the flow that it starts from: with the flow that the cameras
+    predict, it finds wide displacements that it misses otherwise.
 
     Attributes:
         grey: [H, W] grey levels of every frame.
@@ -22,7 +23,18 @@ class Flows:
         x, y: [H, W] column and row of every pixel.
     """
 
-    def __init__(self, images: Sequence[UInt8[np.ndarray, "H W 3"]]) -> None:
+    def __init__(
+        self,
+        images: Sequence[UInt8[np.ndarray, "H W 3"]],
+        expected: Callable[[int, int], Float[np.ndarray, "H W 2"]] | None = None,
+    ) -> None:
+        """Prepares the images.
+
+        Args:
+            images: [H, W, 3] of every frame.
+            expected: The flow from one frame to another to start from; from none if None.
+        """
+        self._expected = expected
         contrast = cv2.createCLAHE(2.0, (8, 8))
         self.grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
         self.planes = [contrast.apply(plane) for plane in self.grey]
@@ -34,11 +46,16 @@ class Flows:
         self._lock = threading.Lock()
         self._released: set[int] = set()
 
-    def compute(self, a: UInt8[np.ndarray, "H W"], b: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 2"]:
-        """[H, W, 2] displacement of every pixel of plane a in plane b [px]."""
+    def compute(
+        self,
+        a: UInt8[np.ndarray, "H W"],
+        b: UInt8[np.ndarray, "H W"],
+        start: Float[np.ndarray, "H W 2"] | None = None,
+    ) -> Float[np.ndarray, "H W 2"]:
+        """[H, W, 2] displacement of every pixel of plane a in plane b [px], found from ``start`` on."""
         if not hasattr(self._engines, "dis"):
             self._engines.dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        return self._engines.dis.calc(a, b, None)
+        return self._engines.dis.calc(a, b, start)
 
     def flow(self, a: int, b: int) -> Float[np.ndarray, "H W 2"]:
         """[H, W, 2] displacement of every pixel of frame a in frame b [px]."""
@@ -47,7 +64,8 @@ class Flows:
         with lock:  # another thread may be computing this flow
             flow = self._flows.get((a, b))
             if flow is None:
-                flow = self.compute(self.planes[a], self.planes[b]).astype(np.float16)
+                start = None if self._expected is None else self._expected(a, b)
+                flow = self.compute(self.planes[a], self.planes[b], start).astype(np.float16)
                 self._flows[a, b] = flow
         return flow.astype(np.float32)
 

@@ -38,7 +38,7 @@ def static_depth(
         dynamic: [H, W] dynamic mask of each frame.
         quiet: Whether to show no progress.
     """
-    flows, indices = Flows(brighten(frames.images)), range(len(frames.images))
+    flows, indices = Flows(brighten(frames.images), frames.expected_flow), range(len(frames.images))
 
     def local(frame: int) -> LocalGeometry:
         found = triangulate(frames.observations(frame, flows), frames.lens.focal[0])

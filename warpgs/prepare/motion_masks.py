@@ -84,7 +84,7 @@ def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarra
         quiet: Whether to show no progress.
     """
     images, indices = brighten(frames.images), range(len(frames.images))
-    flows = Flows(images)
+    flows = Flows(images, frames.expected_flow)
     labs = [cv2.cvtColor(image, cv2.COLOR_RGB2LAB) for image in images]
     found = map_frames(_Finder(frames, flows, labs, Revisits(frames, flows)).find, indices, "motion", quiet)
     segments, carried = [s for s, _ in found], [c for _, c in found if c is not None]

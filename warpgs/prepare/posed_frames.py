@@ -13,7 +13,7 @@ from warpgs.data.lens import Lens
 from .cameras import Cameras, resized_lens
 from .flow import Flows
 from .images import read_images, resize_to_side
-from .triangulation import Observation
+from .triangulation import MIN_RELATIVE_DEPTH, Observation
 
 PARALLAX = (4.0, 8.0, 16.0)
 """Parallax that the neighbours in each temporal direction should have [px of an image 512 wide]."""
@@ -89,6 +89,25 @@ class PosedFrames:
                     break
                 chosen.append(frame + step * offset)
         return chosen
+
+    def expected_flow(self, a: int, b: int) -> Float[np.ndarray, "H W 2"]:
+        """[H, W, 2] displacement of the pixels of a in b, if all were at the points' median depth [px].
+
+        It is no longer than the image is wide; zero where that would be behind the camera.
+        """
+        depths = self.points @ self.poses[a, 2, :3] + self.poses[a, 2, 3]
+        depths = depths[depths > 0]
+        rho = 1.0 / float(np.median(depths)) if len(depths) else 0.0
+        rotation, translation = self.relative(a, b)
+        rotated = self.rotated_rays(rotation)
+        depth = rotated[2] + rho * translation[2]
+        front = depth > MIN_RELATIVE_DEPTH
+        depth[~front] = 1.0
+        x, y = (rotated[0] + rho * translation[0]) / depth, (rotated[1] + rho * translation[1]) / depth
+        column, row = self.lens.image(x, y)
+        start = np.meshgrid(np.arange(self.lens.width) + 0.5, np.arange(self.lens.height) + 0.5)
+        flow = np.where(front[..., None], np.stack([column - start[0], row - start[1]], -1), 0.0)
+        return np.clip(flow, -self.lens.width, self.lens.width).astype(np.float32)
 
     def observations(self, frame: int, flows: Flows) -> list[Observation]:
         """Where the frame's neighbours observe its pixels, by optical flow between the images."""
