@@ -57,6 +57,14 @@ def test_every_dataset_is_read_completely(tmp_path, dataset, files):
     assert f"{files} have depth" in notes
 
 
+def test_images_of_a_camera_that_only_turns_are_an_error_whatever_its_poses(root):
+    for path, image in zip(sorted((root / "rgb/1x").iterdir()), boards.pan(16), strict=True):
+        cv2.imwrite(str(path), image)
+    report = check_capture(root)
+    assert "the camera only turns: a rotation explains" in texts(report, "error")
+    assert not report.is_fit
+
+
 def test_inverted_masks_are_an_error(root):
     for path in (root / "resized_mask/1x").iterdir():
         cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))

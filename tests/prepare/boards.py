@@ -95,6 +95,18 @@ def record(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tup
     return images, masks
 
 
+def pan(num_frames: int) -> list[np.ndarray]:
+    """[H, W, 3] images of a camera that only turns, over a picture."""
+    wide = texture(3, (150, 140, 120), 900, (40, 120))
+    K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1.0]])
+    crop = np.array([[1, 0, -(900 - SIZE[0]) / 2], [0, 1, -(900 - SIZE[1]) / 2], [0, 0, 1.0]])
+    images = []
+    for k in range(num_frames):
+        turn = cv2.Rodrigues(np.array([0.01 * np.sin(k), 0.6 * (k / num_frames - 0.5), 0.0]))[0]
+        images.append(cv2.warpPerspective(wide, K @ turn @ np.linalg.inv(K) @ crop, SIZE))
+    return images
+
+
 def poses(num_frames: int = 24) -> np.ndarray:
     """[F, 3, 4] poses of the video's frames."""
     return np.array([pose(k / (num_frames - 1)) for k in range(num_frames)])

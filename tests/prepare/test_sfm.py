@@ -91,14 +91,7 @@ def test_frames_are_matched_with_the_next_ones_and_at_powers_of_two():
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
     """A camera that pans over a picture."""
-    folder, wide = tmp_path_factory.mktemp("pan"), boards.texture(3, (150, 140, 120), 900, (40, 120))
-    frames = []
-    K = np.array([[boards.FOCAL, 0, 128], [0, boards.FOCAL, 96], [0, 0, 1.0]])
-    start = np.array([[1, 0, -(900 - 256) / 2], [0, 1, -(900 - 192) / 2], [0, 0, 1.0]])
-    for k in range(12):
-        turn = boards.cv2.Rodrigues(np.array([0.01 * np.sin(k), 0.05 * (k - 6), 0.0]))[0]
-        frames.append(boards.cv2.warpPerspective(wide, K @ turn @ np.linalg.inv(K) @ start, boards.SIZE))
-    return boards.write_folder(folder, frames)
+    return boards.write_folder(tmp_path_factory.mktemp("pan"), boards.pan(12))
 
 
 def test_a_camera_that_only_turns_is_refused_and_named(turning, tmp_path):

@@ -19,6 +19,7 @@ from .capture import MIN_EXTENT, Capture, Frame
 from .depth_alignment import DepthProblem, align_to_points, alignment_problem, is_unusable, relative_errors
 from .loaders import load_capture, recognize
 from .motion_check import are_comparable, motion_between
+from .turning_check import turning_of
 
 Level = Literal["error", "warning", "note"]
 
@@ -105,7 +106,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
         return Report(root, [Finding("error", "files", str(error))])
     findings = [Finding("note", "layout", f"read as {dataset or recognize(root)}"), *_counts(capture), *_files(capture)]
     if not any(f.level == "error" for f in findings):
-        findings += [*_geometry(capture, SAMPLES), *_depth(capture), *_motion(capture)]
+        findings += [*_geometry(capture, SAMPLES), *_turning(capture), *_depth(capture), *_motion(capture)]
     return Report(root, findings)
 
 
@@ -203,6 +204,18 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
         text = f"contrast at the points is {ratio:.2f} times that of the images"
         hint = ": points and cameras may not match the images" if low else ""
         yield Finding("warning" if low else "note", "points", text + hint)
+
+
+def _turning(capture: Capture) -> Iterator[Finding]:
+    """Whether the images show parallax at all."""
+    names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+    found = turning_of([capture.frame(name) for name in _sampled(names, SAMPLES)])
+    if found is not None and found.only_turns:
+        text = (
+            f"the camera only turns: a rotation explains {found.explained:.0%} of the matches between frames, so depth "
+            "and positions are undetermined; move the camera sideways"
+        )
+        yield Finding("error", "cameras", text)
 
 
 def _points_at_cameras(capture: Capture, cameras: list[Camera]) -> Iterator[Finding]:

@@ -32,8 +32,8 @@ FOCALS, FINE_FOCALS = np.geomspace(0.4, 5.0, 12), np.geomspace(0.85, 1.18, 7)
 
 NUM_REWEIGHTINGS = 6
 
-Matches = tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]
-"""Positions of the same points in two frames [px from the image's corner]."""
+Matches = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]
+"""[M, 2] positions of the same points in two frames [px from the image's corner]."""
 
 
 @dataclass(frozen=True)

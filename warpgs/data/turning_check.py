@@ -1,0 +1,69 @@
+"""Tells from a capture's images whether its camera only turns, whatever its cameras say."""
+
+import itertools
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from .capture import Frame
+from .turning import MIN_MATCHES, Matches, Turning, find_turning
+
+COMPARED_SIDE = 512
+"""Images are scaled down to this longer side [px]."""
+
+MAX_STEP = 4
+"""Frames are matched with this many of the next sampled ones: with those far away they share less."""
+
+MAX_FEATURES = 1000
+
+MAX_RATIO = 0.8
+"""Distance of the best match over that of the second (Lowe 2004)."""
+
+MAX_EPIPOLAR_ERROR = 2.0
+"""Of the matches that count [px]."""
+
+
+def turning_of(frames: Sequence[Frame]) -> Turning | None:
+    """How well turning alone explains the images in static regions; None if that cannot be told.
+
+    Args:
+        frames: Some frames in temporal order, evenly spread.
+    """
+    sizes = {frame.camera.size for frame in frames}
+    if len(sizes) != 1:
+        return None
+    width, height = sizes.pop()
+    factor = min(1.0, COMPARED_SIDE / max(width, height))
+    size = round(width * factor), round(height * factor)
+    features = [_features(frame, size) for frame in frames]
+    pairs = [p for p in itertools.combinations(range(len(frames)), 2) if p[1] - p[0] <= MAX_STEP]
+    matches = [found for a, b in pairs if (found := _match(features[a], features[b])) is not None]
+    return find_turning(matches, size)
+
+
+def _features(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions [K, 2] and SIFT descriptors [K, 128] of an image's static region."""
+    grey = cv2.resize(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    mask = None
+    if frame.static_mask is not None:
+        mask = cv2.resize(frame.static_mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
+    points, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, mask)
+    return np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5, descriptors
+
+
+def _match(a: tuple[np.ndarray, np.ndarray | None], b: tuple[np.ndarray, np.ndarray | None]) -> Matches | None:
+    """Matches that fit an epipolar geometry; None if there are too few."""
+    if a[1] is None or b[1] is None or min(len(a[0]), len(b[0])) < MIN_MATCHES:
+        return None
+    candidates = cv2.BFMatcher().knnMatch(a[1], b[1], k=2)
+    good = [best for best, second in candidates if best.distance < MAX_RATIO * second.distance]
+    if len(good) < MIN_MATCHES:
+        return None
+    first, second = a[0][[m.queryIdx for m in good]], b[0][[m.trainIdx for m in good]]
+    cv2.setRNGSeed(0)
+    _, inliers = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, MAX_EPIPOLAR_ERROR, 0.999)
+    if inliers is None:
+        return None
+    kept = inliers.ravel() > 0
+    return first[kept], second[kept]
