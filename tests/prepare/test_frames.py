@@ -51,6 +51,7 @@ def test_large_images_are_scaled_down_and_small_ones_kept(tmp_path, images):
     take_frames(shots, tmp_path / "small", Selection(longest_side=128))
     take_frames(shots, tmp_path / "large", Selection(longest_side=5000))
     assert decode(tmp_path / "small/frame_000000.png").shape == (96, 128, 3)
+    assert (Frames.load(tmp_path / "small").factor, Frames.load(tmp_path / "large").factor) == (0.5, 1.0)
     assert np.array_equal(decode(tmp_path / "large/frame_000000.png")[..., ::-1], images[0])
 
 

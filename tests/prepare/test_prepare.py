@@ -300,6 +300,7 @@ def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
     [
         ({"holdout": 1}, "--holdout"),
         ({"holdout": -2}, "--holdout"),
+        ({"focal": -1.0}, "--focal must be positive"),
         ({"masks": "nowhere"}, "--masks must be motion, sam2, none or a folder of masks; nowhere is not a folder"),
         ({"depth": "lidar"}, "--depth must be one of flow, anything, none, got lidar"),
         ({"selection": Selection(count=1)}, "--count"),

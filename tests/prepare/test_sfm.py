@@ -76,7 +76,7 @@ def test_colmap_ends_when_the_process_that_started_it_ends(tmp_path):
     code = "from warpgs.prepare import colmap; colmap.run = lambda *_: __import__('time').sleep(60); colmap.main()"
     process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
     job = '{"folder": "", "names": [], "work": "", "lens": "", "masks": null, "thorough": false, '
-    job += '"weak_features": false, "refine": false}\n'
+    job += '"weak_features": false, "focal": null, "refine": false}\n'
     start = time.monotonic()
     process.communicate(job.encode(), timeout=50)
     assert time.monotonic() - start < 50
@@ -114,3 +114,11 @@ def test_refinement_uses_the_features_of_the_first_pass(tmp_path):
     assert refined.names == names
     assert refined.error < first.error
     assert abs(refined.lens.focal[0] / boards.FOCAL - 1.0) < 0.03
+
+
+def test_a_known_focal_length_is_kept(tmp_path):
+    frames = boards.write_folder(tmp_path / "shots", boards.record(10, moves=False)[0])
+    names = [path.stem for path in sorted(frames.iterdir())]
+    found = recover_cameras(frames, names, tmp_path / "work", Settings(focal=boards.FOCAL))
+    assert found.lens.focal == (boards.FOCAL, boards.FOCAL)
+    assert found.names == names

@@ -1,5 +1,6 @@
 """Checks of the options before a preparation starts, and of the number of frames once they are taken."""
 
+import math
 from pathlib import Path
 
 from .depth import DEPTHS
@@ -21,6 +22,8 @@ def check_options(source: Path, root: Path, options: Options) -> None:
         ImportError: If the package of a network is missing.
     """
     check_selection(options.selection)
+    if options.focal is not None and not 0.0 < options.focal < math.inf:
+        raise ValueError(f"--focal must be positive, got {options.focal}")
     if options.holdout < 0 or options.holdout == 1:
         raise ValueError(f"--holdout must be 0 (none) or at least 2, got {options.holdout}")
     if options.masks not in MASKERS and not Path(options.masks).is_dir():

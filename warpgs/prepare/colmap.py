@@ -60,6 +60,7 @@ class Job:
         masks: Folder of masks <name>.png.png, 0 = dynamic.
         thorough: Whether to match frames far apart in time that see the same points, and to refine with them.
         weak_features: Whether to use features of low contrast.
+        focal: Known focal length [px], which is kept; None to find it.
         refine: Whether to refine the reconstruction in the work folder instead of mapping from nothing, unless that
             shows that it was misled.
     """
@@ -71,6 +72,7 @@ class Job:
     masks: str | None
     thorough: bool
     weak_features: bool
+    focal: float | None
     refine: bool
 
     @property
@@ -125,6 +127,10 @@ def _extract_and_match(job: Job, report: Report) -> None:
     job.database.unlink(missing_ok=True)
     reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reading.camera_model = job.lens
+    if job.focal is not None:
+        first = pycolmap.Bitmap.read(Path(job.folder) / job.files[0], False)
+        camera = pycolmap.Camera.create_from_model_name(1, job.lens, job.focal, first.width, first.height)
+        reading.camera_params = camera.params_to_string()
     extraction.sift.max_num_features = MAX_FEATURES
     extraction.sift.max_num_orientations = 1
     if job.weak_features:
@@ -166,7 +172,7 @@ def _static_database(job: Job) -> Path:
 
 
 def _check_parallax(job: Job, database: Path) -> None:
-    turning = find_turning(*verified_matches(database))
+    turning = find_turning(*verified_matches(database), job.focal)
     if turning is None:
         return
     if turning.stands_still:
@@ -196,9 +202,10 @@ def _size(model: Any) -> int:
     return 0 if model is None else int(model.num_reg_images())
 
 
-def _mapping_options() -> Any:
+def _mapping_options(job: Job) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
+    options.ba_refine_focal_length = job.focal is None
     return options
 
 
@@ -211,7 +218,7 @@ def _map_incrementally(job: Job, database: Path, report: Report) -> Any:
 
     report("cameras", 0, len(job.names))
     models = pycolmap.incremental_mapping(
-        database, job.folder, _empty(job, "mapping"), _mapping_options(), next_image_callback=count
+        database, job.folder, _empty(job, "mapping"), _mapping_options(job), next_image_callback=count
     )
     return max(models.values(), key=_size, default=None)
 
@@ -219,7 +226,9 @@ def _map_incrementally(job: Job, database: Path, report: Report) -> Any:
 def _map_globally(job: Job, database: Path, report: Report) -> Any:
     report("cameras, by global mapping", 0, len(job.names))
     try:
-        models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"))
+        options = pycolmap.GlobalPipelineOptions()
+        options.mapper.bundle_adjustment.refine_focal_length = job.focal is None
+        models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"), options)
     except (RuntimeError, ValueError):  # it raises if it finds no geometry
         return None
     return max(models.values(), key=_size, default=None)
@@ -230,12 +239,13 @@ def _refine(job: Job, model: Any, report: Report) -> Any:
     if job.thorough:
         _match(job, revisit_pairs(model, job.files), report)
     report("refinement", 0, 1)
-    options = _mapping_options()
+    options = _mapping_options(job)
     model = pycolmap.triangulate_points(
         model, _static_database(job), job.folder, _empty(job, "refinement"), clear_points=True, options=options
     )
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
+    adjustment.refine_focal_length = job.focal is None
     for _ in range(2):
         pycolmap.bundle_adjustment(model, adjustment)
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_TRIANGULATION_ANGLE)

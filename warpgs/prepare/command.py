@@ -39,6 +39,8 @@ class Prepare:
     """Larger frames are scaled down to this [px]."""
     lens: LensModel = "SIMPLE_RADIAL"
     """COLMAP's lens model."""
+    focal: float | None = None
+    """Known focal length [px of the source's frames]; found by default."""
     masks: str = "motion"
     """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
     named like the source's files or like the capture's frames."""
@@ -67,7 +69,7 @@ class Prepare:
         from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
 
         selection = Selection(self.fps, self.count, self.longest_side, self.start, self.end)
-        options = Options(selection, self.lens, self.masks, self.depth, self.holdout, self.weights)
+        options = Options(selection, self.lens, self.focal, self.masks, self.depth, self.holdout, self.weights)
         try:
             with _terminable():
                 prepare(self.source, self.capture, options, force=self.force, log=log)

@@ -53,19 +53,21 @@ class Frames:
         folder: Folder of the files.
         taken: The frames, in temporal order.
         width, height: Their size [px].
+        factor: Their size over that of the source.
     """
 
     folder: Path
     taken: list[SourceFrame]
     width: int
     height: int
+    factor: float
 
     @staticmethod
     def load(folder: Path) -> "Frames":
         """The frames that ``take_frames`` wrote."""
         index = read_json(folder / INDEX)
         taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"]), int(f["time"])) for f in index["frames"]]
-        return Frames(folder, taken, int(index["width"]), int(index["height"]))
+        return Frames(folder, taken, int(index["width"]), int(index["height"]), float(index["factor"]))
 
     @property
     def names(self) -> list[str]:
@@ -122,10 +124,10 @@ def take_frames(
     images = read_folder(source, selection, quiet) if source.is_dir() else read_video(source, selection, quiet, notes)
     taken: list[SourceFrame] = []
     size: tuple[int, int] | None = None
-    for step, time, origin, image in images:
-        size = size or image.shape[1::-1]
-        image = _checked(image, f"{source}: {origin}", size, selection.longest_side)
-        taken.append(SourceFrame(f"frame_{len(taken):06d}", origin, step, time))
+    for found in images:
+        size = size or found.image.shape[1::-1]
+        image = _checked(found.image, f"{source}: {found.origin}", size, selection.longest_side)
+        taken.append(SourceFrame(f"frame_{len(taken):06d}", found.origin, found.step, found.time))
         write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < MIN_FRAMES:
         raise ValueError(
@@ -133,8 +135,9 @@ def take_frames(
         )
     height, width = image.shape[:2]
     frames = [asdict(frame) for frame in taken]
-    write_json(folder / INDEX, {"width": width, "height": height, "frames": frames})
-    return Frames(folder, taken, width, height)
+    factor = max(width, height) / found.longest_side
+    write_json(folder / INDEX, {"width": width, "height": height, "factor": factor, "frames": frames})
+    return Frames(folder, taken, width, height, factor)
 
 
 def _checked(image: np.ndarray, origin: str, size: tuple[int, int], longest_side: int) -> np.ndarray:
@@ -174,7 +177,7 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
-        yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1])
+        yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1], max(best[1].shape[:2]))
 
 
 def _natural_order(path: Path) -> tuple[list[str | int], str]:

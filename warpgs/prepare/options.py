@@ -37,6 +37,7 @@ class Options:
     Attributes:
         selection: Frames to take.
         lens: COLMAP's lens model.
+        focal: Known focal length [px of the source]; None to find it.
         masks: A name in ``masks.MASKERS``, or a folder of masks, 0 = dynamic.
         depth: A name in ``depth.DEPTHS``.
         holdout: Every N-th frame is kept for evaluation; 0 for none.
@@ -45,6 +46,7 @@ class Options:
 
     selection: Selection = field(default_factory=Selection)
     lens: LensModel = "SIMPLE_RADIAL"
+    focal: float | None = None
     masks: str = "motion"
     depth: str = "flow"
     holdout: int = 0

@@ -35,6 +35,7 @@ class Settings:
         masks: Folder of masks <name>.png.png; matches are used where they are not 0.
         thorough: Whether to match frames far apart in time that see the same points, and to refine with them.
         weak_features: Whether to use features of low contrast too: more on plain surfaces, but less exact.
+        focal: Known focal length [px]; None to find it.
         refine: Whether to refine the cameras that were recovered last in the work folder instead of starting anew.
     """
 
@@ -42,6 +43,7 @@ class Settings:
     masks: Path | None = None
     thorough: bool = True
     weak_features: bool = False
+    focal: float | None = None
     refine: bool = False
 
 
@@ -69,6 +71,7 @@ def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settin
         "masks": None if settings.masks is None else str(settings.masks.resolve()),
         "thorough": settings.thorough,
         "weak_features": settings.weak_features,
+        "focal": settings.focal,
         "refine": settings.refine and (work / "model").is_dir(),
     }
     code, answer = _run(job, work / LOG, quiet)

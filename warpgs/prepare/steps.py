@@ -64,7 +64,7 @@ class Steps:
         weak_features: bool = False,
     ) -> Cameras:
         """The cameras of the named frames, from features outside of the masks."""
-        settings = Settings(self.options.lens, masks.folder if masks else None, thorough, weak_features)
+        settings = Settings(self.options.lens, masks.folder if masks else None, thorough, weak_features, self._focal)
 
         def make(path: Path) -> str:
             return _save(self._reconstruct(names, settings), path, names)
@@ -74,7 +74,12 @@ class Steps:
     def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
         """The cameras of the first pass, refined with the matches outside of the masks."""
         settings = Settings(
-            self.options.lens, masks.folder, thorough=True, weak_features=first.weak_features, refine=True
+            self.options.lens,
+            masks.folder,
+            thorough=True,
+            weak_features=first.weak_features,
+            focal=self._focal,
+            refine=True,
         )
 
         def make(path: Path) -> str:
@@ -91,6 +96,11 @@ class Steps:
             return f"{len(first.names)} frames, those of the first pass"
 
         return self.journal.result(name, Cameras.load, make)
+
+    @property
+    def _focal(self) -> float | None:
+        """Known focal length of the frames [px]."""
+        return None if self.options.focal is None else self.options.focal * self.frames.factor
 
     def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
         """The masks of the cameras' frames."""

@@ -42,12 +42,14 @@ class TakenImage(NamedTuple):
         time: Its time: milliseconds from the first frame of a video, or the index in a folder.
         origin: Its origin, for messages.
         image: [H, W, 3] RGB.
+        longest_side: Longer side of the frame in the source [px].
     """
 
     step: int
     time: int
     origin: str
     image: UInt8[np.ndarray, "H W 3"]
+    longest_side: int
 
 
 def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]) -> Iterator[TakenImage]:
@@ -91,7 +93,7 @@ def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]
 def _taken(time: Fraction, frame: Any, stream: Any, timeline: Timeline, selection: Selection) -> TakenImage:
     image = to_rgb(frame, int(stream.codec_context.color_trc or 0), selection.longest_side)
     step = timeline.steps[time]
-    return TakenImage(step, round(1000 * time), f"frame {step}", image)
+    return TakenImage(step, round(1000 * time), f"frame {step}", image, max(frame.width, frame.height))
 
 
 def _grey(frame: Any) -> UInt8[np.ndarray, "h w"]:
