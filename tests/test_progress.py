@@ -6,7 +6,7 @@ import select
 import rich
 
 from warpgs import progress as module
-from warpgs.progress import progress
+from warpgs.progress import progress, progress_of_steps
 
 
 def shown_on_a_terminal(monkeypatch, **options):
@@ -20,6 +20,31 @@ def shown_on_a_terminal(monkeypatch, **options):
         sent = os.read(screen, 1 << 16).decode() if select.select([screen], [], [], 0.2)[0] else ""
     os.close(screen)
     return sent
+
+
+def shown_in_steps(monkeypatch, **options) -> str:
+    """The output of two steps on a terminal."""
+    screen, end = os.openpty()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(rich, "_console", None)
+    with open(end, "w") as stream, monkeypatch.context() as patch:
+        patch.setattr(module.sys, "stdout", stream)
+        with progress_of_steps(**options) as show:
+            show("sawing", 1, 4)
+            show("planing", 2, 4)
+        sent = os.read(screen, 1 << 16).decode() if select.select([screen], [], [], 0.2)[0] else ""
+    os.close(screen)
+    return sent
+
+
+def test_the_last_step_is_shown_with_its_share(monkeypatch):
+    sent = shown_in_steps(monkeypatch)
+    assert "planing" in sent
+    assert "50%" in sent
+
+
+def test_quiet_steps_show_nothing(monkeypatch):
+    assert shown_in_steps(monkeypatch, quiet=True) == ""
 
 
 def test_items_keep_their_order():

@@ -6,6 +6,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from tests.prepare import boards
 from warpgs.prepare import sfm
 from warpgs.prepare.cameras import NoCamerasError
-from warpgs.prepare.matches import all_pairs, sequence_pairs
+from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
 
 
@@ -86,6 +87,26 @@ def test_colmap_ends_when_the_process_that_started_it_ends(tmp_path):
 def test_frames_are_matched_with_the_next_ones_and_at_powers_of_two():
     assert sequence_pairs(3) == all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
     assert [b for a, b in sequence_pairs(100) if a == 0] == [*range(1, 11), 16, 32, 64]
+
+
+def test_frames_that_see_the_same_points_much_later_are_matched():
+    """A camera that goes sideways and comes back, in 60 frames; turned around in the last ten."""
+    camera = SimpleNamespace(width=200, height=100, mean_focal_length=lambda: 100.0)
+    points = {k: SimpleNamespace(xyz=np.array([0.05 * k - 2.0, 0.0, 5.0])) for k in range(700)}
+    images = {}
+    for k in range(60):
+        x = 0.5 * min(k, 49 - k)
+        pose = np.hstack([np.diag([1.0, 1.0, 1.0]) if k < 50 else np.diag([-1.0, 1.0, -1.0]), [[-x], [0.0], [0.0]]])
+        seen = [i for i, p in points.items() if abs(p.xyz[0] - x) < 5.0] if k < 50 else []
+        observed = [SimpleNamespace(point3D_id=i, has_point3D=lambda: True) for i in seen]
+        images[k] = SimpleNamespace(
+            name=f"{k}.png", has_pose=True, camera=camera, points2D=observed,
+            cam_from_world=lambda pose=pose: SimpleNamespace(matrix=lambda: pose),
+        )  # fmt: skip
+    pairs = revisit_pairs(SimpleNamespace(images=images, points3D=points), [f"{k}.png" for k in range(60)])
+    assert (5, 44) in pairs
+    assert all(b - a > 10 and b < 50 for a, b in pairs)
+    assert all(abs(min(a, 49 - a) - min(b, 49 - b)) <= 10 for a, b in pairs)
 
 
 @pytest.fixture(scope="module")
