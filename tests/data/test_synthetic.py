@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from warpgs.data import synthetic
+from warpgs.data.bodies import as_tensors, even_samples
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 
@@ -94,7 +95,7 @@ def test_the_evaluation_camera_is_next_to_the_training_camera(capture):
 
 def distances(points, body):
     """Distance of points from the surface of a static body; ellipsoids must be spheres."""
-    local = ((points - torch.tensor(body.center)) @ body.rotation).abs()
+    local = ((points - torch.tensor(body.center)) @ body.rotation.float()).abs()
     half = torch.tensor(body.half_sizes)
     if body.shape == synthetic.SPHERE:
         return (local.norm(dim=1) - half[0]).abs()
@@ -134,10 +135,10 @@ def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
 
 
 def test_shadows_move_over_static_pixels():
-    camera, lamp, samples = synthetic._camera(0.0, SMALL, 0.0), synthetic._lamp(CPU), synthetic._samples(4, CPU)
+    camera, lamp, samples = synthetic._camera(0.0, SMALL, 0.0), synthetic._lamp(CPU), even_samples(4, CPU)
     early, late = (
         synthetic.raytrace(
-            synthetic._as_tensors([*synthetic._static_bodies(), *synthetic._moving_bodies(time)], CPU),
+            as_tensors([*synthetic._static_bodies(), *synthetic._moving_bodies(time)], CPU),
             lamp,
             samples,
             camera.viewmat,

@@ -2,7 +2,9 @@ import pytest
 import torch
 
 from tests.reference.raytrace import raytrace as reference
-from warpgs.data.synthetic import BuiltinScene, _as_tensors, _camera, _lamp, _moving_bodies, _samples, _static_bodies
+from warpgs.data import studio
+from warpgs.data.bodies import as_tensors, even_samples
+from warpgs.data.synthetic import BuiltinScene, _camera, _lamp, _moving_bodies, _static_bodies
 from warpgs.ops.raytrace import raytrace
 
 CPU = torch.device("cpu")
@@ -11,13 +13,21 @@ SCENE = BuiltinScene(width=37, height=21, num_samples=3)
 
 def inputs(time=0.3):
     camera = _camera(time, SCENE, 0.1)
-    bodies = _as_tensors([*_static_bodies(), *_moving_bodies(time)], CPU)
-    return bodies, _lamp(CPU), _samples(3, CPU), camera.viewmat, camera.K, camera.size
+    bodies = as_tensors([*_static_bodies(), *_moving_bodies(time)], CPU)
+    return bodies, _lamp(CPU), even_samples(3, CPU), camera.viewmat, camera.K, camera.size
 
 
-@pytest.fixture(scope="module")
-def pair():
-    bodies, *rest, size = inputs()
+def studio_inputs(time=0.65):
+    size = studio.StudioSize(width=37, height=21)
+    camera = studio._camera(time, 0.1, size)
+    bodies = as_tensors([*studio._static_bodies(), *studio._moving_bodies(time)], CPU)
+    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]])
+    return bodies, lamp, even_samples(3, CPU), camera.viewmat, camera.K, camera.size
+
+
+@pytest.fixture(scope="module", params=[inputs, studio_inputs])
+def pair(request):
+    bodies, *rest, size = request.param()
     scene = [t.double() if t.is_floating_point() else t for t in bodies]
     return raytrace(bodies, *rest, size), reference(scene, *(t.double() for t in rest), size)
 
@@ -55,5 +65,17 @@ def test_wrong_shapes_are_refused_by_name(contracts_off):
     bodies, lamp, *rest = inputs()
     with pytest.raises(ValueError, match="lamp"):
         raytrace(bodies, lamp[:2], *rest)
+    with pytest.raises(ValueError, match="materials"):
+        raytrace(bodies._replace(materials=bodies.materials[:, :2].contiguous()), lamp, *rest)
     with pytest.raises(ValueError, match="frequencies"):
         raytrace(bodies._replace(frequencies=bodies.frequencies[:1]), lamp, *rest)
+
+
+def test_only_mirrors_show_what_is_in_front_of_them():
+    bodies, *rest = studio_inputs()
+    plain = raytrace(bodies._replace(materials=bodies.materials * torch.tensor([1.0, 0.0, 1.0])), *rest)
+    change = (raytrace(bodies, *rest).image - plain.image).abs().amax(-1)
+    is_mirror = bodies.materials[plain.bodies.long(), 1] > 0
+    assert float(change[is_mirror].median()) > 0.01
+    near = torch.nn.functional.max_pool2d(is_mirror[None, None].float(), 3, 1, 1)[0, 0] > 0
+    assert float(change[~near].max()) == 0.0

@@ -7,7 +7,18 @@ TUBE = 0.3
 FAR = 1e6
 
 
-def hit(shape: int, o: Tensor, d: Tensor) -> Tensor:
+def torus(p: Tensor) -> Tensor:
+    """Distance of points from the torus."""
+    return ((p[:, :2].norm(dim=1) - 1) ** 2 + p[:, 2] ** 2).sqrt() - TUBE
+
+
+def blob(p: Tensor, bulge: Tensor) -> Tensor:
+    """Approximate distance of points from the blob."""
+    radius = p.norm(dim=1)
+    return radius - 1 - bulge * (p[:, 0] ** 3 - 3 * p[:, 0] * p[:, 1] ** 2) / radius**3
+
+
+def hit(shape: int, bulge: Tensor, o: Tensor, d: Tensor) -> Tensor:
     """Smallest t > 0 at which each ray meets a unit shape; FAR where it does not."""
     far = torch.full_like(o[:, 0], FAR)
     a, b = (d * d).sum(1), (o * d).sum(1)
@@ -23,22 +34,29 @@ def hit(shape: int, o: Tensor, d: Tensor) -> Tensor:
     t = torch.zeros_like(far)
     for _ in range(400):
         p = o + t[:, None] * d
-        distance = ((p[:, :2].norm(dim=1) - 1) ** 2 + p[:, 2] ** 2).sqrt() - TUBE
+        distance = torus(p) if shape == 2 else blob(p, bulge) / 2
         t = torch.where(distance < 1e-5, t, t + distance / a.sqrt())
     return torch.where((distance < 1e-4) & (t < 100), t, far)
 
 
-def normal(shape: int, p: Tensor) -> Tensor:
+def normal(shape: int, bulge: Tensor, p: Tensor) -> Tensor:
     if shape == 0:
         return p
     if shape == 1:
         return p * torch.nn.functional.one_hot(p.abs().argmax(1), 3)
+    if shape == 3:
+        with torch.enable_grad():
+            q = p.detach().requires_grad_(True)
+            (slope,) = torch.autograd.grad(blob(q, bulge).sum(), q)
+        return slope
     around = p[:, :2].norm(dim=1, keepdim=True)
     return torch.cat([p[:, :2] - p[:, :2] / around, p[:, 2:]], 1)
 
 
-def nearest(shapes: Tensor, bodies: Tensor, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-    ts = [hit(int(k), o @ m[:, :3].T + m[:, 3], d @ m[:, :3].T) for k, m in zip(shapes, bodies, strict=True)]
+def nearest(scene: tuple[Tensor, ...], o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    shapes, bodies, *_, materials = scene
+    found = zip(shapes, materials[:, 2], bodies, strict=True)
+    ts = [hit(int(k), bulge, o @ m[:, :3].T + m[:, 3], d @ m[:, :3].T) for k, bulge, m in found]
     t, body = torch.stack(ts).min(0)
     return t, torch.where(t < FAR, body, -1)
 
@@ -53,9 +71,40 @@ def checkerboard(p: Tensor, frequency: Tensor) -> Tensor:
     return (0.5 + 0.5 * wave / (wave.abs() + 0.06))[:, None]
 
 
+def shade(scene, lamp_points, body, p, d, *, mirrors=True):
+    """[N, 3] colours of the points p of bodies, hit by rays of the directions d; black where there is no body."""
+    shapes, bodies, colors, frequencies, materials = scene
+    m = bodies[body]
+    local = (m[:, :, :3] @ p[:, :, None])[:, :, 0] + m[:, :, 3]
+    n = torch.zeros_like(p)
+    for k in range(len(shapes)):
+        chosen = body == k
+        n[chosen] = normal(int(shapes[k]), materials[k, 2], local[chosen]) @ bodies[k][:, :3]
+    n = torch.nn.functional.normalize(n, dim=1)
+    view = -torch.nn.functional.normalize(d, dim=1)
+    n = torch.where((n * view).sum(1, keepdim=True) < 0, -n, n)
+    start = p + 1e-3 * n
+    to_light = lamp_points - start
+    blocked, _ = nearest(scene, start, to_light)
+    light = torch.nn.functional.normalize(to_light, dim=1)
+    lit = (blocked >= 1) * (n * light).sum(1).clamp_min(0)
+    checks = checkerboard(local, frequencies[body])
+    color = checks * colors[body, 0] + (1 - checks) * colors[body, 1]
+    ambient = 0.24 + (0.42 - 0.24) * (0.5 + 0.5 * n[:, 2])
+    half = torch.nn.functional.normalize(light + view, dim=1)
+    gloss = materials[body, 0] * (n * half).sum(1).clamp_min(0) ** 40 * lit
+    color = (ambient + 0.72 * lit)[:, None] * color + gloss[:, None]
+    if mirrors:
+        reflected = 2 * (n * view).sum(1, keepdim=True) * n - view
+        t, other = nearest(scene, start, reflected)
+        seen = shade(scene, lamp_points, other, start + t[:, None] * reflected, reflected, mirrors=False)
+        fraction = materials[body, 1, None]
+        color = (1 - fraction) * color + fraction * colors[body, 0] * seen
+    return torch.where((body >= 0)[:, None], color, 0.0)
+
+
 def raytrace(scene, lamp, samples, viewmat, K, size):
     """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace; ``scene`` has the fields of ``Bodies``."""
-    shapes, bodies, colors, frequencies = scene
     width, height = size
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([column, row], -1).reshape(-1, 2).to(viewmat.dtype)
@@ -71,28 +120,9 @@ def raytrace(scene, lamp, samples, viewmat, K, size):
     total = torch.zeros(len(pixels), 3, dtype=viewmat.dtype)
     for sample in samples:
         o, d = rays(sample[:2])
-        t, body = nearest(shapes, bodies, o, d)
-        p = o + t[:, None] * d
-        m = bodies[body]
-        local = (m[:, :, :3] @ p[:, :, None])[:, :, 0] + m[:, :, 3]
-        n = torch.zeros_like(p)
-        for k in range(len(shapes)):
-            chosen = body == k
-            n[chosen] = normal(int(shapes[k]), local[chosen]) @ bodies[k][:, :3]
-        n = torch.nn.functional.normalize(n, dim=1)
-        view = -torch.nn.functional.normalize(d, dim=1)
-        n = torch.where((n * view).sum(1, keepdim=True) < 0, -n, n)
-        start = p + 1e-3 * n
-        to_light = lamp[0] + (2 * ((sample[2:] + shift) % 1) - 1) @ lamp[1:] - start
-        blocked, _ = nearest(shapes, bodies, start, to_light)
-        light = torch.nn.functional.normalize(to_light, dim=1)
-        lit = (blocked >= 1) * (n * light).sum(1).clamp_min(0)
-        checks = checkerboard(local, frequencies[body])
-        color = checks * colors[body, 0] + (1 - checks) * colors[body, 1]
-        ambient = 0.24 + (0.42 - 0.24) * (0.5 + 0.5 * n[:, 2])
-        half = torch.nn.functional.normalize(light + view, dim=1)
-        gloss = 0.18 * (n * half).sum(1).clamp_min(0) ** 40 * lit
-        total += torch.where((body >= 0)[:, None], (ambient + 0.72 * lit)[:, None] * color + gloss[:, None], 0.0)
-    t, body = nearest(shapes, bodies, *rays(torch.full((2,), 0.5, dtype=viewmat.dtype)))
+        t, body = nearest(scene, o, d)
+        lamp_points = lamp[0] + (2 * ((sample[2:] + shift) % 1) - 1) @ lamp[1:]
+        total += shade(scene, lamp_points, body, o + t[:, None] * d, d)
+    t, body = nearest(scene, *rays(torch.full((2,), 0.5, dtype=viewmat.dtype)))
     image = total / len(samples)
     return image.reshape(height, width, 3), t.reshape(height, width), body.reshape(height, width)

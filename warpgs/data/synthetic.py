@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,10 +23,11 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, Bodies, raytrace
+from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 
 from . import writer
+from .bodies import Body, as_tensors, euler, even_samples
 from .lens import Lens
 from .units import SceneUnits
 
@@ -38,7 +40,7 @@ POINT_NOISE = 0.004
 BASELINE = 0.16
 """Distance of the evaluation camera, to the right of the training camera [world units]."""
 
-VERSION = 3
+VERSION = 4
 """Increase it when the content changes, so that cached captures are not used any more."""
 
 
@@ -60,56 +62,32 @@ class BuiltinScene:
     num_points: int = 4000
 
 
-@dataclass(frozen=True)
-class _Body:
-    """A unit shape: world_from_body scales by ``half_sizes``, then rotates, then shifts to ``center``."""
-
-    shape: int
-    center: tuple[float, float, float]
-    half_sizes: tuple[float, float, float]
-    colors: tuple[tuple[float, float, float], tuple[float, float, float]]
-    frequency: float
-    rotation: Tensor
-
-
-def _euler(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Tensor:
-    """Rotation about x, then y, then z [rad]."""
-    matrices = []
-    for axis, angle in enumerate((x, y, z)):
-        c, s = math.cos(angle), math.sin(angle)
-        m = torch.eye(3)
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        m[i, i], m[i, j], m[j, i], m[j, j] = c, -s, s, c
-        matrices.append(m)
-    return matrices[2] @ matrices[1] @ matrices[0]
-
-
-def _static_bodies() -> list[_Body]:
-    upright = _euler()
+def _static_bodies() -> list[Body]:
+    upright = euler()
     return [
-        _Body(CUBE, (0.0, 0.0, 1.2), (3.1, 3.1, 1.9), ((0.62, 0.66, 0.72), (0.74, 0.71, 0.64)), 8.0, upright),
-        _Body(CUBE, (0.0, 0.0, -0.06), (1.55, 1.25, 0.06), ((0.80, 0.72, 0.55), (0.72, 0.62, 0.46)), 7.0, upright),
-        _Body(
+        Body(CUBE, (0.0, 0.0, 1.2), (3.1, 3.1, 1.9), ((0.62, 0.66, 0.72), (0.74, 0.71, 0.64)), 8.0, upright),
+        Body(CUBE, (0.0, 0.0, -0.06), (1.55, 1.25, 0.06), ((0.80, 0.72, 0.55), (0.72, 0.62, 0.46)), 7.0, upright),
+        Body(
             CUBE,
             (-0.75, 0.62, 0.30),
             (0.22, 0.22, 0.30),
             ((0.25, 0.42, 0.72), (0.85, 0.86, 0.80)),
             4.6,
-            _euler(z=0.5),
+            euler(z=0.5),
         ),
-        _Body(
+        Body(
             CUBE,
             (0.95, 0.55, 0.17),
             (0.19, 0.19, 0.17),
             ((0.30, 0.60, 0.42), (0.82, 0.84, 0.62)),
             4.6,
-            _euler(z=-0.3),
+            euler(z=-0.3),
         ),
-        _Body(SPHERE, (0.30, 0.80, 0.22), (0.22, 0.22, 0.22), ((0.72, 0.40, 0.62), (0.80, 0.55, 0.70)), 6.0, upright),
+        Body(SPHERE, (0.30, 0.80, 0.22), (0.22, 0.22, 0.22), ((0.72, 0.40, 0.62), (0.80, 0.55, 0.70)), 6.0, upright),
     ]
 
 
-def _moving_bodies(time: float) -> list[_Body]:
+def _moving_bodies(time: float) -> list[Body]:
     """The ring tumbles once while it swings back and forth; the ball rolls and is squashed."""
     angle = 2.0 * math.pi * time
     ring_center = (0.32 + 0.30 * math.sin(angle), -0.12, 0.62 + 0.06 * math.cos(angle))
@@ -119,22 +97,9 @@ def _moving_bodies(time: float) -> list[_Body]:
     ball_center = (-0.52 + 0.26 * math.cos(angle), -0.42 + 0.12 * math.sin(angle), half_sizes[2])
     ring, ball = ((0.86, 0.58, 0.38), (0.70, 0.36, 0.24)), ((0.86, 0.30, 0.24), (0.93, 0.82, 0.50))
     return [
-        _Body(TORUS, ring_center, (0.25, 0.25, 0.25), ring, 4.0, _euler(x=0.9 + angle, z=0.5 * angle)),
-        _Body(SPHERE, ball_center, half_sizes, ball, 5.0, _euler(z=0.7 * math.sin(angle))),
+        Body(TORUS, ring_center, (0.25, 0.25, 0.25), ring, 4.0, euler(x=0.9 + angle, z=0.5 * angle)),
+        Body(SPHERE, ball_center, half_sizes, ball, 5.0, euler(z=0.7 * math.sin(angle))),
     ]
-
-
-def _as_tensors(bodies: list[_Body], device: torch.device) -> Bodies:
-    rows = []
-    for body in bodies:
-        linear = torch.diag(1.0 / torch.tensor(body.half_sizes)) @ body.rotation.T
-        rows.append(torch.cat([linear, -(linear @ torch.tensor(body.center, dtype=torch.float32))[:, None]], 1))
-    return Bodies(
-        torch.tensor([body.shape for body in bodies], dtype=torch.int32, device=device),
-        torch.stack(rows).contiguous().to(device),
-        torch.tensor([body.colors for body in bodies], device=device),
-        torch.tensor([body.frequency for body in bodies], device=device),
-    )
 
 
 def _camera(time: float, scene: BuiltinScene, shift: float) -> Camera:
@@ -153,19 +118,6 @@ def _lamp(device: torch.device) -> Tensor:
     return torch.tensor([[0.9, -1.1, 2.7], [0.22, 0.0, 0.0], [0.0, 0.22, 0.0]], device=device)
 
 
-def _samples(count: int, device: torch.device) -> Tensor:
-    """[S, 4] positions in the pixel (additive recurrence) and on the lamp (Fibonacci lattice), evenly distributed.
-
-    A lattice stays even when each pixel shifts it modulo 1: shadows have 20 % less noise than with the recurrence in
-    all four dimensions (measured with 16 samples).
-    """
-    root = 1.1673039782614187  # the real root of x⁵ = x + 1
-    golden = 0.5 * (5.0**0.5 - 1.0)
-    k = torch.arange(count, dtype=torch.float64)
-    positions = [0.5 + (k + 1) / root, 0.5 + (k + 1) / root**2, (k + 0.5) / count, k * golden]
-    return (torch.stack(positions, 1) % 1.0).float().contiguous().to(device)
-
-
 def trace(
     time: float, shift: float, scene: BuiltinScene, device: torch.device
 ) -> tuple[Camera, Float[Tensor, "H W 3"], Float[Tensor, "H W"], Int32[Tensor, "H W"]]:
@@ -178,8 +130,8 @@ def trace(
         device: Device to trace on.
     """
     camera = _camera(time, scene, shift)
-    bodies = _as_tensors([*_static_bodies(), *_moving_bodies(time)], device)
-    lamp, samples, traced_from = _lamp(device), _samples(scene.num_samples, device), camera.to(device)
+    bodies = as_tensors([*_static_bodies(), *_moving_bodies(time)], device)
+    lamp, samples, traced_from = _lamp(device), even_samples(scene.num_samples, device), camera.to(device)
     image, depth, hits = raytrace(bodies, lamp, samples, traced_from.viewmat, traced_from.K, camera.size)
     return camera, image.cpu(), depth.cpu(), hits.cpu()
 
@@ -257,14 +209,23 @@ def builtin_capture(
         OSError: If it cannot be written; the message names the file or folder.
     """
     scene = scene or BuiltinScene()
-    if cache_dir is None:
-        cache_dir = cache_folder()
-    key = hashlib.blake2b(json.dumps([VERSION, asdict(scene)]).encode(), digest_size=6).hexdigest()
-    folder = cache_dir / key / "builtin"
+    folder = content_folder(cache_dir, [VERSION, asdict(scene)]) / "builtin"
     if not folder.is_dir():
-        with _complete_or_absent(folder) as partial:
+        with complete_or_absent(folder) as partial:
             write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet)
     return folder
+
+
+def content_folder(cache_dir: Path | None, content: Any) -> Path:
+    """The folder for a built-in capture of some content, given as plain values.
+
+    Args:
+        cache_dir: Folder of all of them; ``cache_folder`` if None.
+        content: What the capture is made from; another content has another folder.
+    """
+    if cache_dir is None:
+        cache_dir = cache_folder()
+    return cache_dir / hashlib.blake2b(json.dumps(content).encode(), digest_size=6).hexdigest()
 
 
 def cache_folder() -> Path:
@@ -284,7 +245,7 @@ def cache_folder() -> Path:
 
 
 @contextmanager
-def _complete_or_absent(folder: Path) -> Iterator[Path]:
+def complete_or_absent(folder: Path) -> Iterator[Path]:
     """A temporary folder, renamed to ``folder`` on success and removed after any error."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

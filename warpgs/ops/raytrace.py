@@ -10,24 +10,26 @@ from warpgs.kernels import raytrace as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
 from warpgs.runtime.tape import OpContext, differentiable
 
-SPHERE, CUBE, TORUS = 0, 1, 2
-"""Unit shapes; the torus is around z and has radii 1 and 0.3."""
+SPHERE, CUBE, TORUS, BLOB = 0, 1, 2, 3
+"""Unit shapes; the torus is around z and has radii 1 and 0.3, the blob has three lobes around z."""
 
 
 class Bodies(NamedTuple):
     """Bodies, each a unit shape in its own space.
 
     Attributes:
-        shapes: [B] SPHERE, CUBE or TORUS.
+        shapes: [B] SPHERE, CUBE, TORUS or BLOB.
         body_from_world: [B, 3, 4] affine transforms; that of a torus must be a rotation, a uniform scale and a shift.
         colors: [B, 2, 3] the two colours of the checkerboard.
         frequencies: [B] angular frequency of the checkerboard [rad per unit of body space].
+        materials: [B, 3] strength of the highlight, mirrored fraction in [0, 1], height of a blob's lobes in [−¼, ¼].
     """
 
     shapes: Int32[Tensor, " B"]
     body_from_world: Float[Tensor, "B 3 4"]
     colors: Float[Tensor, "B 2 3"]
     frequencies: Float[Tensor, " B"]
+    materials: Float[Tensor, "B 3"]
 
 
 class TracedImage(NamedTuple):
@@ -87,6 +89,7 @@ def _check_inputs(bodies: Bodies, lamp: Tensor, samples: Tensor, viewmat: Tensor
     check_tensor("body_from_world", bodies.body_from_world, ("B", 3, 4), sizes)
     check_tensor("colors", bodies.colors, ("B", 2, 3), sizes)
     check_tensor("frequencies", bodies.frequencies, ("B",), sizes)
+    check_tensor("materials", bodies.materials, ("B", 3), sizes)
     check_tensor("lamp", lamp, (3, 3), sizes)
     check_tensor("samples", samples, ("S", 4), sizes)
     check_tensor("viewmat", viewmat, (4, 4), sizes)

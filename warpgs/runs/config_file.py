@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig, validate
+from warpgs.data.builtin import is_builtin
 from warpgs.files import read_json, write_text
 
 NAME = "config.json"
@@ -25,7 +26,8 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    data, weights = config.data and config.data.resolve(), config.lpips and config.lpips.resolve()
+    data = config.data if config.data is None or is_builtin(config.data) else config.data.resolve()
+    weights = config.lpips and config.lpips.resolve()
     plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
     write_text(folder / NAME, json.dumps(plain, indent=2, default=str) + "\n")
 
@@ -39,15 +41,28 @@ def read_config(folder: Path) -> TrainConfig:
     path = folder / NAME
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    config = dataclasses.replace(_parse(TrainConfig, read_json(path, max_bytes=MAX_BYTES), path), out=folder)
+    return dataclasses.replace(parse_config(read_json(path, max_bytes=MAX_BYTES), path), out=folder)
+
+
+def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
+    """A training config from parsed JSON or TOML; fields that are not given have the defaults of ``TrainConfig``.
+
+    Args:
+        values: Fields, nested as in ``TrainConfig``.
+        source: Where they come from, for messages.
+
+    Raises:
+        ValueError: If there are unknown or mistyped fields, or numbers out of their range.
+    """
+    config: TrainConfig = _parse(TrainConfig, values, source)
     try:
         validate(config)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{source}: {error}") from error
     return config
 
 
-def _parse(cls: Any, values: Any, path: Path) -> Any:
+def _parse(cls: Any, values: Any, path: Path | str) -> Any:
     """A (nested) dataclass from parsed JSON."""
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object for {cls.__name__}, got {values!r}")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,6 +11,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
+from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
@@ -44,7 +45,10 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         ValueError: If a file of the capture is missing or damaged; the message names it.
         OSError: If the built-in scene cannot be written.
     """
-    root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
+    if config.data is not None and is_builtin(config.data):
+        root = builtin_folder(config.data, quiet)
+    else:
+        root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     return load_capture(root, config.dataset, factor=config.factor, perturbation=config.masks)
 
 
@@ -134,20 +138,25 @@ class Run:
         scene = checkpoint.load_scene(loaded, self.config.model)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
 
-    @contextmanager
-    def lock(self) -> Iterator[None]:
-        """Locks the folder against other training processes; the lock ends with the process at the latest.
+    def lock(self) -> AbstractContextManager[None]:
+        """Locks the folder against other training processes; raises as ``lock_folder``."""
+        return lock_folder(self.folder)
 
-        Raises:
-            ValueError: If another process holds the lock.
-            OSError: If the lock file cannot be written.
-        """
-        try:
-            held = FileLock(self.folder / LOCK).acquire(timeout=0)
-        except Timeout as error:
-            raise ValueError(f"{self.folder} is being trained by another process") from error
-        with held:
-            yield
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Locks a folder against other processes that write to it; the lock ends with the process at the latest.
+
+    Raises:
+        ValueError: If another process holds the lock.
+        OSError: If the lock file cannot be written.
+    """
+    try:
+        held = FileLock(folder / LOCK).acquire(timeout=0)
+    except Timeout as error:
+        raise ValueError(f"{folder} is being trained by another process") from error
+    with held:
+        yield
 
 
 def open_run(folder: Path | str, device: Device | None = None) -> TrainedScene:

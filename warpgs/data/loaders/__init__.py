@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from warpgs.config import MaskPerturbation
+from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.masks import check_perturbation
 from warpgs.files import read_json
@@ -65,7 +66,7 @@ def load_capture(
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
     Args:
-        root: Folder of the capture.
+        root: Folder of the capture, or a built-in one (``data/builtin.py``).
         dataset: Key of ``LOADERS``; recognized from the files if None.
         factor: Downscaling factor of the images; the dataset's default if None.
         perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
@@ -80,7 +81,7 @@ def load_capture(
         raise ValueError(f"factor must be at least 1, got {factor}")
     perturbation = perturbation or MaskPerturbation()
     check_perturbation(perturbation)
-    root = Path(root)
+    root = builtin_folder(root) if is_builtin(root) else Path(root)
     loader = LOADERS[dataset or recognize(root)]
     return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
 

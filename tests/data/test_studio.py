@@ -1,0 +1,139 @@
+"""The built-in benchmark."""
+
+import hashlib
+import itertools
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from warpgs.data import studio
+from warpgs.data.builtin import builtin_folder
+from warpgs.data.degraded_depth import DegradedDepth
+from warpgs.data.loaders import load_capture
+from warpgs.data.studio import StudioSize, studio_capture, trace
+
+SMALL = StudioSize(width=64, height=36, num_frames=4, num_samples=2, num_points=200)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def capture(cache):
+    return load_capture(studio_capture("exact", cache, SMALL, quiet=True))
+
+
+def content(folder):
+    """A hash of what the files say, whatever their compression."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(str(path.relative_to(folder)).encode())
+        if path.suffix == ".png":
+            digest.update(cv2.imread(str(path), cv2.IMREAD_UNCHANGED).tobytes())
+        elif path.suffix == ".npy":
+            digest.update(np.load(path).tobytes())
+        else:
+            digest.update(json.dumps(json.loads(path.read_text()), sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("depth", "expected"),
+    [
+        ("exact", "ed66a46364289baaadaf520543b5854c"),
+        ("network", "e31d7d72724d9da74dd92aa3eeb57520"),
+        ("none", "1be22f3501ecfb42cfae7193ca5487e6"),
+    ],
+)
+def test_the_content_is_the_same_everywhere(cache, depth, expected):
+    assert content(studio_capture(depth, cache, SMALL, quiet=True)) == expected
+
+
+def test_one_camera_trains_and_a_second_one_beside_it_evaluates(capture):
+    assert capture.train == tuple(f"left_{k:06d}" for k in range(4))
+    assert capture.val == ("right_000000", "right_000002")
+    left, right = capture.cameras["left_000002"], capture.cameras["right_000002"]
+    assert left.time == right.time
+    shift = right.position - left.position
+    assert float(shift.norm()) == pytest.approx(studio.BASELINE * studio.SCALE, rel=1e-4)
+    assert float(shift @ left.viewmat[0, :3]) == pytest.approx(float(shift.norm()), rel=1e-4)
+
+
+def test_points_lie_on_static_surfaces(capture):
+    """Their depth through the camera that saw them is that of the frame, but for the noise."""
+    per_frame = len(capture.points) // 4
+    inverse = 1.0 / trace(0.0, 0.0, SMALL)[1]
+    row, column, depth, inside = capture.cameras["left_000000"].project(capture.points[:per_frame])
+    ratio = depth[inside] / studio.SCALE * inverse[row[inside], column[inside]]
+    assert float((ratio - 1.0).abs().median()) < 0.01
+    assert bool(capture.frame("left_000000").static_mask[row[inside], column[inside]].float().mean() > 0.95)
+
+
+def test_exact_depth_is_inverse_depth_up_to_scale_and_offset(capture):
+    inverse = capture.frame("left_000003").inverse_depth.flatten()
+    assert torch.corrcoef(torch.stack([inverse, 1.0 / trace(1.0, 0.0, SMALL)[1].flatten()]))[0, 1] > 0.9999
+
+
+def test_the_shape_and_the_place_of_what_moves_change():
+    masks = [~trace(time, 0.0, SMALL)[2] for time in (0.0, 0.4)]
+    assert all(0.02 < float(mask.float().mean()) < 0.3 for mask in masks)
+    assert float((masks[0] & masks[1]).sum()) < 0.7 * float(masks[0].sum())
+
+
+def test_a_network_is_wrong_by_a_few_percent_smoothly_and_moving_things_by_more():
+    flat, nothing = np.full((90, 160), 30_000.0), np.zeros((90, 160), bool)
+    flat[:, :80] = 20_000.0
+    errors = DegradedDepth(80)
+    relative = [errors(k, flat, nothing)[5:-5, 90:] / 30_000.0 - 1.0 for k in range(0, 80, 8)]
+    assert 0.05 < float(np.std(relative)) < 0.12
+    assert max(float(np.abs(np.diff(error, axis=1)).max()) for error in relative) < 0.02
+    moving = nothing.copy()
+    moving[30:60, 100:130] = True
+    shifts = [int(errors(k, flat, moving)[45, 115]) - int(errors(k, flat, nothing)[45, 115]) for k in range(80)]
+    assert 200 < max(map(abs, shifts)) <= 1001
+    assert max(abs(a - b) for a, b in itertools.pairwise(shifts)) < 800
+
+
+def test_variants_differ_in_depth_only(cache):
+    folders = {depth: studio_capture(depth, cache, SMALL, quiet=True) for depth in ("exact", "network", "none")}
+    files = {depth: {str(p.relative_to(f)) for p in f.rglob("*.*")} for depth, f in folders.items()}
+    assert files["network"] == files["exact"]
+    assert {name for name in files["exact"] if not name.startswith("depth")} == files["none"]
+    for name in files["none"]:
+        assert (folders["none"] / name).read_bytes() == (folders["network"] / name).read_bytes()
+    assert load_capture(folders["none"]).frame("left_000000").inverse_depth is None
+
+
+def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(studio, "StudioSize", lambda: SMALL)
+    capture = load_capture("builtin:studio?depth=none")
+    assert len(capture.train) == 4
+    monkeypatch.setattr(studio, "write_studio", lambda *_: pytest.fail("made again"))
+    assert builtin_folder("builtin:studio").name == "studio"
+    assert load_capture("builtin:studio?depth=network").frame("left_000000").inverse_depth is not None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "builtin:",
+        "builtin:studi",
+        "builtin:studio?depth=",
+        "builtin:room?depth=none",
+        "builtin:studio?depth=depth=none",
+    ],
+)
+def test_an_unknown_name_lists_those_that_are(name):
+    with pytest.raises(ValueError, match=r"there is no built-in capture builtin:.*, expected one of builtin:room"):
+        load_capture(name)
+
+
+def test_a_single_frame_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least 2 frames, got 1"):
+        studio_capture("exact", tmp_path, StudioSize(num_frames=1), quiet=True)

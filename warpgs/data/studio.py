@@ -1,0 +1,248 @@
+"""The built-in capture ``builtin:studio``: a benchmark that everyone can make on a machine of their own.
+
+480×270; 160 training frames of one hand-held camera, 80 evaluation frames of a second one beside it. On a table in a
+room a mirroring ring tumbles, a glossy body is squashed and changes its lobes, and both throw soft shadows. Masks are
+exact, points are noisy, depth is exact, has the errors of a network, or is missing:
+
+    builtin:studio    builtin:studio?depth=network    builtin:studio?depth=none
+
+The content is the same bits on every machine, so numbers can be compared: the images by the ray tracer (see its
+kernels), the rest by computing in double precision before the last rounding.
+"""
+
+import math
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
+from warpgs.progress import progress
+
+from . import writer
+from .bodies import Body, as_tensors, euler, even_samples
+from .degraded_depth import DegradedDepth
+from .lens import Lens
+from .synthetic import complete_or_absent, content_folder
+from .units import SceneUnits
+
+Depth = Literal["exact", "network", "none"]
+
+CENTER, SCALE = (0.0, 0.3, 0.9), 0.25
+"""Scene units are (p − CENTER) · SCALE."""
+
+POINT_NOISE = 0.004
+"""Standard deviation of the noise on the sparse points [world units]."""
+
+BASELINE = 0.28
+"""Distance of the evaluation camera, to the right of the training camera [world units]."""
+
+VERSION = 1
+"""Increase it when the content changes, so that cached captures are not used any more."""
+
+Vector = Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class StudioSize:
+    """Size of the capture; numbers are compared at the default only.
+
+    Attributes:
+        width, height: Size of the images [px].
+        num_frames: Number of times; each has a training frame, every second one also an evaluation frame.
+        num_samples: Samples per pixel.
+        num_points: Number of sparse points.
+    """
+
+    width: int = 480
+    height: int = 270
+    num_frames: int = 160
+    num_samples: int = 8
+    num_points: int = 10_000
+
+
+def _static_bodies() -> list[Body]:
+    room = ((0.60, 0.63, 0.70), (0.74, 0.71, 0.63))
+    wood, leg = ((0.84, 0.77, 0.56), (0.75, 0.66, 0.47)), ((0.52, 0.42, 0.30), (0.45, 0.36, 0.26))
+    blue, grey = ((0.24, 0.40, 0.74), (0.88, 0.87, 0.78)), ((0.42, 0.52, 0.66), (0.80, 0.82, 0.84))
+    violet, red = ((0.66, 0.46, 0.78), (0.74, 0.58, 0.82)), ((0.86, 0.36, 0.28), (0.90, 0.52, 0.36))
+    pink, green = ((0.84, 0.42, 0.56), (0.92, 0.66, 0.72)), ((0.30, 0.56, 0.54), (0.42, 0.66, 0.62))
+    corners = [(x, y) for x in (-1.55, 1.55) for y in (-0.9, 1.3)]
+    return [
+        Body(CUBE, (0.0, 0.6, 1.9), (4.2, 4.2, 2.5), room, 13.0, euler(), shine=0.0),
+        Body(CUBE, (0.0, 0.2, 0.54), (1.7, 1.25, 0.06), wood, 6.0, euler(), shine=0.05),
+        Body(CUBE, (-0.55, 0.95, 0.94), (0.20, 0.20, 0.34), blue, 7.0, euler(z=0.4)),
+        Body(CUBE, (0.35, 0.70, 0.76), (0.19, 0.15, 0.16), grey, 6.0, euler(z=-0.5)),
+        Body(SPHERE, (0.95, 0.80, 0.77), (0.17, 0.17, 0.17), violet, 5.0, euler()),
+        Body(SPHERE, (1.35, 1.05, 0.84), (0.24, 0.24, 0.24), red, 4.0, euler()),
+        Body(SPHERE, (-1.25, 0.60, 0.80), (0.13, 0.13, 0.20), pink, 6.0, euler()),
+        Body(SPHERE, (-0.15, 0.45, 0.78), (0.18, 0.18, 0.18), green, 5.0, euler(), shine=0.5, mirror=0.25),
+        *(Body(CUBE, (x, y, -0.06), (0.07, 0.07, 0.54), leg, 9.0, euler()) for x, y in corners),
+    ]
+
+
+def _moving_bodies(time: float) -> list[Body]:
+    """The ring tumbles while it swings to and fro; the blob rolls, is squashed and changes its lobes."""
+    angle = 2.0 * math.pi * time
+    ring = (0.30 + 0.55 * math.sin(angle + 0.4), -0.10 + 0.25 * math.cos(angle), 1.12 + 0.14 * math.sin(2.0 * angle))
+    squash = 0.20 * math.sin(3.0 * angle)
+    radius = 0.30
+    sizes = (radius * (1.0 + 0.5 * squash), radius * (1.0 + 0.5 * squash), radius * (1.0 - squash))
+    blob = (-0.55 + 0.45 * math.cos(angle + 0.9), -0.45 + 0.20 * math.sin(angle), 0.60 + 1.12 * sizes[2])
+    copper, checks = ((0.95, 0.72, 0.58), (0.86, 0.56, 0.42)), ((0.85, 0.36, 0.32), (0.94, 0.86, 0.56))
+    tumble = euler(x=1.2 + 2.0 * angle, z=1.5 * angle)
+    bulge = 0.2 * math.sin(2.0 * angle)
+    return [
+        Body(TORUS, ring, (0.30, 0.30, 0.30), copper, 3.0, tumble, shine=0.9, mirror=0.5),
+        Body(BLOB, blob, sizes, checks, 5.5, euler(x=0.3, z=1.2 * angle), shine=0.6, bulge=bulge),
+    ]
+
+
+def _pose(time: float, shift: float) -> tuple[Float[np.ndarray, "3 3"], Vector]:
+    """World-to-camera rotation and position of the hand-held camera, moved to its right by ``shift``."""
+    angle = -0.5 * math.pi + 0.50 * math.sin(2.0 * math.pi * (0.8 * time + 0.07))
+    height = 1.78 + 0.27 * math.sin(2.0 * math.pi * (1.7 * time + 0.02))
+    position = np.array([3.1 * math.cos(angle), 3.1 * math.sin(angle), height])
+    forward = np.array([0.0, 0.3, 0.82]) - position
+    forward /= math.sqrt(sum(x * x for x in forward.tolist()))
+    right = np.array([forward[1], -forward[0], 0.0]) / math.hypot(forward[0], forward[1])
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return rotation, position + shift * right
+
+
+def _camera(time: float, shift: float, size: StudioSize) -> Camera:
+    rotation, position = _pose(time, shift)
+    viewmat = torch.eye(4)
+    viewmat[:3, :3] = torch.from_numpy(rotation)
+    viewmat[:3, 3] = torch.from_numpy(-(rotation @ position))
+    focal = 0.82 * size.width
+    K = torch.tensor([[focal, 0.0, 0.5 * size.width], [0.0, focal, 0.5 * size.height], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, size.width, size.height, time)
+
+
+def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
+    """Image [H, W, 3], depth [H, W] in world units and static mask [H, W] of a frame.
+
+    Args:
+        time: Time in [0, 1].
+        shift: Distance of the camera to the right of the training camera [world units].
+        size: Size of the capture.
+    """
+    cpu = torch.device("cpu")  # a GPU rounds otherwise
+    static = _static_bodies()
+    bodies = as_tensors([*static, *_moving_bodies(time)], cpu)
+    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]])
+    camera = _camera(time, shift, size)
+    traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
+    return traced.image, traced.depth, traced.bodies < len(static)
+
+
+def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
+    """Writes the capture, with exact depth, to an empty folder.
+
+    Raises:
+        ValueError: If there are fewer than two frames.
+        OSError: If a file cannot be written; the message names it.
+    """
+    if size.num_frames < 2:
+        raise ValueError(f"the studio needs at least 2 frames, got {size.num_frames}")
+    jobs = [("left", k, 0.0) for k in range(size.num_frames)]
+    jobs += [("right", k, BASELINE) for k in range(0, size.num_frames, 2)]
+    times, points = {f"{side}_{k:06d}": k for side, k, _ in jobs}, []
+    label = "creating builtin:studio, once for all runs"
+    for name, (side, k, shift) in zip(times, progress(jobs, label, quiet), strict=True):
+        time = k / (size.num_frames - 1)
+        image, depth, static = trace(time, shift, size)
+        rotation, position = _pose(time, shift)
+        writer.write_image(folder, name, (image.clamp(0, 1) * 255).round().byte().numpy())
+        writer.write_mask(folder, name, static.numpy())
+        writer.write_camera(folder, name, _lens(size), rotation.round(9), position.round(9))
+        if side == "left":
+            inverse = 1.0 / depth.numpy().astype(np.float64)
+            writer.write_depth(folder, name, _sixteen_bits(inverse, k / size.num_frames))
+            points.append(_surface_points(inverse, static.numpy(), rotation, position, k, size))
+    units = SceneUnits(np.array(CENTER), SCALE)
+    writer.write_scene(folder, units, np.concatenate(points)[: size.num_points], near=0.05, far=3.0)
+    right = {name: int(name.startswith("right")) for name in times}
+    writer.write_index(folder, times, [name for name in times if right[name]], right)
+
+
+def _lens(size: StudioSize) -> Lens:
+    focal = 0.82 * size.width
+    return Lens(size.width, size.height, (focal, focal), (0.5 * size.width, 0.5 * size.height))
+
+
+def _sixteen_bits(inverse: Float[np.ndarray, "H W"], phase: float) -> np.ndarray:
+    """Inverse depth with a scale and an offset that drift from frame to frame, as 16 bits."""
+    value = (inverse - inverse.min()) / (inverse.max() - inverse.min())
+    value = (0.70 + 0.10 * math.sin(9.0 * phase)) * value + 0.12 + 0.05 * math.cos(7.0 * phase)
+    return (value * 65535.0).round().astype(np.uint16)
+
+
+def _surface_points(
+    inverse: Float[np.ndarray, "H W"],
+    static: Bool[np.ndarray, "H W"],
+    rotation: Float[np.ndarray, "3 3"],
+    position: Vector,
+    k: int,
+    size: StudioSize,
+) -> Float[np.ndarray, "P 3"]:
+    """The sparse points of frame ``k``: random static pixels, unprojected with some noise."""
+    random = np.random.default_rng(k)
+    rows, columns = static.nonzero()
+    count = -(-size.num_points // size.num_frames)
+    chosen = random.permutation(len(rows))[:count]
+    row, column = rows[chosen], columns[chosen]
+    focal = 0.82 * size.width
+    slopes = [(column + 0.5 - 0.5 * size.width) / focal, (row + 0.5 - 0.5 * size.height) / focal]
+    local = np.stack([*slopes, np.ones(len(row))], 1) / inverse[row, column, None]
+    points = local @ rotation + position + POINT_NOISE * random.standard_normal((len(row), 3))
+    return points.round(6).astype(np.float32)
+
+
+def studio_capture(
+    depth: Depth = "exact", cache_dir: Path | None = None, size: StudioSize | None = None, quiet: bool = False
+) -> Path:
+    """The folder of the capture, which is created on the first call.
+
+    Args:
+        depth: Exact, with the errors of a network, or none at all.
+        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
+        size: Size of the capture; the default size if None.
+        quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
+
+    Raises:
+        ValueError: If there are fewer than two frames.
+        OSError: If it cannot be written; the message names the file or folder.
+    """
+    size = size or StudioSize()
+    root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
+    exact = root / "studio"
+    if not exact.is_dir():
+        with complete_or_absent(exact) as partial:
+            write_studio(partial, size, quiet)
+    if depth == "exact":
+        return exact
+    folder = root / f"studio-depth-{depth}"
+    if not folder.is_dir():
+        with complete_or_absent(folder) as partial:
+            shutil.copytree(exact, partial, ignore=shutil.ignore_patterns("depth"), dirs_exist_ok=True)
+            if depth == "network":
+                _write_degraded(exact, partial)
+    return folder
+
+
+def _write_degraded(exact: Path, folder: Path) -> None:
+    files = sorted((exact / "depth/1x").glob("*.png"))
+    errors = DegradedDepth(len(files))
+    for k, path in enumerate(files):
+        inverse = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.float64)
+        mask = np.asarray(cv2.imread(str(exact / f"resized_mask/1x/{path.name}.png"), cv2.IMREAD_UNCHANGED))
+        writer.write_depth(folder, path.stem, errors(k, inverse, mask == 0))
