@@ -15,6 +15,10 @@ import pytest  # noqa: E402
 import torch  # noqa: E402
 
 
+def pytest_addoption(parser):
+    parser.addoption("--cluster", action="store_true", help="also run tests that kill nodes of a Ray cluster (minutes)")
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)

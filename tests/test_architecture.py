@@ -25,6 +25,7 @@ ORDER = [
     "evaluation",
     "training prepare",
     "bench export viewer report",
+    "sweep",
     "cli",
 ]
 """The layers of the package: each may import from its own line and from those above it."""

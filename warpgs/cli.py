@@ -15,6 +15,7 @@ from .evaluation.command import Eval
 from .export.command import Export
 from .prepare.command import Prepare
 from .report.command import Report
+from .sweep.command import Sweep
 from .training import command as training
 from .video.command import Render
 from .viewer.command import View
@@ -24,8 +25,8 @@ from .viewer.command import View
 class Command(Protocol):
     """A dataclass of options with a method ``run``."""
 
-    def run(self) -> None:
-        """Does what the options ask for."""
+    def run(self) -> object:
+        """Does what the options ask for; returns the exit code if that is not 0."""
 
 
 COMMANDS: dict[str, Callable[..., Command]] = {
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[..., Command]] = {
     "prepare": Prepare,
     "render": Render,
     "report": Report,
+    "sweep": Sweep,
     "view": View,
 }
 """Every command but ``train``, whose defaults depend on its preset."""

@@ -57,21 +57,30 @@ def text(value: object) -> str:
     return html.escape(str(value), quote=True)
 
 
-def page(runs: Sequence[EvaluatedRun], galleries: Sequence[Gallery], origin: str) -> str:
-    """The whole page; ``origin`` is a line that says when and by which program it was written."""
-    title = f"warpgs: {', '.join(run.label for run in runs)}"
+def page(
+    runs: Sequence[EvaluatedRun], galleries: Sequence[Gallery], origin: str, title: str = "", introduction: str = ""
+) -> str:
+    """The whole page.
+
+    Args:
+        runs: Runs, shown side by side; nothing is shown of them if there are none.
+        galleries: Images of runs on the same views.
+        origin: A line that says when and by which program it was written.
+        title: Title; the runs' labels if empty.
+        introduction: HTML above everything about the runs.
+    """
+    title = title or f"warpgs: {', '.join(run.label for run in runs)}"
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         f'<meta name="viewport" content="width=device-width"><title>{text(title)}</title><style>{STYLE}</style>'
     )
     sections = [
         f"<h1>{text(title)}</h1><p class=note>{text(origin)}</p>",
-        _summary(runs),
-        _charts(runs),
-        *(_gallery(runs, gallery) for gallery in galleries),
-        _views(runs),
-        _config(runs),
+        introduction,
     ]
+    if runs:
+        galleries_html = [_gallery(runs, gallery) for gallery in galleries]
+        sections += [_summary(runs), _charts(runs), *galleries_html, _views(runs), _config(runs)]
     return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{chr(10).join(sections)}\n</body></html>\n'
 
 

@@ -1,0 +1,74 @@
+"""The live table."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from warpgs.sweep import board as module
+from warpgs.sweep.board import Board
+from warpgs.sweep.cells import plan_cells
+from warpgs.sweep.scheduler import Event
+from warpgs.sweep.spec import read_spec
+
+
+@pytest.fixture
+def lines():
+    return []
+
+
+@pytest.fixture
+def board(tmp_path, lines):
+    cells = plan_cells(read_spec("seeds"), {"as": "/as"}, tmp_path, {"iterations": 300})
+    return Board(tmp_path, cells, lines.append)
+
+
+def text(table):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table)
+    return [" ".join(line.replace("│", " ").split()) for line in console.file.getvalue().splitlines()]
+
+
+def test_running_and_failed_cells_come_first_with_their_host_and_reason(board, tmp_path, monkeypatch):
+    with board:
+        (tmp_path / "running").mkdir()
+        (tmp_path / "running/as-full-seed2").write_text("node7")
+        board.tell(Event("as-full-seed4", "failed", "out of memory"))
+        monkeypatch.setattr(board, "_live", type("Shown", (), {"update": lambda *_: None, "stop": lambda *_: None})())
+        board.poll()
+        shown = text(board.table())
+    assert "1 running, 1 failed, 3 queued" in shown
+    rows = [line for line in shown if line.startswith("as-full")]
+    assert rows == [
+        "as-full-seed2 running node7",
+        "as-full-seed4 failed out of memory",
+        "as-full-seed0 queued",
+        "as-full-seed1 queued",
+        "as-full-seed3 queued",
+    ]
+
+
+def test_without_a_terminal_every_end_is_a_line(board, lines):
+    board.tell(Event("as-full-seed1", "retried", "broken"))
+    board.tell(Event("as-full-seed1", "failed", "broken still"))
+    assert lines == ["[0/5] as-full-seed1 retried: broken", "[1/5] as-full-seed1 failed: broken still"]
+
+
+def test_a_long_table_is_cut(board, monkeypatch):
+    monkeypatch.setattr(module, "MAX_LINES", 2)
+    assert len([line for line in text(board.table()) if line.startswith("as-full")]) == 2
+
+
+def test_what_a_killed_sweep_left_running_is_forgotten(board, tmp_path):
+    (tmp_path / "running").mkdir()
+    (tmp_path / "running/as-full-seed0").write_text("node1")
+    with board:
+        assert list((tmp_path / "running").iterdir()) == []
+
+
+def test_damaged_results_are_named_and_trained_again(board, tmp_path):
+    (tmp_path / "as-full-seed0").mkdir()
+    (tmp_path / "as-full-seed0/metrics.json").write_text("{")
+    again = Board(tmp_path, board.cells, print)
+    assert "metrics.json is not valid JSON" in again.errors["as-full-seed0"]
+    assert "as-full-seed0" in [job.name for job in again.jobs("cpu")]

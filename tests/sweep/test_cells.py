@@ -1,0 +1,129 @@
+"""The plan of a sweep: which cells there are, and with which commands."""
+
+import dataclasses
+import json
+
+import pytest
+
+from warpgs.config import TrainConfig
+from warpgs.presets import PRESETS
+from warpgs.sweep.cells import arguments, find_scenes, finished_metrics, plan_cells
+from warpgs.sweep.spec import SweepSpec, Variant, read_spec
+from warpgs.training.command import parse
+
+
+def spec(*variants, seeds=(0,), options=None):
+    return SweepSpec("mine", "Mine", "fast", seeds, (), options or {}, variants or (Variant("full", "full", {}),))
+
+
+def plan(spec, scenes=None, out=None, **overrides):
+    return plan_cells(spec, scenes or {"as": "/nerfds/as"}, out, overrides)
+
+
+def test_there_is_a_cell_for_every_variant_capture_and_seed_and_seeds_come_last(tmp_path):
+    two = spec(Variant("a", "", {}), Variant("b", "", {}), seeds=(4, 7))
+    names = [cell.name for cell in plan(two, {"x": "/x", "y": "/y"}, tmp_path)]
+    first = ["x-a-seed4", "x-b-seed4", "y-a-seed4", "y-b-seed4"]
+    assert names == [*first, *(name.replace("4", "7") for name in first)]
+
+
+def test_the_command_line_precedes_the_variant_which_precedes_the_file(tmp_path):
+    made = spec(
+        Variant("v", "", {"factor": 2, "loss": {"ssim": 0.5}}),
+        options={"factor": 1, "loss": {"ssim": 0.1, "depth": 9.0}},
+    )
+    assert (plan(made, out=tmp_path)[0].config.factor, plan(made, out=tmp_path, factor=4)[0].config.factor) == (2, 4)
+    loss = plan(made, out=tmp_path)[0].config.loss
+    assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["fast"].loss.static)
+
+
+@pytest.mark.parametrize("name", ["ablation", "masks", "scenes", "seeds"])
+def test_the_command_of_a_cell_trains_its_config(name, tmp_path):
+    for cell in plan(read_spec(name), out=tmp_path):
+        assert parse(arguments(cell.config)) == cell.config
+        assert cell.command.startswith("warpgs train --preset ")
+
+
+def test_every_option_survives_the_way_through_the_command_line(tmp_path):
+    def changed(config):
+        values = {}
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            if dataclasses.is_dataclass(value):
+                values[field.name] = changed(value)
+            elif isinstance(value, bool):
+                values[field.name] = not value
+            elif isinstance(value, int | float):
+                values[field.name] = value + 1
+        return dataclasses.replace(config, **values)
+
+    config = changed(TrainConfig(preset="best"))
+    assert parse(arguments(config)) == config
+
+
+def test_two_cells_with_one_name_are_refused(tmp_path):
+    two = spec(Variant("c", "", {}), Variant("b-c", "", {}))
+    with pytest.raises(ValueError, match="two cells have the name a-b-c-seed0: variant b-c on a, and variant c on a-b"):
+        plan(two, {"a": "/a", "a-b": "/b"}, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"iterations": "many"}, "mine: variant v: iterations cannot be 'many'"),
+        ({"model": {"sh_degree": 4}}, "mine: variant v: expected model.appearance_degree <= model.sh_degree"),
+        ({"densify": {"every": 0}}, "mine: variant v: densify.every must be a number of at least 1"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_before_anything_is_trained(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        plan(spec(Variant("v", "", options)), out=tmp_path)
+
+
+def test_a_folder_of_captures_stands_for_the_captures_in_it(tmp_path):
+    for name in ("bell", "as"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "dataset.json").write_text("{}")
+    (tmp_path / "notes").mkdir()
+    found = find_scenes([str(tmp_path)])
+    assert found == {"as": str(tmp_path / "as"), "bell": str(tmp_path / "bell")}
+    assert find_scenes([str(tmp_path / "as")]) == {"as": str(tmp_path / "as")}
+
+
+def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
+    assert find_scenes([f"mine={tmp_path}", "builtin:room", "b=builtin:room"]) == {
+        "mine": str(tmp_path),
+        "room": "builtin:room",
+        "b": "builtin:room",
+    }
+
+
+def test_two_captures_with_one_name_are_refused():
+    with pytest.raises(
+        ValueError, match="two captures have the name as: /x/as and /y/as; name one with --data NAME=/y/as"
+    ):
+        find_scenes(["/x/as", "/y/as"])
+
+
+def test_a_sweep_without_captures_is_refused():
+    with pytest.raises(ValueError, match="give them with --data"):
+        find_scenes([])
+
+
+def test_a_query_is_appended_to_built_in_captures_only(tmp_path):
+    made = spec(Variant("n", "", {}, "depth=network"))
+    assert str(plan(made, {"s": "builtin:studio"}, tmp_path)[0].config.data) == "builtin:studio?depth=network"
+    with pytest.raises(
+        ValueError, match="variant n needs a plain built-in capture such as --data builtin:studio, got /as"
+    ):
+        plan(made, {"as": "/as"}, tmp_path)
+
+
+def test_a_cell_is_finished_once_its_last_iteration_was_evaluated(tmp_path):
+    (cell,) = plan(spec(), out=tmp_path, iterations=300)
+    assert cell.num_iterations == 300
+    assert finished_metrics(cell) is None
+    cell.folder.mkdir()
+    for iterations, expected in ((200, None), (300, {"iterations": 300})):
+        (cell.folder / "metrics.json").write_text(json.dumps({"iterations": iterations}))
+        assert finished_metrics(cell) == expected

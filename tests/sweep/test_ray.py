@@ -1,0 +1,195 @@
+"""Sweeps on a real Ray; with ``--cluster`` on two nodes, of which one is killed in the middle."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip("ray")
+
+from warpgs.sweep import ray_pool
+from warpgs.sweep.ray_pool import RayPool
+from warpgs.sweep.scheduler import ClusterGoneError
+from warpgs.sweep.worker import Job
+
+pytestmark = pytest.mark.filterwarnings("default")  # Ray's own
+
+
+def job(name, argument=""):
+    return Job(name, "", "", "", (argument,), "cpu")
+
+
+@pytest.fixture(scope="module")
+def pool():
+    def pretend(job):
+        import os
+        import time
+
+        if job.name == "crash":
+            os._exit(1)
+        if job.name == "bug":
+            raise RuntimeError("a bug")
+        if job.name.startswith("long"):
+            try:
+                open(job.arguments[0], "w").close()
+                for _ in range(600):
+                    time.sleep(0.1)
+            except KeyboardInterrupt:
+                open(job.arguments[0] + ".saved", "w").close()
+                raise
+        return job.arguments[0] or None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ray_pool, "run_job", pretend)
+        made = RayPool(None, None, 1, 1)
+    yield made
+    made.close()
+
+
+def results(pool, count):
+    found, deadline = {}, time.monotonic() + 60
+    while len(found) < count and time.monotonic() < deadline:
+        found.update({result.name: result for result in pool.wait(0.2)})
+    return found
+
+
+def test_jobs_report_success_failure_bugs_and_lost_workers(pool):
+    assert pool.device == "cpu"
+    for made in (job("good"), job("bad", "broken capture"), job("crash"), job("bug")):
+        pool.submit(made)
+    found = results(pool, 4)
+    assert (found["good"].error, found["bad"].error) == (None, "broken capture")
+    assert found["crash"].is_lost
+    assert not found["bug"].is_lost
+    assert "a bug" in found["bug"].error
+
+
+def test_stop_interrupts_what_runs_and_drops_what_waits(pool, tmp_path):
+    paths = [tmp_path / f"started{k}" for k in range(os.cpu_count() + 1)]
+    for k, path in enumerate(paths):
+        pool.submit(job(f"long{k}", str(path)))
+    deadline = time.monotonic() + 60
+    while sum(path.exists() for path in paths) < os.cpu_count() and time.monotonic() < deadline:
+        pool.wait(0.2)
+    stopped = time.monotonic()
+    pool.stop()
+    assert time.monotonic() - stopped < 20
+    started = [path for path in paths if path.exists()]
+    assert len(started) == os.cpu_count()
+    assert all(path.with_name(path.name + ".saved").exists() for path in started)
+
+
+def test_an_address_without_a_cluster_is_refused_at_once():
+    started = time.monotonic()
+    with pytest.raises(ConnectionError, match=r"there is no Ray cluster at 127\.0\.0\.1:9 .*refused"):
+        RayPool("127.0.0.1:9", None, 1, None)
+    with pytest.raises(ConnectionError, match="expected HOST:PORT"):
+        RayPool("auto", None, 1, None)
+    assert time.monotonic() - started < 5
+
+
+def test_a_training_that_fits_on_no_node_is_refused(pool):
+    with pytest.raises(ValueError, match="no node of the cluster has 1000 cores for a training: "):
+        pool._check_room(0.0, 1000)
+
+
+def test_a_cluster_whose_head_is_silent_is_gone(pool, monkeypatch):
+    monkeypatch.setattr(pool, "_head", "127.0.0.1:9")
+    monkeypatch.setattr(ray_pool, "MAX_SILENCE", 0.0)
+    monkeypatch.setattr(ray_pool, "PROBE_SECONDS", 0.01)
+    with pytest.raises(ClusterGoneError, match=r"the Ray cluster at 127\.0\.0\.1:9 is gone"):
+        results(pool, 1)
+
+
+# Real trainings on a real cluster -------------------------------------------------------------------------------------
+
+TOML = """
+preset = "quick"
+seeds = 4
+[options]
+model = {position_bands = 2, time_bands = 2, depth = 2, width = 8, skip = 1, max_static_points = 50, \
+dynamic_points = 20}
+loss.ssim = 0.0
+densify.max_gaussians = 120
+iterations = 150
+checkpoint_every = 10
+"""
+
+
+@pytest.fixture
+def cluster(request):
+    if not request.config.getoption("--cluster"):
+        pytest.skip("minutes; runs with --cluster")
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    made.workers = [made.add_node(num_cpus=1) for _ in range(2)]
+    yield made
+    made.shutdown()
+
+
+@contextlib.contextmanager
+def sweeping(cluster, folder):
+    """The command in a process of its own; yields it once two cells have written checkpoints."""
+    from tests import tiny
+
+    (folder / "tiny.toml").write_text(TOML)
+    command = [sys.executable, "-m", "warpgs", "sweep", "tiny.toml", "--data", f"tiny={tiny.write(folder / 'capture')}"]
+    command += ["--out", "out", "--address", cluster.address, "--cpus", "1"]
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        while process.poll() is None and len(list(folder.glob("out/*/checkpoints/*20.safetensors"))) < 2:
+            time.sleep(0.1)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def kill(node):
+    """Ends all of Ray on a node at once, as a power failure does; trainings must follow by themselves."""
+    started = [info.process.pid for infos in node.all_processes.values() for info in infos]
+    parents = ",".join(map(str, started))
+    workers = subprocess.run(["ps", "-o", "pid=", "--ppid", parents], capture_output=True, text=True).stdout.split()
+    for pid in [*started, *map(int, workers)]:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def test_a_node_that_dies_loses_only_its_running_cell_which_goes_on_elsewhere(cluster, tmp_path):
+    with sweeping(cluster, tmp_path) as process:
+        kill(cluster.workers[0])
+        output, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, output
+    assert output.count("lost: its node was lost (") == 1, output
+    assert "4 of 4 trainings finished" in output
+    resumed = [log.read_text().count("--resume") for log in tmp_path.glob("out/logs/*.log")]
+    assert sorted(resumed) == [0, 0, 0, 1]
+
+
+def test_ctrl_c_saves_the_running_cells_and_the_next_start_goes_on(cluster, tmp_path):
+    with sweeping(cluster, tmp_path) as process:
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=200)
+    assert process.returncode == 130, output
+    assert "stopped; the same command continues" in output
+    logs = "".join(log.read_text() for log in tmp_path.glob("out/logs/*.log"))
+    assert logs.count("; continue with --resume") == 2
+    with sweeping(cluster, tmp_path) as process:
+        output, _ = process.communicate(timeout=400)
+    assert process.returncode == 0, output
+    assert "4 of 4 trainings finished" in output
+
+
+def test_a_cluster_that_is_gone_leaves_one_line_and_the_tables(cluster, tmp_path):
+    with sweeping(cluster, tmp_path) as process:
+        kill(cluster.head_node)
+        output, _ = process.communicate(timeout=200)
+    assert process.returncode == 2, output
+    assert "warpgs sweep: the Ray cluster at" in output
+    assert "0 of 4 trainings finished" in output
+    assert (tmp_path / "out/report.html").exists()

@@ -1,0 +1,179 @@
+"""The command, with a pool that only pretends to train."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+
+from warpgs.cli import main
+from warpgs.runs.config_file import read_config
+from warpgs.sweep import run_sweep as module
+from warpgs.sweep.scheduler import ClusterGoneError, Result
+
+TOML = """
+title = "Mine"
+preset = "quick"
+seeds = 2
+options.iterations = 32
+[variants.full]
+[variants.plain]
+app = false
+"""
+
+
+@pytest.fixture
+def sweep(tmp_path, monkeypatch, finished_run):
+    """Runs the command; ``train(job)`` returns an error, and by default leaves a finished run behind."""
+
+    def finish(job):
+        folder = tmp_path / "out" / job.name
+        if not folder.exists():
+            shutil.copytree(finished_run, folder, ignore=shutil.ignore_patterns("checkpoints"))
+        (folder / "metrics.json").write_text(
+            json.dumps({"iterations": 32, "psnr": 20.0 + int(job.name[-1]), "train_seconds": 60.0, "peak_bytes": None})
+        )
+        (folder / "views.csv").write_text("name,time,psnr,ssim,lpips\nleft_000000,0,20,0.5,\n")
+
+    class Pretended:
+        device = "cpu"
+
+        def __init__(self, *_):
+            self.queue = []
+
+        def submit(self, job):
+            self.queue.append(job)
+
+        def wait(self, seconds):
+            job = self.queue.pop(0)
+            trained.append(job.name)
+            return [Result(job.name, train(job))]
+
+        def stop(self):
+            pass
+
+        def close(self):
+            pass
+
+    train, trained = finish, []
+    monkeypatch.setattr(module, "RayPool", Pretended)
+    (tmp_path / "mine.toml").write_text(TOML)
+
+    def run(*arguments, by=finish):
+        nonlocal train
+        train = by
+        trained.clear()
+        out = ["--out", str(tmp_path / "out")]
+        return main(["sweep", str(tmp_path / "mine.toml"), "--data", "as=/nerfds/as", *out, *arguments]), list(trained)
+
+    run.finish = finish
+    return run
+
+
+def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
+    code, trained = sweep()
+    assert code == 0
+    assert trained == ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"]
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
+    text = (tmp_path / "out/table.md").read_text()
+    assert f"warpgs train --preset quick --data /nerfds/as --out {tmp_path}/out/as-full-seed0 --iterations 32" in text
+    assert r"20.50 $\pm$ 0.71" in (tmp_path / "out/table.tex").read_text()
+    assert (tmp_path / "out/cells.csv").read_text().count("finished") == 4
+    assert "20.50 ± 0.71" in (tmp_path / "out/report.html").read_text()
+
+
+def test_the_same_command_trains_nothing_again_and_more_seeds_train_those(sweep):
+    sweep()
+    assert sweep() == (0, [])
+    assert sweep("--seeds", "3") == (0, ["as-full-seed2", "as-plain-seed2"])
+
+
+def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, capsys):
+    def fail(job):
+        return "warpgs train: broken" if job.name == "as-plain-seed0" else sweep.finish(job)
+
+    code, trained = sweep(by=fail)
+    assert code == 1
+    assert trained.count("as-plain-seed0") == 2
+    printed = capsys.readouterr().out
+    assert "[4/4] as-plain-seed0 failed: warpgs train: broken" in printed
+    assert "| plain | **21.00** | 1.0 | 1 of 2 |" in printed
+    assert "3 of 4 trainings finished" in printed
+    assert "as-plain-seed0: warpgs train: broken" in printed
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "warpgs: stopped; the same command continues"),
+        (
+            ClusterGoneError("the Ray cluster at host:6379 is gone"),
+            2,
+            "warpgs sweep: the Ray cluster at host:6379 is gone;",
+        ),
+    ],
+)
+def test_a_sweep_that_stops_says_so_prints_what_is_there_and_goes_on(sweep, capsys, error, code, message):
+    def stop(job):
+        if job.name == "as-plain-seed0":
+            raise error
+        return sweep.finish(job)
+
+    assert sweep(by=stop) == (code, ["as-full-seed0", "as-plain-seed0"])
+    captured = capsys.readouterr()
+    assert message in captured.out + captured.err
+    assert "| full | 20.00 | 1.0 | 1 of 2 |" in captured.out
+    assert sweep() == (0, ["as-plain-seed0", "as-full-seed1", "as-plain-seed1"])
+
+
+def test_results_of_other_options_are_never_mixed_in(sweep, capsys):
+    sweep()
+    code, trained = sweep("--iterations", "64")
+    assert (code, trained) == (2, [])
+    assert "as-full-seed0 was trained with other options" in capsys.readouterr().err
+
+
+def test_a_cell_that_ends_without_results_has_failed(sweep, capsys):
+    code, _ = sweep(by=lambda job: None)
+    assert code == 1
+    assert "as-full-seed0 failed: " in capsys.readouterr().out
+
+
+def test_tables_only_and_dry_run_train_nothing(sweep, tmp_path, capsys):
+    assert sweep("--dry-run") == (0, [])
+    assert not (tmp_path / "out").exists()
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert sweep("--tables-only") == (0, [])
+    assert "0 of 4 trainings finished" in capsys.readouterr().out
+
+
+def test_numbers_of_others_stand_beside(sweep, tmp_path, capsys):
+    (tmp_path / "peers.json").write_text(json.dumps({"D3DGS": {"as": {"psnr": 25.8}}}))
+    assert sweep("--compare", str(tmp_path / "peers.json"))[0] == 0
+    assert "| D3DGS | **25.80** |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--preset", "worst"], "--preset must be one of paper"),
+        (["--seeds", "0"], "--seeds must be 1 to 1000, got 0"),
+        (["--per-gpu", "0"], "--per-gpu must be 1 to 1000, got 0"),
+        (["--iterations", "1"], "iterations must be a number of at least 3, got 1"),
+    ],
+)
+def test_wrong_options_are_one_line(sweep, capsys, arguments, message):
+    assert sweep(*arguments) == (2, [])
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, tmp_path):
+    from pathlib import Path
+
+    from warpgs.runs.config_file import write_config
+
+    config = dataclasses.replace(read_config(finished_run), data=Path("builtin:room"))
+    write_config(tmp_path, config)
+    assert read_config(tmp_path).data == Path("builtin:room")

@@ -1,0 +1,98 @@
+"""Files of sweeps."""
+
+import pytest
+
+from warpgs.sweep.spec import read_spec, shipped
+
+
+def write(folder, text):
+    path = folder / "rates.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_file_is_read(tmp_path):
+    text = """
+    title = "Rates"
+    preset = "fast"
+    seeds = [3, 5]
+    data = ["nerfds/as"]
+    options.iterations = 500
+    [variants.slow]
+    label = "half the rate"
+    optim.networks = 4e-4
+    [variants.noisy]
+    query = "depth=network"
+    """
+    spec = read_spec(write(tmp_path, text))
+    assert (spec.name, spec.title, spec.preset, spec.seeds, spec.data) == (
+        "rates",
+        "Rates",
+        "fast",
+        (3, 5),
+        ("nerfds/as",),
+    )
+    assert spec.options == {"iterations": 500}
+    assert [(v.name, v.label, v.options, v.query) for v in spec.variants] == [
+        ("slow", "half the rate", {"optim": {"networks": 4e-4}}, ""),
+        ("noisy", "noisy", {}, "depth=network"),
+    ]
+
+
+def test_a_number_of_seeds_counts_from_0(tmp_path):
+    assert read_spec(write(tmp_path, "seeds = 3")).seeds == (0, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("variants.a.losss.ssim = 1", r"rates.toml: variant a: there is no option losss"),
+        ("variants.a.loss.sim = 1", r"rates.toml: variant a: there is no option loss.sim"),
+        ("variants.a.loss = 1", r"rates.toml: variant a: loss must be a table, got 1"),
+        ("variants.a.seed = 1", r"variant a: seed is not an option of one training"),
+        ("variants.a.label = 1", r"variant a: label and query must be texts"),
+        ("variants = 3", r"variants must be tables"),
+        ("variant.a = {}", r"there is no entry variant, expected title"),
+        ("preset = 'worst'", r"preset must be one of paper, .*, got 'worst'"),
+        ("seeds = 0", r"seeds must be a number of seeds \(1 to 1000\) or a list of different ones, got 0"),
+        ("seeds = 1000000000000", r"seeds must be a number"),
+        ("seeds = [1, 1]", r"seeds must be a number"),
+        ("data = 'nerfds'", r"data must be a list of captures, got 'nerfds'"),
+        ("title = ", r"rates.toml is not valid TOML"),
+    ],
+)
+def test_a_wrong_entry_is_named(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read_spec(write(tmp_path, text))
+
+
+def test_an_unknown_sweep_names_those_that_ship():
+    with pytest.raises(
+        ValueError, match=r"no sweep 'ablations', expected ablation, depth, masks, scenes, seeds or a \.toml"
+    ):
+        read_spec("ablations")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"none\.toml is missing"):
+        read_spec(str(tmp_path / "none.toml"))
+
+
+def test_the_ablation_adds_one_component_per_line_and_then_leaves_out_one():
+    variants = {v.name: v.options for v in read_spec("ablation").variants}
+    off = {name: {key for key, value in options.items() if value is False} for name, options in variants.items()}
+    assert off == {
+        "a": {"stage2", "app", "dap", "vdp"},
+        "b": {"app", "dap", "vdp"},
+        "c": {"dap", "vdp"},
+        "d": {"vdp"},
+        "e": set(),
+        "no-s2": {"stage2"},
+        "no-app": {"app"},
+        "no-dap": {"dap"},
+    }
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_sweep_that_ships_can_be_read(name):
+    assert read_spec(name).variants

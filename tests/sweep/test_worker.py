@@ -1,0 +1,110 @@
+"""A cell on its node: a child process, its log, and what is reported."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from warpgs.sweep import worker
+from warpgs.sweep.worker import Job, run_job
+
+
+def job(folder, *arguments):
+    running, log = str(folder / "running/cell"), str(folder / "logs/cell.log")
+    return Job("cell", str(folder / "cell"), log, running, arguments, "cpu")
+
+
+def replace_child(monkeypatch, program):
+    """The child runs a program of Python instead of a training; sys.argv[2:] are its arguments."""
+    popen = subprocess.Popen
+
+    def start(command, **options):
+        assert command[1:3] == ["-m", "warpgs.sweep.child"]
+        return popen([sys.executable, "-c", program, *command[3:]], **options)
+
+    monkeypatch.setattr(worker.subprocess, "Popen", start)
+
+
+def test_a_broken_capture_is_one_line(tmp_path):
+    made = job(tmp_path, "--preset", "quick", "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "cell"))
+    error = run_job(made)
+    assert error is not None
+    assert error.startswith(f"warpgs train: {tmp_path}/nowhere/dataset.json is missing")
+    assert "\n" not in error
+    assert not (tmp_path / "running/cell").exists()
+    assert not (tmp_path / "cell").exists()
+
+
+def test_a_new_cell_gets_its_arguments_and_one_that_has_begun_is_resumed(tmp_path, monkeypatch):
+    replace_child(monkeypatch, "import sys; print(sys.argv[2:])")
+    assert run_job(job(tmp_path, "--seed", "3")) is None
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell/config.json").write_text("{}")
+    assert run_job(job(tmp_path, "--seed", "3")) is None
+    lines = (tmp_path / "logs/cell.log").read_text().splitlines()
+    assert lines[1] == "['--seed', '3', '--device', 'cpu']"
+    assert lines[3] == f"['--resume', '{tmp_path}/cell', '--device', 'cpu']"
+
+
+def test_a_cell_that_is_killed_says_by_what(tmp_path, monkeypatch):
+    replace_child(monkeypatch, "import os; os.kill(os.getpid(), 9)")
+    assert run_job(job(tmp_path)) == "the training was killed by signal 9"
+
+
+def test_a_disk_that_is_full_names_the_host_and_the_file(tmp_path):
+    (tmp_path / "running").write_text("a file where a folder is needed")
+    error = run_job(job(tmp_path))
+    assert error is not None
+    assert "running/cell could not be written" in error
+
+
+def test_an_interrupt_is_passed_on_and_waited_for(tmp_path, monkeypatch):
+    program = (
+        "import signal, time, pathlib, sys\n"
+        "def stop(*_): time.sleep(0.3); pathlib.Path('saved').write_text(''); sys.exit(130)\n"
+        "signal.signal(signal.SIGINT, stop); pathlib.Path('started').write_text(''); time.sleep(60)"
+    )
+    replace_child(monkeypatch, program)
+    monkeypatch.chdir(tmp_path)
+
+    def interrupt():
+        while not (tmp_path / "started").exists():
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_job(job(tmp_path))
+    thread.join()
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_training_ends_with_its_worker(tmp_path):
+    program = (
+        "import os, subprocess, sys\n"
+        "code = 'import os, sys, time; from warpgs.sweep import child; import warpgs.training.command as c;'\n"
+        "code += 'c.main = lambda *_: (print(os.getpid(), flush=True), time.sleep(60));'\n"
+        "code += 'child.main([], int(sys.argv[1]))'\n"
+        "p = subprocess.Popen([sys.executable, '-c', code, str(os.getpid())], stdout=subprocess.PIPE)\n"
+        "print(p.stdout.readline().decode(), flush=True); os._exit(0)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    pid = int(done.stdout)
+    for _ in range(100):
+        if not alive(pid):
+            return
+        time.sleep(0.05)
+    pytest.fail("the training outlived its worker")
+
+
+def alive(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().split()[2] != "Z"
+    except FileNotFoundError:
+        return False

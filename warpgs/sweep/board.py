@@ -1,0 +1,146 @@
+"""The state of every cell, as files say it, and as a table in the terminal."""
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.live import Live
+from rich.table import Table
+
+from .cells import Cell, finished_metrics
+from .scheduler import Event
+from .worker import Job
+
+MAX_LINES = 30
+"""Maximum number of cells in the live table; those that run and fail come first."""
+
+REFRESH_SECONDS = 2.0
+ORDER = ("running", "failed", "retried", "lost", "queued", "stopped", "finished")
+
+
+class Board:
+    """Cells and what happens to them; a context that shows a live table if stdout is a terminal.
+
+    Args:
+        out: Folder of the sweep.
+        cells: Its cells.
+        log: Receives a line for each event if stdout is not a terminal.
+
+    Attributes:
+        metrics: Results by name of the cell, of those that have finished.
+        errors: Last error by name of the cell.
+        states: State by name of the cell: queued, running, retried, lost, failed, stopped or finished.
+    """
+
+    def __init__(self, out: Path, cells: Sequence[Cell], log: Any) -> None:
+        self.out, self.cells, self._log = out, cells, log
+        self.metrics: dict[str, Mapping[str, Any]] = {}
+        self.errors: dict[str, str] = {}
+        self.states: dict[str, str] = {}
+        self._hosts: dict[str, str] = {}
+        self._live: Live | None = None
+        self._refreshed = 0.0
+        for cell in cells:
+            self.read(cell)
+
+    def read(self, cell: Cell) -> None:
+        """Reads whether a cell has finished, and with which results."""
+        try:
+            metrics = finished_metrics(cell)
+        except ValueError as error:
+            metrics, self.errors[cell.name] = None, str(error)
+        self.states[cell.name] = "queued" if metrics is None else "finished"
+        if metrics is not None:
+            self.metrics[cell.name] = metrics
+
+    def jobs(self, device: str) -> list[Job]:
+        """What is left to do, in order."""
+        from .cells import arguments
+
+        return [
+            Job(
+                name=cell.name,
+                folder=str(cell.folder),
+                log=str(self.out / "logs" / f"{cell.name}.log"),
+                running=str(self._running / cell.name),
+                arguments=tuple(arguments(cell.config)),
+                device=device,
+            )
+            for cell in self.cells
+            if cell.name not in self.metrics
+        ]
+
+    @property
+    def _running(self) -> Path:
+        return self.out / "running"
+
+    def tell(self, event: Event) -> None:
+        """Takes note of how an attempt ended, and says so."""
+        self.states[event.name] = event.state
+        cell = next(cell for cell in self.cells if cell.name == event.name)
+        if event.error is None:
+            self.errors.pop(event.name, None)
+            self.read(cell)
+            if event.name not in self.metrics:
+                self.states[event.name], self.errors[event.name] = "failed", f"{cell.folder} has no results"
+        else:
+            self.errors[event.name] = event.error
+            with suppress(OSError):  # what a lost node left behind
+                (self._running / event.name).unlink(missing_ok=True)
+        if self._live is None:
+            done = sum(state in ("finished", "failed") for state in self.states.values())
+            reason = f": {self.errors[event.name]}" if event.name in self.errors else ""
+            self._log(f"[{done}/{len(self.cells)}] {event.name} {self.states[event.name]}{reason}")
+
+    def stop(self) -> None:
+        """Marks what has not ended as stopped."""
+        for name, state in self.states.items():
+            if state not in ("finished", "failed"):
+                self.states[name] = "stopped"
+
+    def poll(self) -> None:
+        """Reads which cells run, and refreshes the live table."""
+        if self._live is None or time.monotonic() - self._refreshed < REFRESH_SECONDS:
+            return
+        self._refreshed = time.monotonic()
+        self._hosts = {}
+        with suppress(OSError):  # files come and go meanwhile
+            for path in self._running.iterdir():
+                self._hosts[path.name] = path.read_text()[:60]
+        self._live.update(self.table())
+
+    def table(self) -> Table:
+        """The live table: one line per cell, running and failed ones first."""
+        states = {
+            name: "running" if name in self._hosts and state != "finished" else state
+            for name, state in self.states.items()
+        }
+        counts = Counter(states.values())
+        title = ", ".join(f"{counts[state]} {state}" for state in ORDER if counts[state])
+        table = Table("cell", "state", "PSNR [dB]", "", title=title, title_justify="left")
+        for cell in sorted(self.cells, key=lambda cell: ORDER.index(states[cell.name]))[:MAX_LINES]:
+            psnr = self.metrics.get(cell.name, {}).get("psnr")
+            note = self.errors.get(cell.name) or self._hosts.get(cell.name, "")
+            table.add_row(cell.name, states[cell.name], "" if psnr is None else f"{psnr:.2f}", note)
+        return table
+
+    def __enter__(self) -> "Board":
+        with suppress(FileNotFoundError):  # what a killed sweep left behind
+            for path in self._running.iterdir():
+                path.unlink()
+        if sys.stdout.isatty():
+            self._live = Live(self.table(), transient=True, auto_refresh=False)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None

@@ -1,0 +1,183 @@
+"""The cells of a sweep: every variant on every capture with every seed, each a run folder of its own."""
+
+import dataclasses
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from warpgs.config import TrainConfig, scaled
+from warpgs.data.builtin import is_builtin
+from warpgs.files import read_json
+from warpgs.presets import PRESETS
+from warpgs.runs.config_file import NAME as CONFIG_NAME
+from warpgs.runs.config_file import parse_config
+
+from .spec import SweepSpec, Variant
+
+MAX_CELLS = 100_000
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training of a sweep.
+
+    Attributes:
+        name: Unique name, and that of its run folder.
+        scene: Name of the capture.
+        variant: Name of the variant.
+        config: What is trained; ``out`` is the run folder.
+    """
+
+    name: str
+    scene: str
+    variant: str
+    config: TrainConfig
+
+    @property
+    def seed(self) -> int:
+        return self.config.seed
+
+    @property
+    def folder(self) -> Path:
+        assert self.config.out is not None
+        return self.config.out
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations of the whole run."""
+        schedule = scaled(self.config).schedule
+        return schedule.pretrain + schedule.stage1 + schedule.stage2
+
+    @property
+    def command(self) -> str:
+        """The command that trains it, for a shell."""
+        return shlex.join(["warpgs", "train", *arguments(self.config)])
+
+
+def find_scenes(data: Sequence[str]) -> dict[str, str]:
+    """Captures by name, in order.
+
+    Args:
+        data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
+
+    Raises:
+        ValueError: If there is none, or two have one name; the message names both.
+    """
+    if not data:
+        raise ValueError("a sweep needs captures: give them with --data")
+    scenes: dict[str, str] = {}
+    for text in data:
+        for name, path in _named(text):
+            if name in scenes:
+                raise ValueError(
+                    f"two captures have the name {name}: {scenes[name]} and {path}; name one with --data NAME={path}"
+                )
+            scenes[name] = path
+    return scenes
+
+
+def _named(text: str) -> Iterator[tuple[str, str]]:
+    name, equals, rest = text.partition("=")
+    if equals and name.replace("-", "").replace("_", "").isalnum() and not Path(text).exists():
+        yield name, rest if is_builtin(rest) else str(Path(rest).resolve())
+    elif is_builtin(text):
+        yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
+    else:
+        root = Path(text).resolve()
+        inside = [] if (root / "dataset.json").exists() else sorted(root.glob("*/dataset.json"))
+        yield from ((path.parent.name, str(path.parent)) for path in inside)
+        if not inside:
+            yield root.name, str(root)
+
+
+def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides: Mapping[str, Any]) -> list[Cell]:
+    """Every cell of a sweep: variants within captures within seeds, so that whole tables come first.
+
+    Args:
+        spec: The sweep.
+        scenes: Captures by name.
+        out: Folder of the sweep.
+        overrides: Options of every training that precede those of the file.
+
+    Raises:
+        ValueError: If options do not fit together, or two cells have one name; the message names what is wrong.
+    """
+    if len(spec.seeds) * len(scenes) * len(spec.variants) > MAX_CELLS:
+        raise ValueError(f"the sweep has more than {MAX_CELLS:,} cells")
+    cells: dict[str, Cell] = {}
+    for seed in spec.seeds:
+        for scene, data in scenes.items():
+            for variant in spec.variants:
+                cell = _cell(spec, variant, scene, data, seed, out, overrides)
+                if other := cells.get(cell.name):
+                    raise ValueError(
+                        f"two cells have the name {cell.name}: variant {other.variant} on {other.scene}, and variant "
+                        f"{variant.name} on {scene}; rename one of them"
+                    )
+                cells[cell.name] = cell
+    return list(cells.values())
+
+
+def _cell(
+    spec: SweepSpec, variant: Variant, scene: str, data: str, seed: int, out: Path, overrides: Mapping[str, Any]
+) -> Cell:
+    where = f"{spec.name}: variant {variant.name}"
+    if variant.query:
+        if not is_builtin(data) or "?" in data:
+            raise ValueError(f"{where} needs a plain built-in capture such as --data builtin:studio, got {data}")
+        data = f"{data}?{variant.query}"
+    options = dataclasses.asdict(PRESETS[spec.preset])
+    for layer in (spec.options, variant.options, overrides):
+        _update(options, layer)
+    name = f"{scene}-{variant.name}-seed{seed}"
+    config = parse_config(options, where)
+    config = dataclasses.replace(config, data=Path(data), out=out / name, seed=seed)
+    try:
+        scaled(config)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return Cell(name, scene, variant.name, config)
+
+
+def _update(options: dict[str, Any], layer: Mapping[str, Any]) -> None:
+    for name, value in layer.items():
+        if isinstance(value, dict):
+            _update(options[name], value)
+        else:
+            options[name] = value
+
+
+def arguments(config: TrainConfig) -> list[str]:
+    """Arguments of ``warpgs train`` for a config: its preset, and every option that differs from it."""
+    first = ["--preset", config.preset]
+    return first + [word for words in _different("", config, PRESETS[config.preset]) for word in words]
+
+
+def _different(prefix: str, config: Any, default: Any) -> Iterator[list[str]]:
+    for field in dataclasses.fields(config):
+        name, value, usual = field.name.replace("_", "-"), getattr(config, field.name), getattr(default, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _different(f"{prefix}{name}.", value, usual)
+        elif value != usual:
+            switch = f"--{prefix}{name}" if value else f"--{prefix}no-{name}"
+            yield [switch] if isinstance(value, bool) else [f"--{prefix}{name}", str(value)]
+
+
+def finished_metrics(cell: Cell) -> dict[str, Any] | None:
+    """The metrics of a cell that was trained to its end and evaluated; None if it was not.
+
+    Raises:
+        ValueError: If metrics.json is damaged; the message names it.
+    """
+    path = cell.folder / "metrics.json"
+    if not path.is_file():
+        return None
+    metrics = read_json(path)
+    return metrics if metrics.get("iterations") == cell.num_iterations else None
+
+
+def is_started(cell: Cell) -> bool:
+    """Whether there is a run to continue."""
+    return (cell.folder / CONFIG_NAME).is_file()

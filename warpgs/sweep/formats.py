@@ -1,0 +1,131 @@
+"""Tables as Markdown, LaTeX and CSV."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .cells import Cell
+from .table import Metric, Row, Statistic, Table, best_means
+
+NOTHING = "–"
+"""Stands where nothing was measured."""
+
+LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+    "×": r"$\times$",
+}
+ARROWS = {"higher": "↑", "lower": "↓", "": ""}
+
+
+def number(metric: Metric, value: float) -> str:
+    """A value with the digits of its column."""
+    return f"{value:,.{metric.digits}f}"
+
+
+def statistic(metric: Metric, value: Statistic | None) -> str:
+    """Mean ± standard deviation."""
+    if value is None:
+        return NOTHING
+    spread = "" if value.deviation is None else f" ± {number(metric, value.deviation)}"
+    return number(metric, value.mean) + spread
+
+
+def seeds(row: Row) -> str:
+    """How many seeds are in the means of a line."""
+    if not row.planned:
+        return NOTHING
+    return str(row.done) if row.done == row.planned else f"{row.done} of {row.planned}"
+
+
+def texts(table: Table) -> list[list[tuple[str, bool]]]:
+    """Every line as (text, whether it is the best of its column): the values, then the seeds."""
+    best = best_means(table)
+    return [
+        [
+            *(
+                (statistic(metric, value), value is not None and round(value.mean, metric.digits) == top)
+                for metric, value, top in zip(table.metrics, row.values, best, strict=True)
+            ),
+            (seeds(row), False),
+        ]
+        for row in table.rows
+    ]
+
+
+def heads(table: Table) -> list[str]:
+    """Titles of the columns, after the first."""
+    return [*(f"{metric.title} {ARROWS[metric.better]}".strip() for metric in table.metrics), "seeds"]
+
+
+def markdown(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
+    """A document with all tables and, below them, notes (one paragraph each)."""
+    parts = [f"# {title}", "Mean ± standard deviation over seeds."]
+    for table in tables:
+        lines = [["", *heads(table)], ["---"] * (len(table.metrics) + 2)]
+        for row, cells in zip(table.rows, texts(table), strict=True):
+            lines.append(
+                [row.label.replace("|", r"\|"), *(f"**{text}**" if is_best else text for text, is_best in cells)]
+            )
+        parts += [f"## {table.title}", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+    return "\n\n".join([*parts, *notes]) + "\n"
+
+
+def latex(title: str, tables: Sequence[Table]) -> str:
+    """A ``table`` environment for each table; needs the package booktabs."""
+    return "\n".join(_latex_table(title, table) for table in tables)
+
+
+def _latex_table(title: str, table: Table) -> str:
+    arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
+    titles = [escaped(metric.title) + arrows[metric.better] for metric in table.metrics]
+    lines = [
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{escaped(title)}: {escaped(table.title)}}}",
+        rf"\begin{{tabular}}{{l{'r' * len(titles)}}}",
+        r"\toprule",
+        " & ".join(["", *titles]) + r" \\",
+        r"\midrule",
+    ]
+    for row, cells in zip(table.rows, texts(table), strict=True):
+        values = [rf"\textbf{{{escaped(text)}}}" if is_best else escaped(text) for text, is_best in cells[:-1]]
+        lines.append(" & ".join([escaped(row.label), *values]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+
+
+def escaped(text: str) -> str:
+    """A text for LaTeX."""
+    return "".join(LATEX.get(c, c) for c in text)
+
+
+def cells_csv(cells: Sequence[tuple[Cell, str, Mapping[str, Any] | None]]) -> str:
+    """One line per cell: name, capture, variant, seed, state, every metric, command."""
+    names = list(dict.fromkeys(name for _, _, metrics in cells for name in metrics or {}))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["cell", "capture", "variant", "seed", "state", *names, "command"])
+    for cell, state, metrics in cells:
+        values = [(metrics or {}).get(name) for name in names]
+        row = [cell.name, cell.scene, cell.variant, cell.seed, state]
+        writer.writerow([*row, *("" if value is None else value for value in values), cell.command])
+    return text.getvalue()
+
+
+def means_csv(tables: Sequence[Table]) -> str:
+    """One line per line of every table: mean and standard deviation of each metric, unrounded."""
+    metrics = list(dict.fromkeys(metric for table in tables for metric in table.metrics))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    pairs = [name for metric in metrics for name in (metric.title, f"{metric.title} deviation")]
+    writer.writerow(["table", "row", *pairs, "seeds"])
+    for table in tables:
+        for row in table.rows:
+            found = dict(zip(table.metrics, row.values, strict=True))
+            numbers = [n for metric in metrics for n in (found.get(metric) or (None, None))]
+            writer.writerow([table.title, row.label, *("" if n is None else n for n in numbers), row.done])
+    return text.getvalue()

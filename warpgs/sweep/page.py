@@ -1,0 +1,61 @@
+"""The HTML report of a sweep: its tables, then the report of one run of each variant and capture."""
+
+import importlib.metadata
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+
+from warpgs.files import write_text
+from warpgs.report.evaluated_run import read_runs
+from warpgs.report.image_strips import saved_strips, saved_views
+from warpgs.report.page import Gallery, page, text
+from warpgs.report.write_report import extremes, groups
+
+from .cells import Cell
+from .formats import heads, texts
+from .table import Table
+
+NUM_VIEWS = 2
+"""Worst and best views of each capture; those whose images the evaluation saved."""
+
+REASON = "a sweep's report renders nothing"
+
+
+def write_page(path: Path, title: str, tables: Sequence[Table], notes: Sequence[str], cells: Sequence[Cell]) -> None:
+    """Writes the report.
+
+    Args:
+        path: The file.
+        title: Title of the sweep.
+        tables: Its tables.
+        notes: Paragraphs below the tables.
+        cells: Finished cells to show with curves and images.
+
+    Raises:
+        ValueError: If results of a cell are damaged.
+        OSError: If the file cannot be written.
+    """
+    runs = read_runs([cell.folder for cell in cells]) if cells else []
+    galleries = []
+    for group in groups(runs):
+        chosen = [runs[k] for k in group]
+        worst, best = extremes(chosen, NUM_VIEWS, set.intersection(*map(saved_views, chosen)))
+        if worst:
+            strips = [saved_strips(run, [*worst, *best], REASON) for run in chosen]
+            galleries.append(Gallery(group, worst, best, strips))
+    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    origin = f"written {now} by warpgs {importlib.metadata.version('warpgs')}"
+    write_text(path, page(runs, galleries, origin, title=title, introduction=_introduction(tables, notes)))
+
+
+def _introduction(tables: Sequence[Table], notes: Sequence[str]) -> str:
+    return "".join(map(_table, tables)) + "".join(f"<p class=note>{text(note)}</p>" for note in notes)
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{text(title)}</th>" for title in ("", *heads(table)))
+    rows = []
+    for row, cells in zip(table.rows, texts(table), strict=True):
+        values = "".join(f"<td{' class=best' if is_best else ''}>{text(value)}</td>" for value, is_best in cells)
+        rows.append(f"<tr><th>{text(row.label)}</th>{values}</tr>")
+    return f"<h2>{text(table.title)}</h2><table><tr>{head}</tr>{''.join(rows)}</table>"

@@ -1,0 +1,144 @@
+"""Runs cells on Ray: this machine, all of its GPUs, or a cluster."""
+
+import logging
+import socket
+import time
+import warnings
+from contextlib import suppress
+from typing import Any
+
+from warpgs.errors import one_line
+
+from .scheduler import ClusterGoneError, Result
+from .worker import GRACE_SECONDS, Job, run_job
+
+PROBE_SECONDS = 5.0
+"""Time for the head of a cluster to accept a connection, and between two such probes [s]."""
+
+MAX_SILENCE = 20.0
+"""Time without an accepted connection after which a cluster is gone [s]; Ray ends the program after 60 s."""
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError("a sweep needs Ray: pip install 'warpgs[sweep]'") from error
+    return ray
+
+
+class RayPool:
+    """A pool of Ray tasks, one for each cell.
+
+    Args:
+        address: HOST:PORT of the head of a cluster; None starts Ray on this machine.
+        device: Device of the trainings; CUDA if None and the cluster has GPUs.
+        per_gpu: Number of trainings that share a GPU.
+        cpus: Cores of each training; if None, 1 on a GPU and 2 without.
+
+    Raises:
+        ImportError: If Ray is not installed.
+        ConnectionError: If there is no cluster at the address.
+        ValueError: If no node has what a training needs.
+    """
+
+    def __init__(self, address: str | None, device: str | None, per_gpu: int, cpus: int | None) -> None:
+        self._ray = _import_ray()
+        self._connect(address)
+        total = self._ray.cluster_resources()
+        self.device = device or ("cuda" if total.get("GPU", 0) else "cpu")
+        gpus = 1.0 / per_gpu if self.device == "cuda" else 0.0
+        cores = cpus or (1 if gpus else min(2, round(total.get("CPU", 1))))
+        self._check_room(gpus, cores)
+        # Attempts are counted by the sweep, and a worker's memory must not outlive its training.
+        remote = self._ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=0, max_calls=1)
+        self._run = remote(run_job)
+        self._jobs: dict[Any, str] = {}
+        self._head = self._ray.get_runtime_context().gcs_address
+        self._heard = self._probed = time.monotonic()
+
+    def _connect(self, address: str | None) -> None:
+        if address is not None:
+            _probe(address)  # Ray would try for a minute and a half, and then end the program
+        logging.getLogger("ray").setLevel(logging.ERROR)
+        options = {} if address else {"include_dashboard": False}
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Ray's announcements of its future versions
+                self._ray.init(
+                    address or "local",
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    configure_logging=False,
+                    **options,
+                )
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise ConnectionError(f"Ray cannot be reached at {address or 'this machine'}: {one_line(error)}") from error
+
+    def _check_room(self, gpus: float, cores: int) -> None:
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        if not any(node.get("GPU", 0) >= gpus and node.get("CPU", 0) >= cores for node in nodes):
+            raise ValueError(
+                f"no node of the cluster has {cores} cores{f' and {gpus:g} GPUs' if gpus else ''} for a training: "
+                f"{', '.join(_described(node) for node in nodes) or 'there are no nodes'}"
+            )
+
+    def submit(self, job: Job) -> None:
+        """Queues a job."""
+        self._jobs[self._run.options(name=job.name).remote(job)] = job.name
+
+    def wait(self, seconds: float) -> list[Result]:
+        """The jobs that have ended since the last call; waits up to some seconds for the first.
+
+        Raises:
+            ClusterGoneError: If the head of the cluster has not answered for ``MAX_SILENCE``.
+        """
+        done, _ = self._ray.wait(list(self._jobs), timeout=seconds)
+        self._check_head()
+        return [self._result(reference) for reference in done]
+
+    def _result(self, reference: Any) -> Result:
+        name, errors = self._jobs.pop(reference), self._ray.exceptions
+        try:
+            return Result(name, self._ray.get(reference))
+        except (errors.NodeDiedError, errors.WorkerCrashedError, errors.ObjectLostError) as error:
+            return Result(name, f"its node was lost ({type(error).__name__})", is_lost=True)
+        except errors.RayError as error:
+            lines = [line for line in str(error).splitlines() if line.strip()]
+            return Result(name, one_line(ValueError(lines[-1] if lines else type(error).__name__))[:300])
+
+    def _check_head(self) -> None:
+        now = time.monotonic()
+        if now - self._probed < PROBE_SECONDS:
+            return
+        self._probed = now
+        with suppress(ConnectionError):
+            _probe(self._head)
+            self._heard = now
+        if now - self._heard > MAX_SILENCE:
+            raise ClusterGoneError(f"the Ray cluster at {self._head} is gone")
+
+    def stop(self) -> None:
+        """Drops what is queued, and interrupts what runs and waits until it has saved a checkpoint."""
+        for reference in self._jobs:
+            self._ray.cancel(reference)
+        self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=GRACE_SECONDS + 10.0)
+
+    def close(self) -> None:
+        """Disconnects; a Ray that was started here ends."""
+        self._ray.shutdown()
+
+
+def _probe(address: str) -> None:
+    """Raises ConnectionError unless something listens at HOST:PORT."""
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), PROBE_SECONDS).close()
+    except (OSError, ValueError, OverflowError) as error:
+        raise ConnectionError(
+            f"there is no Ray cluster at {address} (expected HOST:PORT of its head): {one_line(error)}"
+        ) from error
+
+
+def _described(node: dict[str, float]) -> str:
+    return f"{node.get('CPU', 0):g} cores and {node.get('GPU', 0):g} GPUs"

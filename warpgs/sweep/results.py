@@ -1,0 +1,67 @@
+"""The files with a sweep's results: table.md, table.tex, table.csv, cells.csv and report.html."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from warpgs.files import write_text
+
+from .board import Board
+from .cells import Cell
+from .formats import cells_csv, latex, markdown, means_csv
+from .page import write_page
+from .spec import SweepSpec
+from .table import Measured, Peers, Table, make_tables
+
+
+def tables_of(board: Board, spec: SweepSpec, peers: Peers) -> list[Table]:
+    """The tables of what has finished."""
+    labels = {variant.name: variant.label for variant in spec.variants}
+    cells = [Measured(cell.variant, cell.scene, cell.seed, board.metrics.get(cell.name)) for cell in board.cells]
+    return make_tables(cells, labels, peers)
+
+
+def notes_of(board: Board) -> list[str]:
+    """Paragraphs below the tables: how much has finished, how long it took, and what failed and why."""
+    seconds = [metrics.get("train_seconds") for metrics in board.metrics.values()]
+    hours = sum(value for value in seconds if isinstance(value, int | float)) / 3600.0
+    notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {hours:.2f} hours of training in all."]
+    reasons: dict[str, list[str]] = {}
+    for name, error in board.errors.items():
+        if board.states[name] != "finished":
+            reasons.setdefault(error, []).append(name)
+    return notes + [f"{', '.join(names)}: {error}" for error, names in reasons.items()]
+
+
+def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> str:
+    """Writes every file but the report; returns the tables as Markdown, without the commands.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    tables, notes = tables_of(board, spec, peers), notes_of(board)
+    text = markdown(spec.title, tables, notes)
+    commands = "\n".join(cell.command for cell in board.cells)
+    write_text(out / "table.md", f"{text}\n## Commands\n\n```sh\n{commands}\n```\n")
+    write_text(out / "table.tex", latex(spec.title, tables))
+    write_text(out / "table.csv", means_csv(tables))
+    lines = [(cell, board.states[cell.name], board.metrics.get(cell.name)) for cell in board.cells]
+    write_text(out / "cells.csv", cells_csv(lines))
+    return text
+
+
+def write_report(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None:
+    """Writes report.html: the tables, and curves and images of the first finished seed of each variant and capture.
+
+    Raises:
+        ValueError: If results of a cell are damaged.
+        OSError: If the file cannot be written.
+    """
+    write_page(out / "report.html", spec.title, tables_of(board, spec, peers), notes_of(board), _representatives(board))
+
+
+def _representatives(board: Board) -> Sequence[Cell]:
+    first: dict[tuple[str, str], Cell] = {}
+    for cell in board.cells:
+        if cell.name in board.metrics and (cell.folder / "views.csv").is_file():
+            first.setdefault((cell.scene, cell.variant), cell)
+    return list(first.values())

@@ -1,0 +1,130 @@
+"""``warpgs sweep``: plan, train what is missing, write the tables."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warpgs.data.builtin import builtin_folder, is_builtin
+from warpgs.errors import FAILED, one_line
+from warpgs.files import read_json, write_json
+from warpgs.presets import PRESETS
+from warpgs.runs.run import lock_folder
+
+from .board import Board
+from .cells import Cell, find_scenes, is_started, plan_cells
+from .command import Sweep
+from .peers import read_peers
+from .ray_pool import RayPool
+from .results import write_report, write_tables
+from .scheduler import Event, run_jobs
+from .spec import MAX_SEEDS, SweepSpec, read_spec
+from .table import Peers
+
+INDEX = "sweep.json"
+"""File in the folder of a sweep with the command of each cell, so that results of other options are never mixed in."""
+
+INCOMPLETE = 1
+"""Exit code if cells failed."""
+
+Log = Callable[[str], None]
+
+
+def run_sweep(options: Sweep, log: Log) -> int:
+    """Trains what is missing, then writes and prints the tables; returns the exit code.
+
+    Args:
+        options: Options of the command.
+        log: Receives lines for the user.
+
+    Raises:
+        ValueError: If options, the sweep's file or the plan are wrong, or the folder holds another sweep's results.
+        ImportError: If Ray is not installed.
+        OSError: If the tables cannot be written.
+        KeyboardInterrupt: After Ctrl-C; the tables of what is finished are written.
+    """
+    spec = _spec(options)
+    out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
+    cells = plan_cells(spec, find_scenes(spec.data), out, _overrides(options))
+    peers = read_peers(options.compare) if options.compare else {}
+    if options.dry_run:
+        log("\n".join(cell.command for cell in cells))
+        return 0
+    out.mkdir(parents=True, exist_ok=True)
+    with lock_folder(out):
+        _check_index(out, cells)
+        board = Board(out, cells, log)
+        return _run(options, spec, board, peers, log)
+
+
+def _spec(options: Sweep) -> SweepSpec:
+    """The sweep's file, changed by the command line."""
+    spec = read_spec(options.sweep)
+    if options.preset is not None and options.preset not in PRESETS:
+        raise ValueError(f"--preset must be one of {', '.join(PRESETS)}, got {options.preset!r}")
+    for name in ("seeds", "per_gpu", "cpus"):
+        value = getattr(options, name)
+        if value is not None and not 1 <= value <= MAX_SEEDS:
+            raise ValueError(f"--{name.replace('_', '-')} must be 1 to {MAX_SEEDS}, got {value}")
+    return dataclasses.replace(
+        spec,
+        preset=options.preset or spec.preset,
+        seeds=tuple(range(options.seeds)) if options.seeds else spec.seeds,
+        data=options.data or spec.data,
+    )
+
+
+def _overrides(options: Sweep) -> dict[str, Any]:
+    lpips = None if options.lpips is None else str(options.lpips.resolve())
+    given = {"iterations": options.iterations, "factor": options.factor, "lpips": lpips}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _check_index(out: Path, cells: list[Cell]) -> None:
+    """Writes the command of each cell; refuses a cell that was begun with another one."""
+    path = out / INDEX
+    known = read_json(path) if path.exists() else {}
+    for cell in cells:
+        if is_started(cell) and known.get(cell.name) != cell.command:
+            raise ValueError(
+                f"{cell.folder} was trained with other options ({known.get(cell.name)}): choose another --out"
+            )
+    write_json(path, {**known, **{cell.name: cell.command for cell in cells}})
+
+
+def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> int:
+    code, stopped = 0, False
+    try:
+        if not options.tables_only:
+            _train(options, spec, board, peers)
+    except ConnectionError as error:
+        log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
+        code = FAILED
+    except KeyboardInterrupt:
+        stopped = True
+    if code or stopped:
+        board.stop()
+    log(write_tables(board.out, spec, board, peers))
+    write_report(board.out, spec, board, peers)
+    log(f"table.md, table.tex, table.csv, cells.csv and report.html are in {board.out}")
+    if stopped:
+        raise KeyboardInterrupt("stopped; the same command continues")
+    return code or (INCOMPLETE if "failed" in board.states.values() else 0)
+
+
+def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers) -> None:
+    if not board.jobs(""):
+        return
+
+    def on_event(event: Event) -> None:
+        board.tell(event)
+        write_tables(board.out, spec, board, peers)  # Ray may end this program
+
+    pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
+    try:
+        for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
+            builtin_folder(data)  # once, not in every cell
+        with board:
+            run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
+    finally:
+        pool.close()

@@ -1,0 +1,175 @@
+"""What a sweep trains: a TOML file, or one of those that ship.
+
+title = "Learning rates"
+preset = "best"                          # a preset of warpgs train
+seeds = 3                                # seeds 0, 1 and 2; a list names them
+data = ["nerfds/as", "cup=other/cup"]    # captures, or folders of captures; NAME=PATH gives a name
+
+[options]                                # of every training, as in warpgs train
+iterations = 5_000
+
+[variants.slow]
+label = "half the rate"                  # in the tables; the variant's name if omitted
+optim.networks = 4e-4
+
+[variants.noisy]
+query = "depth=network"                  # appended to the name of a built-in capture, after "?"
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from warpgs.config import TrainConfig
+from warpgs.files import read_bounded
+from warpgs.presets import PRESETS
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+FOLDER = Path(__file__).parent / "sweeps"
+"""The sweeps that ship, as <name>.toml."""
+
+MAX_BYTES = 1 << 20
+"""Maximum size of a sweep's file [bytes]."""
+
+MAX_SEEDS = 1000
+RESERVED = ("data", "out", "resume", "preset", "seed", "device")
+"""Options of a training that the sweep sets."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One line of the table.
+
+    Attributes:
+        name: Unique name, part of the names of run folders.
+        label: What tables call it.
+        options: Options of the training, nested as in ``TrainConfig``.
+        query: Appended to the name of a built-in capture; may be empty.
+    """
+
+    name: str
+    label: str
+    options: Mapping[str, Any]
+    query: str = ""
+
+
+@dataclass(frozen=True)
+class SweepSpec:
+    """A sweep, as its file describes it.
+
+    Attributes:
+        name: Name of the file, without its ending.
+        title: Title of the tables.
+        preset: Preset of every training.
+        seeds: Seeds of every variant.
+        data: Captures, as on the command line; may be empty.
+        options: Options of every training, nested as in ``TrainConfig``; those of a variant come before them.
+        variants: In the order of the table.
+    """
+
+    name: str
+    title: str
+    preset: str
+    seeds: tuple[int, ...]
+    data: tuple[str, ...]
+    options: Mapping[str, Any]
+    variants: tuple[Variant, ...]
+
+
+def shipped() -> list[str]:
+    """Names of the sweeps that ship."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def read_spec(name: str) -> SweepSpec:
+    """A sweep that ships, by its name, or one from a TOML file.
+
+    Raises:
+        ValueError: If there is no such sweep, or its file is damaged or has unknown entries; the message names it.
+    """
+    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    if not name.endswith(".toml") and name not in shipped():
+        raise ValueError(f"there is no sweep {name!r}, expected {', '.join(shipped())} or a .toml file")
+    try:
+        values = tomllib.loads(read_bounded(path, MAX_BYTES).decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path} is not valid TOML: {error}") from error
+    return _parse(path, values)
+
+
+def _parse(path: Path, values: dict[str, Any]) -> SweepSpec:
+    _check_keys(f"{path}", values, ("title", "preset", "seeds", "data", "options", "variants"))
+    preset = values.get("preset", "best")
+    if preset not in PRESETS:
+        raise ValueError(f"{path}: preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    variants = values.get("variants", {"full": {}})
+    if not isinstance(variants, dict) or not variants:
+        raise ValueError(f"{path}: variants must be tables, one for each line of the result")
+    options = values.get("options", {})
+    check_options(f"{path}: options", options)
+    title, data = values.get("title", path.stem), values.get("data", [])
+    if not isinstance(title, str):
+        raise ValueError(f"{path}: title must be a text, got {title!r}")
+    if not isinstance(data, list) or not all(isinstance(item, str) for item in data):
+        raise ValueError(f"{path}: data must be a list of captures, got {data!r}")
+    parsed = tuple(_variant(path, name, variant) for name, variant in variants.items())
+    seeds = _seeds(path, values.get("seeds", 1))
+    return SweepSpec(path.stem, title, preset, seeds, tuple(data), options, parsed)
+
+
+def _variant(path: Path, name: str, values: Any) -> Variant:
+    where = f"{path}: variant {name}"
+    if not isinstance(values, dict):
+        raise ValueError(f"{where} must be a table, got {values!r}")
+    label, query = values.get("label", name), values.get("query", "")
+    if not isinstance(label, str) or not isinstance(query, str):
+        raise ValueError(f"{where}: label and query must be texts, got {label!r} and {query!r}")
+    options = {key: value for key, value in values.items() if key not in ("label", "query")}
+    check_options(where, options)
+    return Variant(name, label, options, query)
+
+
+def _seeds(path: Path, seeds: Any) -> tuple[int, ...]:
+    chosen = list(range(min(seeds, MAX_SEEDS + 1))) if type(seeds) is int else seeds
+    valid = isinstance(chosen, list) and all(type(seed) is int and seed >= 0 for seed in chosen)
+    if not valid or not 0 < len(chosen) <= MAX_SEEDS or len(set(chosen)) < len(chosen):
+        raise ValueError(
+            f"{path}: seeds must be a number of seeds (1 to {MAX_SEEDS}) or a list of different ones, got {seeds!r}"
+        )
+    return tuple(chosen)
+
+
+def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str = "") -> None:
+    """Refuses what ``TrainConfig`` has no field for, or what the sweep sets itself; types are checked later.
+
+    Args:
+        where: What the options belong to, for the message.
+        options: Parsed TOML.
+        cls: The dataclass that they are fields of.
+        prefix: Names of the dataclasses around it, with dots.
+
+    Raises:
+        ValueError: If there is an unknown option; the message names it.
+    """
+    if not isinstance(options, dict):
+        raise ValueError(f"{where}: {prefix.rstrip('.') or 'options'} must be a table, got {options!r}")
+    known = {field.name: field for field in fields(cls)}
+    for name, value in options.items():
+        if name not in known:
+            raise ValueError(f"{where}: there is no option {prefix}{name}")
+        if not prefix and name in RESERVED:
+            raise ValueError(f"{where}: {name} is not an option of one training: the sweep sets it")
+        default = known[name].default_factory
+        if isinstance(default, type) and is_dataclass(default):
+            check_options(where, value, default, f"{prefix}{name}.")
+
+
+def _check_keys(where: str, values: dict[str, Any], known: Sequence[str]) -> None:
+    if unknown := sorted(set(values) - set(known)):
+        raise ValueError(f"{where}: there is no entry {unknown[0]}, expected {', '.join(known)}")

@@ -1,0 +1,212 @@
+"""Means over seeds and captures: the content of every table, whatever its format."""
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+
+class Metric(NamedTuple):
+    """A column.
+
+    Attributes:
+        key: Name in metrics.json; "num_gaussians" is the sum of both branches.
+        title: Head of the column.
+        better: "higher", "lower", or "" where neither is.
+        digits: Digits after the point.
+        unit: One unit of the table in units of metrics.json.
+    """
+
+    key: str
+    title: str
+    better: str
+    digits: int
+    unit: float = 1.0
+
+
+METRICS = (
+    Metric("psnr", "PSNR [dB]", "higher", 2),
+    Metric("ssim", "SSIM", "higher", 4),
+    Metric("lpips", "LPIPS", "lower", 4),
+    Metric("psnr_static", "static [dB]", "higher", 2),
+    Metric("psnr_dynamic", "dynamic [dB]", "higher", 2),
+    Metric("masked_psnr", "mPSNR [dB]", "higher", 2),
+    Metric("masked_ssim", "mSSIM", "higher", 4),
+    Metric("train_seconds", "time [min]", "lower", 1, 60.0),
+    Metric("peak_bytes", "memory [GB]", "lower", 2, 1e9),
+    Metric("num_gaussians", "Gaussians", "", 0),
+    Metric("fps", "FPS", "higher", 0),
+)
+"""Columns, in order; one without any value is omitted."""
+
+ALL_SCENES = "mean"
+"""Name of the table of means over captures, in peers.json, too."""
+
+
+class Statistic(NamedTuple):
+    """A value of a table.
+
+    Attributes:
+        mean: Mean over seeds.
+        deviation: Sample standard deviation over seeds; None with one seed.
+    """
+
+    mean: float
+    deviation: float | None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A cell with its results.
+
+    Attributes:
+        variant: Name of its variant.
+        scene: Name of its capture.
+        seed: Its seed.
+        metrics: Content of metrics.json; None if it is not finished.
+    """
+
+    variant: str
+    scene: str
+    seed: int
+    metrics: Mapping[str, Any] | None
+
+
+class Row(NamedTuple):
+    """A line of a table.
+
+    Attributes:
+        label: Name of the variant or of a peer.
+        values: One per metric of the table; None where not measured.
+        done: Number of seeds in the means.
+        planned: Number of seeds asked for; 0 for a peer.
+    """
+
+    label: str
+    values: tuple[Statistic | None, ...]
+    done: int
+    planned: int
+
+
+class Table(NamedTuple):
+    """A table.
+
+    Attributes:
+        title: What it is about.
+        metrics: Its columns.
+        rows: Its lines; first the variants, then the peers.
+    """
+
+    title: str
+    metrics: tuple[Metric, ...]
+    rows: tuple[Row, ...]
+
+
+Peers = Mapping[str, Mapping[str, Mapping[str, Statistic]]]
+"""Numbers of others by method, capture and metric."""
+
+
+def make_tables(cells: Sequence[Measured], labels: Mapping[str, str], peers: Peers) -> list[Table]:
+    """The table of means over captures, if there are several, and one for each capture.
+
+    Captures on which nothing has finished are left out. A mean over captures exists for a seed that has finished on
+    all others: each capture counts the same.
+
+    Args:
+        cells: Every cell of the sweep.
+        labels: Label of every variant, in the order of the lines.
+        peers: Numbers of others, shown beside.
+    """
+    planned = len({cell.scene for cell in cells})
+    scenes = list(dict.fromkeys(cell.scene for cell in cells if cell.metrics is not None))
+    groups = [(scene, [scene]) for scene in scenes]
+    if len(scenes) > 1:
+        count = f"{planned}" if len(scenes) == planned else f"{len(scenes)} of {planned}"
+        groups.insert(0, (f"Mean over {count} captures", scenes))
+    tables = []
+    for title, chosen in groups:
+        seeds = {v: _by_seed([c for c in cells if c.variant == v and c.scene in chosen]) for v in labels}
+        rows = [_row(labels[v], found, len(chosen)) for v, found in seeds.items()]
+        rows += [row for name, numbers in peers.items() if (row := _peer_row(name, numbers, chosen))]
+        tables.append(_without_empty(Table(title, METRICS, tuple(rows))))
+    return tables
+
+
+def _by_seed(cells: Iterable[Measured]) -> dict[int, list[Mapping[str, Any] | None]]:
+    found: dict[int, list[Mapping[str, Any] | None]] = {}
+    for cell in cells:
+        found.setdefault(cell.seed, []).append(cell.metrics)
+    return found
+
+
+def _row(label: str, seeds: Mapping[int, list[Mapping[str, Any] | None]], num_scenes: int) -> Row:
+    complete = [
+        known
+        for group in seeds.values()
+        if len(known := [metrics for metrics in group if metrics is not None]) == num_scenes
+    ]
+    values = tuple(_statistic([_mean(metric, group) for group in complete]) for metric in METRICS)
+    return Row(label, values, len(complete), len(seeds))
+
+
+def _mean(metric: Metric, group: Sequence[Mapping[str, Any]]) -> float | None:
+    """Mean over captures; None unless each has the value."""
+    values = [value_of(metric, metrics) for metrics in group]
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+def value_of(metric: Metric, metrics: Mapping[str, Any]) -> float | None:
+    """A metric of one cell, in the unit of the table; None where not measured."""
+    if metric.key == "num_gaussians":
+        parts = [metrics.get("num_static"), metrics.get("num_dynamic")]
+        value = sum(parts) if all(isinstance(part, int) for part in parts) else None  # type: ignore[arg-type]
+    else:
+        value = metrics.get(metric.key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return value / metric.unit
+
+
+def _statistic(values: Sequence[float | None]) -> Statistic | None:
+    """Mean and deviation over seeds; None unless every seed has the value."""
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return None
+    return Statistic(statistics.fmean(known), statistics.stdev(known) if len(known) > 1 else None)
+
+
+def _peer_row(name: str, numbers: Mapping[str, Mapping[str, Statistic]], scenes: Sequence[str]) -> Row | None:
+    if len(scenes) == 1 or ALL_SCENES in numbers:
+        found = numbers.get(scenes[0] if len(scenes) == 1 else ALL_SCENES, {})
+        values = [found.get(metric.key) for metric in METRICS]
+    elif all(scene in numbers for scene in scenes):
+        columns = [[numbers[scene].get(metric.key) for scene in scenes] for metric in METRICS]
+        means = [None if None in column else statistics.fmean(s.mean for s in column if s) for column in columns]
+        values = [None if mean is None else Statistic(mean, None) for mean in means]
+    else:
+        return None
+    scaled = tuple(value and _in_unit(value, metric) for value, metric in zip(values, METRICS, strict=True))
+    return Row(name, scaled, 0, 0) if any(scaled) else None
+
+
+def _in_unit(value: Statistic, metric: Metric) -> Statistic:
+    return Statistic(value.mean / metric.unit, None if value.deviation is None else value.deviation / metric.unit)
+
+
+def _without_empty(table: Table) -> Table:
+    """The table without the columns in which no line has a value."""
+    kept = [k for k in range(len(table.metrics)) if any(row.values[k] is not None for row in table.rows)]
+    rows = tuple(row._replace(values=tuple(row.values[k] for k in kept)) for row in table.rows)
+    return Table(table.title, tuple(table.metrics[k] for k in kept), rows)
+
+
+def best_means(table: Table) -> list[float | None]:
+    """The best mean of each column, as it is printed; None where no value is better than another."""
+    best: list[float | None] = []
+    for k, metric in enumerate(table.metrics):
+        means = [round(value.mean, metric.digits) for row in table.rows if (value := row.values[k]) is not None]
+        choose = {"higher": max, "lower": min}.get(metric.better)
+        best.append(choose(means) if choose and len(set(means)) > 1 else None)
+    return best

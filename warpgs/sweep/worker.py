@@ -1,0 +1,108 @@
+"""Runs one cell in a child process; the part of a sweep that happens on the nodes of a cluster."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from warpgs.errors import one_line
+from warpgs.files import write_text
+
+POLL_SECONDS = 0.2
+GRACE_SECONDS = 120.0
+"""Time that a cell has to finish its iteration and save a checkpoint when the sweep is stopped [s]."""
+
+MAX_REASON = 300
+"""Maximum number of characters of the reason of a failure."""
+
+LAST_BYTES = 1 << 14
+"""Bytes at the end of a log in which the reason is looked for."""
+
+
+class Job(NamedTuple):
+    """What a node needs to know about a cell; only plain values, which are sent over the network.
+
+    Attributes:
+        name: Name of the cell.
+        folder: Run folder.
+        log: File that its output is appended to.
+        running: File that exists while it runs, and holds the name of the host.
+        arguments: Arguments of ``warpgs train`` for a new run.
+        device: Device to train on.
+    """
+
+    name: str
+    folder: str
+    log: str
+    running: str
+    arguments: tuple[str, ...]
+    device: str
+
+
+def run_job(job: Job) -> str | None:
+    """Trains and evaluates a cell, from its newest checkpoint if there is one.
+
+    Returns:
+        None on success, else one line that says why it failed.
+
+    Raises:
+        KeyboardInterrupt: If it was stopped; a checkpoint was saved.
+    """
+    running = Path(job.running)
+    try:
+        write_text(running, socket.gethostname())
+        return _train(job)
+    except OSError as error:  # a full disk, or a file system that is not mounted on this node
+        return f"{socket.gethostname()}: {one_line(error)}"
+    finally:
+        with suppress(OSError):
+            running.unlink(missing_ok=True)
+
+
+def _train(job: Job) -> str | None:
+    resumed = (Path(job.folder) / "config.json").is_file()
+    arguments = ["--resume", job.folder] if resumed else list(job.arguments)
+    arguments += ["--device", job.device]
+    Path(job.log).parent.mkdir(parents=True, exist_ok=True)
+    with open(job.log, "a") as log:
+        log.write(f"{socket.gethostname()}: warpgs train {' '.join(arguments)}\n")
+        log.flush()
+        command = [sys.executable, "-m", "warpgs.sweep.child", str(os.getpid()), *arguments]
+        # A session of its own: Ctrl-C in the terminal reaches the sweep, which stops its cells itself.
+        child = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        code = _wait(child)
+    if code == 0:
+        return None
+    return _last_line(Path(job.log)) if code > 0 else f"the training was killed by signal {-code}"
+
+
+def _wait(child: subprocess.Popen[bytes]) -> int:
+    """The exit code; an interrupt is passed on, once, and waited for."""
+    try:
+        while True:
+            with suppress(subprocess.TimeoutExpired):  # in steps, so that Ray can interrupt this thread
+                return child.wait(POLL_SECONDS)
+    finally:
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+            try:
+                child.wait(GRACE_SECONDS)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+
+
+def _last_line(log: Path) -> str:
+    """The last line of a log, where commands and exceptions say what went wrong."""
+    with open(log, "rb") as file:
+        file.seek(max(0, log.stat().st_size - LAST_BYTES))
+        lines = file.read().decode(errors="replace").splitlines()
+    last = deque((line.strip() for line in lines if line.strip()), maxlen=1)
+    return last[0][:MAX_REASON] if last else f"it wrote nothing into {log}"
