@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from warpgs.data import studio
 from warpgs.data.builtin import builtin_folder
 from warpgs.data.degraded_depth import DegradedDepth
-from warpgs.data.loaders import load_capture
+from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.studio import StudioSize, studio_capture, trace
 
 SMALL = StudioSize(width=64, height=36, num_frames=4, num_samples=2, num_points=200)
@@ -114,6 +115,7 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch):
     monkeypatch.setattr(studio, "StudioSize", lambda: SMALL)
     capture = load_capture("builtin:studio?depth=none")
     assert len(capture.train) == 4
+    assert recognize(Path("builtin:studio")) == "nerfds"
     monkeypatch.setattr(studio, "write_studio", lambda *_: pytest.fail("made again"))
     assert builtin_folder("builtin:studio").name == "studio"
     assert load_capture("builtin:studio?depth=network").frame("left_000000").inverse_depth is not None

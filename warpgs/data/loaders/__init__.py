@@ -88,6 +88,7 @@ def load_capture(
 
 def recognize(root: Path) -> str:
     """The layout of a capture, as a key of ``LOADERS``: ``layout`` in its dataset.json, or that of its files."""
+    root = builtin_folder(root) if is_builtin(root) else root
     try:
         named = read_json(root / "dataset.json").get("layout")
     except ValueError:  # no file, or one that the loader reports
