@@ -36,6 +36,31 @@ def test_a_video_keeps_red_red(tmp_path):
     assert max(blue, green) < 50
 
 
+COLORS = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (255, 255, 255), (0, 0, 0), (180, 90, 20)]
+
+
+@pytest.mark.parametrize("size", [(48, 64), (720, 1280)])
+def test_players_show_the_colors_of_the_pixels(tmp_path, size):
+    """OpenCV and FFmpeg convert by the tags of the file, as players do."""
+    with mp4.Video(tmp_path / "a.mp4") as video:
+        for color in COLORS:
+            video.add(np.broadcast_to(np.array(color, np.uint8), (*size, 3)))
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        by_ffmpeg = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    by_opencv = [frame[..., ::-1] for frame in frames_of(tmp_path / "a.mp4")]
+    for shown in (by_ffmpeg, by_opencv):
+        assert np.abs(np.array(shown).mean((1, 2)) - COLORS).max() <= 3
+
+
+def test_a_video_is_tagged_as_bt709_of_limited_range(tmp_path):
+    with mp4.Video(tmp_path / "a.mp4") as video:
+        video.add(np.zeros((H, W, 3), np.uint8))
+    assert b"colrnclx" in (tmp_path / "a.mp4").read_bytes()
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        frame = next(file.decode(video=0))
+        assert (frame.color_range, frame.colorspace, frame.color_primaries, frame.color_trc) == (1, 1, 1, 1)
+
+
 def test_a_video_of_odd_size_loses_its_last_row_and_column(tmp_path):
     with mp4.Video(tmp_path / "a.mp4") as video:
         video.add(np.zeros((21, 33, 3), np.uint8))

@@ -22,6 +22,11 @@ FRAME_RATES = (0.01, 1000.0)
 CODEC = "libx264"
 """FFmpeg's H.264 encoder."""
 
+BT709, LIMITED_RANGE = 1, 1
+"""FFmpeg's numbers (libavutil/pixfmt.h) of BT.709, the same for colour space, primaries and transfer, and of a range of
+16 to 235. Pixels are converted to them, and the file says so: without these tags players assume BT.601 below 720 lines
+and show wrong colours."""
+
 QUALITY = 18
 """Constant rate factor of H.264: 0 is lossless; at 18 the loss is hardly visible."""
 
@@ -58,7 +63,8 @@ class Video:
             if self._file is None:
                 self._open(width, height)
             frame = _ffmpeg().VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), "rgb24")
-            self._file.mux(self._stream.encode(frame.reformat(format="yuv420p", dst_colorspace="ITU709")))
+            frame = frame.reformat(format="yuv420p", dst_colorspace=BT709, dst_color_range=LIMITED_RANGE)
+            self._file.mux(self._stream.encode(frame))
 
     def __exit__(
         self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -86,6 +92,9 @@ class Video:
         self._stream = self._file.add_stream(CODEC, Fraction(self.rate).limit_denominator(1000))
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         self._stream.options = {"crf": str(QUALITY)}
+        context = self._stream.codec_context
+        context.color_range, context.colorspace = LIMITED_RANGE, BT709
+        context.color_primaries = context.color_trc = BT709
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
