@@ -88,13 +88,14 @@ def _finite(values: Any) -> Any:
     return [_finite(value) for value in values] if isinstance(values, list | tuple) else values
 
 
-def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W 3"]) -> None:
-    """Writes a greyscale or RGB image of 8 or 16 bits.
+def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W C"]) -> None:
+    """Writes a greyscale, RGB or RGBA image of 8 or 16 bits.
 
     Raises:
         OSError: If the file cannot be written; the message names it.
     """
-    encoded, data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    order = [2, 1, 0, 3][: image.shape[-1]]  # OpenCV's
+    encoded, data = cv2.imencode(".png", image[..., order] if image.ndim == 3 else image)
     if not encoded:
         raise OSError(f"{path} could not be encoded")
     write_bytes(path, [data.tobytes()])

@@ -17,8 +17,8 @@ CAPTION_HEIGHT = 18
 """Height of the bar with a caption [px]."""
 
 
-def to_bytes(image: Float[Tensor, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """8-bit RGB of an image in [0, 1]."""
+def to_bytes(image: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
+    """8-bit channels of an image in [0, 1]."""
     return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
@@ -29,17 +29,28 @@ def error_image(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) ->
     return _colored(level, cv2.COLORMAP_INFERNO)
 
 
-def depth_image(inverse_depth: Float[np.ndarray, "H W"], unknown: int = 0) -> UInt8[np.ndarray, "H W 3"]:
+def depth_bounds(inverse_depths: Float[np.ndarray, " N"]) -> tuple[float, float]:
+    """Inverse depths that have the first and the last colour: ``DEPTH_PERCENTILES``; (0, 1) without any depth."""
+    if not len(inverse_depths):
+        return 0.0, 1.0
+    low, high = np.percentile(inverse_depths, DEPTH_PERCENTILES)
+    return float(low), float(high)
+
+
+def depth_image(
+    inverse_depth: Float[np.ndarray, "H W"], unknown: int = 0, bounds: tuple[float, float] | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
     """Inverse depth in colours, from blue (far) to red (near).
 
     Args:
         inverse_depth: [H, W], not finite where unknown.
         unknown: Grey level of unknown pixels.
+        bounds: Inverse depths that have the first and the last colour; ``depth_bounds`` of the image if None.
     """
     known = np.isfinite(inverse_depth)
     if not known.any():
         return np.full((*known.shape, 3), unknown, np.uint8)
-    low, high = np.percentile(inverse_depth[known], DEPTH_PERCENTILES)
+    low, high = depth_bounds(inverse_depth[known]) if bounds is None else bounds
     # The lower bound of the range gives a wall at one depth one colour instead of noise.
     level = np.clip((np.where(known, inverse_depth, low) - low) / max(high - low, 1e-6), 0, 1)
     image = _colored((level * 255).round().astype(np.uint8), cv2.COLORMAP_TURBO)

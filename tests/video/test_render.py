@@ -9,15 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests import tiny
-from tests.video.test_mp4 import frames_of
+from tests.video.test_writer import frames_of
 from warpgs import visualize
 from warpgs.cli import main
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
-from warpgs.video import mp4, render_run
+from warpgs.video import frames, render_run, writer
 from warpgs.video.command import Render
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -175,6 +176,70 @@ def test_layers_are_side_by_side(run, tmp_path):
     assert (images[1] != images[2]).any()
 
 
+def test_a_size_of_another_shape_crops_the_view(run, tmp_path):
+    """32 × 24 at 20 × 48: twice as large, then 20 of 64 columns."""
+    render(run, tmp_path, path="fixed", frames=1, scale=2.0)
+    whole = images_in(tmp_path)["00000"]
+    render(run, tmp_path, path="fixed", frames=1, size="20x48")
+    difference = np.abs(images_in(tmp_path)["00000"].astype(int) - whole[:, 22:42])
+    assert difference.mean() < 0.2  # the covariance of Gaussians at the border depends on the field of view
+    assert difference.max() <= 4
+
+
+def test_the_ground_truth_is_cropped_like_the_image(run, capture, tmp_path):
+    render(run, tmp_path, truth=True, size="16x24")
+    for name, image in images_in(tmp_path).items():
+        assert image.shape == (24, 32, 3)
+        assert (image[:, :16] == capture.frame(name).image.numpy()[:, 8:24]).all()
+
+
+def test_alpha_is_grey(run, capture, scene, tmp_path):
+    render(run, tmp_path, layers="alpha")
+    for name, image in images_in(tmp_path).items():
+        alpha = scene.render(capture.cameras[name]).joint.alpha
+        assert (image == visualize.to_bytes(alpha[..., None].expand(-1, -1, 3))).all()
+
+
+def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):
+    bounds, original = [], visualize.depth_image
+    monkeypatch.setattr(frames, "MIN_ALPHA", 0.05)
+    monkeypatch.setattr(visualize, "depth_image", lambda *a, **k: bounds.append(k["bounds"]) or original(*a, **k))
+    render(run, tmp_path, path="moving", layers="depth", frames=4)
+    assert len(bounds) == 4
+    assert len(set(bounds)) == 1
+    assert 0 < bounds[0][0] < bounds[0][1]
+    assert len({image.tobytes() for image in images_in(tmp_path).values()}) > 1
+
+
+@pytest.mark.parametrize("layers", ["joint", "dynamic"])
+def test_a_transparent_image_over_black_is_the_opaque_one(run, tmp_path, layers):
+    render(run, tmp_path, path="fixed", frames=1, write="png", layers=layers)
+    opaque = images_in(tmp_path)["00000"]
+    render(run, tmp_path, path="fixed", frames=1, write="png", layers=layers, transparent=True)
+    b, g, r, alpha = np.moveaxis(cv2.imread(str(tmp_path / "out" / "00000.png"), cv2.IMREAD_UNCHANGED), 2, 0)
+    assert alpha.min() < 128
+    assert np.abs(np.stack([r, g, b], 2) * (alpha[..., None] / 255.0) - opaque).max() <= 2
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp"])
+@pytest.mark.parametrize("transparent", [False, True])
+def test_an_animation_shows_every_frame_and_repeats(run, tmp_path, suffix, transparent):
+    options = {"path": "moving", "frames": 3, "layers": "static", "transparent": transparent}
+    render(run, tmp_path, write="png", **options)
+    render(run, tmp_path, write=suffix, rate=10.0, **options)
+    expected = [Image.open(path).convert("RGBA") for path in sorted((tmp_path / "out").glob("*.png"))]
+    with Image.open(tmp_path / "out" / f"video.{suffix}") as file:
+        assert file.info["loop"] == 0
+        assert file.n_frames == 3
+        for k, truth in enumerate(map(np.asarray, expected)):
+            file.seek(k)
+            shown = np.asarray(file.convert("RGBA")).astype(int)
+            assert file.info["duration"] == pytest.approx(100, abs=1)
+            solid = (truth[..., 3] > 250) & (shown[..., 3] > 0)
+            assert np.abs(shown - truth)[solid].sum() < 8 * max(1, solid.sum())
+            assert ((shown[..., 3] == 255) == (truth[..., 3] > 127))[(truth[..., 3] < 20) | (truth[..., 3] > 250)].all()
+
+
 @pytest.mark.parametrize(("write", "suffixes"), [("png", {".png"}), ("mp4", {".mp4"}), ("both", {".png", ".mp4"})])
 def test_only_the_requested_files_are_written(run, tmp_path, write, suffixes):
     render(run, tmp_path, path="fixed", write=write)
@@ -184,7 +249,7 @@ def test_only_the_requested_files_are_written(run, tmp_path, write, suffixes):
 @pytest.mark.parametrize("quiet", [True, False])
 def test_progress_is_hidden_only_if_quiet(run, tmp_path, monkeypatch, quiet):
     calls = []
-    monkeypatch.setattr(render_run, "progress", lambda steps, name, quiet: calls.append(quiet) or steps)
+    monkeypatch.setattr(frames, "progress", lambda steps, name, quiet: calls.append(quiet) or steps)
     render(run, tmp_path, path="fixed", quiet=quiet)
     assert calls == [quiet]
 
@@ -217,6 +282,16 @@ def test_progress_is_hidden_only_if_quiet(run, tmp_path, monkeypatch, quiet):
         ({"truth": True, "path": "spiral"}, "--truth is for views, not for spiral"),
         ({"path": "fixed", "view": "none"}, "has no view 'none'"),
         ({"scale": 0.001}, "has no pixels"),
+        ({"size": "1080"}, "--size must be WIDTHxHEIGHT with sides of 1 to 16,384 pixels, got '1080'"),
+        ({"size": "0x20"}, "--size must be WIDTHxHEIGHT"),
+        ({"size": "20x99999"}, "--size must be WIDTHxHEIGHT"),
+        ({"size": "20x20", "scale": 0.5}, "omit --scale"),
+        ({"transparent": True}, "MP4 has no transparency: add --write png"),
+        (
+            {"transparent": True, "write": "png", "layers": "depth"},
+            "--transparent is for joint, static, dynamic and all",
+        ),
+        ({"rate": 60.0, "write": "gif"}, "--rate must be between 0.01 and 50, got 60"),
         ({"scale": 5000.0}, "must be between 0 and 32768 pixels"),
     ],
 )
@@ -241,11 +316,11 @@ def test_views_of_a_capture_without_evaluation_views_are_refused(run, capture, t
 
 
 def test_without_an_encoder_the_error_suggests_png(run, tmp_path, monkeypatch):
-    class Video(mp4.Video):
+    class Video(writer.Video):
         def add(self, image):
             raise OSError(f"{self.path} could not be opened as a video")
 
-    monkeypatch.setattr(mp4, "Video", Video)
+    monkeypatch.setattr(writer, "Video", Video)
     with pytest.raises(OSError, match=r"video\.mp4 could not be opened as a video; --write png needs no encoder"):
         render(run, tmp_path, path="fixed")
     render(run, tmp_path, path="fixed", write="png")

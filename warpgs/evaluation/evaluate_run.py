@@ -17,7 +17,7 @@ from warpgs.rendering import Rendering
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced_indices
-from warpgs.video.mp4 import Video
+from warpgs.video.writer import Video
 
 from .evaluate import evaluate, write_views
 from .lpips import find

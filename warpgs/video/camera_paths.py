@@ -275,3 +275,16 @@ def resized(camera: Camera, factor: float) -> Camera:
         raise ValueError(f"an image of {camera.width} × {camera.height} times {factor:g} has no pixels")
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0], device=camera.K.device)
     return Camera(camera.viewmat, camera.K * scale[:, None], width, height, camera.time)
+
+
+def filling(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The same view at another (width, height), scaled until it fills it, then cropped around its middle.
+
+    The image is never stretched, and shows nothing that the camera does not see.
+    """
+    width, height = size
+    scaled = resized(camera, max(width / camera.width, height / camera.height))
+    K = scaled.K.clone()
+    K[0, 2] -= (scaled.width - width) // 2
+    K[1, 2] -= (scaled.height - height) // 2
+    return Camera(camera.viewmat, K, width, height, camera.time)

@@ -1,5 +1,6 @@
 """``warpgs render``."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,6 +8,9 @@ from typing import Annotated, Literal
 import tyro
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
+
+MAX_SIDE = 16_384
+"""Maximum width and height of ``--size`` [px]."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,18 @@ class Render:
     """Frames along a path; 120 by default."""
     rate: float | None = None
     """Frames per second of the video; 24 by default."""
-    write: Literal["both", "png", "mp4"] = "both"
-    """Numbered PNG files, a video, or both."""
-    layers: Literal["joint", "static", "dynamic", "all"] = "joint"
-    """Layer to show; all shows the three side by side."""
+    write: Literal["both", "png", "mp4", "gif", "webp"] = "both"
+    """Numbered PNG files, a video (MP4, GIF or WebP), or both PNG files and MP4."""
+    layers: Literal["joint", "static", "dynamic", "all", "depth", "alpha"] = "joint"
+    """What to show: one of the layers, all three side by side, depth in colours (red is near), or opacity in grey."""
+    transparent: bool = False
+    """Leave pixels transparent where the layer is; for PNG, GIF and WebP."""
     truth: bool = False
     """For views: show the ground truth beside the rendered image."""
     scale: float = 1.0
     """Image size as a factor of the capture's."""
+    size: str | None = None
+    """Image size WIDTHxHEIGHT instead, such as 1080x1920; the view is cropped to it, not stretched [px]."""
     supersample: int = 1
     """Render at this multiple of the size, then average down."""
     data: Path | None = None
@@ -52,6 +60,19 @@ class Render:
         from .render_run import render_run
 
         print(render_run(self))
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) of ``size`` [px].
+
+        Raises:
+            ValueError: If it does not have the form WIDTHxHEIGHT, or is out of range.
+        """
+        numbers = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", self.size or "")
+        width, height = (int(number) for number in numbers.groups()) if numbers else (0, 0)
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise ValueError(f"--size must be WIDTHxHEIGHT with sides of 1 to {MAX_SIDE:,} pixels, got {self.size!r}")
+        return width, height
 
     @property
     def path_name(self) -> str:

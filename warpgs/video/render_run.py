@@ -8,20 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.files import remove_numbered, write_png
-from warpgs.progress import progress
-from warpgs.rendering import Rendering
 from warpgs.runs.run import Run
-from warpgs.runs.trained import TrainedScene
 
-from . import camera_paths, keyframes, mp4
+from . import camera_paths, keyframes, writer
 from .command import Render
+from .encodings import ENCODINGS
+from .frames import COLORED, render_frames
 
 FRAMES = 120
 """Default number of frames along a path."""
@@ -58,7 +55,7 @@ def render_run(options: Render) -> str:
     camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
     name = options.keyframes.stem if options.keyframes else options.path_name
     folder = options.out or options.run_folder / "render" / name
-    return _write(options, folder, names, _frames(options, capture, scene, cameras, names))
+    return _write(options, folder, names, render_frames(options, capture, scene, cameras, names))
 
 
 def _check(options: Render) -> None:
@@ -76,9 +73,29 @@ def _check(options: Render) -> None:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
     if not (math.isfinite(options.scale) and options.scale > 0):
         raise ValueError(f"--scale must be positive, got {options.scale}")
-    slowest, fastest = mp4.FRAME_RATES
+    _check_image(options)
+    slowest, fastest = writer.FRAME_RATES
+    if video := _video_suffix(options):
+        fastest = min(fastest, ENCODINGS[video].max_rate)
     if options.rate is not None and not slowest <= options.rate <= fastest:
         raise ValueError(f"--rate must be between {slowest:g} and {fastest:g}, got {options.rate}")
+
+
+def _check_image(options: Render) -> None:
+    if options.size is not None and options.scale != 1.0:
+        raise ValueError("--size is the size of the image: omit --scale")
+    if options.size is not None:
+        _ = options.image_size
+    if options.transparent and options.layers not in (*COLORED, "all"):
+        raise ValueError(f"--transparent is for joint, static, dynamic and all, not for {options.layers}")
+    video = _video_suffix(options)
+    if options.transparent and video and not ENCODINGS[video].has_alpha:
+        raise ValueError("MP4 has no transparency: add --write png, --write webp or --write gif to --transparent")
+
+
+def _video_suffix(options: Render) -> str | None:
+    """Suffix of the video that the options ask for; None without a video."""
+    return {"png": None, "both": ".mp4"}.get(options.write, f".{options.write}")
 
 
 def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) -> tuple[list[Camera], list[str]]:
@@ -121,61 +138,28 @@ def _start_view(options: Render, capture: Capture) -> Camera:
     return capture.cameras[name]
 
 
-def _frames(
-    options: Render, capture: Capture, scene: TrainedScene, cameras: list[Camera], names: list[str]
-) -> Iterator[np.ndarray]:
-    """Renders the 8-bit RGB image of each camera, one at a time."""
-    for camera, name in progress(list(zip(cameras, names, strict=True)), "rendering", options.quiet):
-        camera = camera_paths.resized(camera, options.scale).to(scene.device)
-        larger = camera_paths.resized(camera, float(options.supersample))
-        rendering = scene.render(larger, branches=options.layers != "joint")
-        images = [_averaged(image, options.supersample) for image in _images(rendering, options.layers)]
-        if options.truth:
-            truth = capture.frame(name).image.to(scene.device).float() / 255.0
-            images.insert(0, _resized(truth, camera))
-        yield visualize.to_bytes(torch.cat(images, 1))
-
-
-def _images(rendering: Rendering, layers: str) -> list[Float[Tensor, "H W 3"]]:
-    by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
-    chosen = by_name if layers == "all" else {layers: by_name[layers]}
-    return [layer.image.clamp(0, 1) for layer in chosen.values() if layer is not None]
-
-
-def _averaged(image: Float[Tensor, "H W 3"], factor: int) -> Float[Tensor, "h w 3"]:
-    if factor == 1:
-        return image
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
-
-
-def _resized(truth: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
-    """A ground-truth image, resized to a camera's size."""
-    size = (camera.height, camera.width)
-    if truth.shape[:2] == size:
-        return truth
-    channels = truth.permute(2, 0, 1)[None]
-    return torch.nn.functional.interpolate(channels, size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
-
-
 def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:
     """Writes images while they are rendered; returns a summary."""
-    if options.path_name != "views" and options.write != "mp4":
+    with_images = options.write in ("png", "both")
+    if options.path_name != "views" and with_images:
         # an earlier, longer path may have left more images
         remove_numbered(folder, lambda k: f"{_number(k)}.png")
     with ExitStack() as stack:
-        video = mp4.Video(folder / "video.mp4", options.rate or mp4.FRAME_RATE)
-        writer = stack.enter_context(video) if options.write != "png" else None
+        suffix = _video_suffix(options)
+        video = writer.Video(folder / f"video{suffix}", options.rate or writer.FRAME_RATE) if suffix else None
+        if video is not None:
+            stack.enter_context(video)
         for name, image in zip(names, images, strict=True):
-            if writer is not None:
-                _add(writer, image)
-            if options.write != "mp4":
+            if video is not None:
+                _add(video, image)
+            if with_images:
                 write_png(folder / f"{name}.png", image)
     height, width = image.shape[:2]
     return f"{len(names)} images of {width} × {height} in {folder}"
 
 
-def _add(video: mp4.Video, image: np.ndarray) -> None:
+def _add(video: writer.Video, image: np.ndarray) -> None:
     try:
         video.add(image)
     except OSError as error:
-        raise OSError(f"{error}; --write png needs no encoder for MP4") from error
+        raise OSError(f"{error}; --write png needs no encoder") from error

@@ -1,0 +1,120 @@
+"""The images along a camera path: layers side by side, supersampled, beside the ground truth, or transparent."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from warpgs import visualize
+from warpgs.cameras import Camera
+from warpgs.config import RenderSettings
+from warpgs.data.capture import Capture
+from warpgs.progress import progress
+from warpgs.rendering import Layer, render
+from warpgs.runs.trained import TrainedScene
+
+from . import camera_paths
+from .command import Render
+
+MIN_ALPHA = 0.5
+"""A pixel has a depth where it is at least this opaque."""
+
+NUM_SAMPLES = 8
+"""Number of cameras that decide the range of depths of a path."""
+
+COLORED = ("joint", "static", "dynamic")
+"""The layers that ``all`` shows, and that can be transparent."""
+
+
+def render_frames(
+    options: Render, capture: Capture, scene: TrainedScene, cameras: list[Camera], names: list[str]
+) -> Iterator[UInt8[np.ndarray, "H W C"]]:
+    """Renders the 8-bit RGB or RGBA image of each camera, one at a time."""
+    cameras = [sized(options, camera).to(scene.device) for camera in cameras]
+    depths = depth_range(scene, cameras) if options.layers == "depth" else None
+    for camera, name in progress(list(zip(cameras, names, strict=True)), "rendering", options.quiet):
+        images = _images(options, scene, camera, depths)
+        if options.truth:
+            truth = fitted(capture.frame(name).image.to(scene.device).float() / 255.0, camera)
+            images.insert(0, torch.cat([truth, torch.ones_like(truth[..., :1])], -1) if options.transparent else truth)
+        yield visualize.to_bytes(torch.cat(images, 1))
+
+
+def sized(options: Render, camera: Camera) -> Camera:
+    """A camera with the size of image that the options ask for."""
+    if options.size is None:
+        return camera_paths.resized(camera, options.scale)
+    return camera_paths.filling(camera, options.image_size)
+
+
+def depth_range(scene: TrainedScene, cameras: list[Camera]) -> tuple[float, float]:
+    """Inverse depths that have the first and the last colour in all images of a path, so that colours do not flicker.
+
+    They are percentiles over the pixels of sampled cameras.
+    """
+    chosen = camera_paths.evenly_spaced_indices(len(cameras), NUM_SAMPLES)
+    inverse = np.concatenate([_inverse_depth(scene, cameras[k]).ravel() for k in chosen])
+    return visualize.depth_bounds(inverse[np.isfinite(inverse)])
+
+
+@torch.no_grad()
+def _images(
+    options: Render, scene: TrainedScene, camera: Camera, depths: tuple[float, float] | None
+) -> list[Float[Tensor, "H W C"]]:
+    """The images of the chosen layers, averaged down from their supersampled size."""
+    larger = camera_paths.resized(camera, float(options.supersample))
+    if depths is not None:
+        return [_averaged(_depth_image(scene, larger, depths), options.supersample)]
+    rendering = scene.render(larger, branches=options.layers not in ("joint", "alpha"))
+    if options.layers == "alpha":
+        return [_averaged(rendering.joint.alpha[..., None].expand(-1, -1, 3), options.supersample)]
+    by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
+    layers = [by_name[name] for name in (COLORED if options.layers == "all" else (options.layers,))]
+    return [_pixels(layer, options) for layer in layers if layer is not None]
+
+
+def _pixels(layer: Layer, options: Render) -> Float[Tensor, "H W C"]:
+    """RGB over black; with transparency RGBA, whose colour is not multiplied by its alpha."""
+    image = layer.image.clamp(0, 1)
+    if not options.transparent:
+        return _averaged(image, options.supersample)
+    image = _averaged(torch.cat([image, layer.alpha[..., None]], -1), options.supersample)
+    alpha = image[..., 3:]
+    return torch.cat([image[..., :3] / alpha.clamp_min(1 / 255), alpha], -1).clamp(0, 1)
+
+
+def _depth_image(scene: TrainedScene, camera: Camera, depths: tuple[float, float]) -> Float[Tensor, "H W 3"]:
+    """Inverse depth in colours: red is near, blue is far, black is empty."""
+    image = visualize.depth_image(_inverse_depth(scene, camera), bounds=depths)
+    return torch.from_numpy(image).to(scene.device).float() / 255.0
+
+
+@torch.no_grad()
+def _inverse_depth(scene: TrainedScene, camera: Camera) -> Float[np.ndarray, "H W"]:
+    """[H, W], NaN where empty."""
+    settings = RenderSettings(depth=True, antialias=scene.config.antialias)
+    layer = render(scene.splats(camera.time), camera, settings=settings).joint
+    assert layer.depth is not None
+    visible = (layer.alpha >= MIN_ALPHA) & (layer.depth > 0)
+    return torch.where(visible, 1.0 / layer.depth, torch.nan).cpu().numpy()
+
+
+def _averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
+    if factor == 1:
+        return image
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
+
+
+def fitted(image: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
+    """An image scaled until it fills a camera's size, then cropped around its middle (``camera_paths.filling``)."""
+    if image.shape[:2] == (camera.height, camera.width):
+        return image
+    height, width = image.shape[:2]
+    factor = max(camera.width / width, camera.height / height)
+    size = (round(height * factor), round(width * factor))
+    channels = image.permute(2, 0, 1)[None]
+    scaled = torch.nn.functional.interpolate(channels, size, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
+    top, left = (size[0] - camera.height) // 2, (size[1] - camera.width) // 2
+    return scaled[top : top + camera.height, left : left + camera.width]
