@@ -6,13 +6,14 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests import tiny
 from tests.export import scenes
 from tests.export.pages import read_page
 from warpgs.cli import main
 from warpgs.data.loaders import load_capture
-from warpgs.export import page
+from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
 from warpgs.export.command import Export
 from warpgs.export.compressed import read_compressed
@@ -42,7 +43,10 @@ def data(run):
 
 
 def export(run, tmp_path, **options):
-    return export_run(Export(run, out=tmp_path / "out", quiet=True, **options))
+    """Exports in the scene's coordinates, if the format has this option."""
+    writer = WRITERS.get(options.get("format", "ply"))
+    up = {"up": "scene"} if writer and "up" in writer.options else {}
+    return export_run(Export(run, out=tmp_path / "out", quiet=True, **{**up, **options}))
 
 
 def names(tmp_path):
@@ -176,7 +180,7 @@ def test_another_format_takes_one_entry(run, tmp_path, monkeypatch):
 
 
 def test_an_unknown_format_is_refused_with_the_names_of_all(run, tmp_path):
-    with pytest.raises(ValueError, match="--format must be one of ply, compressed, html, got 'splat'"):
+    with pytest.raises(ValueError, match=f"--format must be one of {', '.join(WRITERS)}, got 'splat'"):
         export(run, tmp_path, format="splat")
 
 
@@ -200,6 +204,32 @@ def stranded(run, tmp_path):
     values = json.loads((run / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**values, "data": str(tmp_path / "gone")}))
     return folder
+
+
+def test_files_stand_upright(run, data, tmp_path):
+    """Rotated cameras see the same; what is up for the cameras points to -y."""
+    summary = export(run, tmp_path, up="capture")
+    assert "in scene coordinates is up, from the training cameras" in summary
+    up = orientation.vertical(load_capture(data))
+    rotation = torch.from_numpy(orientation.upright(up)).float()
+    assert (rotation @ torch.from_numpy(up).float()).tolist() == pytest.approx([0, -1, 0], abs=1e-6)
+    camera = view(data, 0.0)
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, :3] = viewmat[:3, :3] @ rotation.T
+    image = scenes.image(read_standard(tmp_path / "out" / "scene.ply"), dataclasses.replace(camera, viewmat=viewmat))
+    assert (image - truth(run, camera)).abs().max() < 1e-4
+    assert (scenes.image(read_standard(tmp_path / "out" / "scene.ply"), camera) - image).abs().max() > 0.05
+
+
+def test_an_axis_can_be_up(run, tmp_path):
+    assert "z of the scene is up" in export(run, tmp_path, up="z")
+    means = clouds_of(run).at(0.0).means
+    back = read_standard(tmp_path / "out" / "scene.ply").means
+    assert -back[:, 1] == pytest.approx(means[:, 2], abs=1e-5)
+
+
+def test_without_a_capture_the_summary_says_what_is_up(stranded, tmp_path):
+    assert "\n-y is taken as up (otherwise give --up), because the capture" in export(stranded, tmp_path, up="capture")
 
 
 def test_ply_files_need_no_capture(stranded, tmp_path):

@@ -15,7 +15,7 @@ from jaxtyping import Float64, UInt8, UInt32
 
 from warpgs.model.gaussians import SH_C0
 
-from .cloud import Cloud, logit, sigmoid
+from .cloud import ARRAYS, Cloud, logit, sigmoid
 from .packing import dequantise, pack_rotations, quantise, unpack, unpack_rotations
 
 MEAN_BITS = 21
@@ -106,8 +106,7 @@ class Baked:
         """The Gaussians at a time in [0, 1], static ones first."""
         position = time * (self.keys - 1)
         parts = [self.static.at(position, False), self.dynamic.at(position, True)]
-        names = ("means", "quats", "log_scales", "logit_opacities", "sh", "is_dynamic")
-        return Cloud(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+        return parts[0].replaced(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS})
 
 
 def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float]) -> Baked:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ class Cloud:
         logit_opacities: [N] logits of the opacities.
         sh: [N, 1 | 4 | 9 | 16, 3] spherical harmonics coefficients.
         is_dynamic: [N] whether a Gaussian is dynamic; files do not store it.
+        antialias: Whether opacities compensate for the low-pass filter of the renderer (Mip-Splatting).
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -37,9 +39,10 @@ class Cloud:
     logit_opacities: Float32[np.ndarray, " N"]
     sh: Float32[np.ndarray, "N bases 3"]
     is_dynamic: Bool[np.ndarray, " N"]
+    antialias: bool = False
 
     @staticmethod
-    def of_splats(splats: Splats) -> "Cloud":
+    def of_splats(splats: Splats, antialias: bool = False) -> "Cloud":
         """The cloud of splats that are coloured by spherical harmonics, up to the degree in use.
 
         Gaussians with values that are not finite are kept; ``finite`` marks the others.
@@ -55,6 +58,7 @@ class Cloud:
             logit_opacities=_to_numpy(torch.logit(opacities)),
             sh=_to_numpy(splats.sh[:, :bases]),
             is_dynamic=np.zeros(len(splats.means), bool) if dynamic is None else dynamic.cpu().numpy(),
+            antialias=antialias,
         )
 
     def splats(self, device: torch.device | str = "cpu") -> Splats:
@@ -83,7 +87,14 @@ class Cloud:
 
     def select(self, rows: Integer[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> "Cloud":
         """The Gaussians of some rows, in the order of the rows."""
-        return Cloud(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
+        return self.replaced(**{name: getattr(self, name)[rows] for name in ARRAYS})
+
+    def replaced(self, **arrays: Any) -> "Cloud":
+        """The cloud with other arrays."""
+        return dataclasses.replace(self, **arrays)
+
+
+ARRAYS = tuple(field.name for field in dataclasses.fields(Cloud) if field.name != "antialias")
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:

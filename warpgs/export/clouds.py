@@ -30,7 +30,7 @@ class Clouds:
 
     def at(self, time: float) -> Cloud:
         """The Gaussians at a time in [0, 1], in the same rows at every time."""
-        cloud = Cloud.of_splats(self.scene.splats(time))
+        cloud = Cloud.of_splats(self.scene.splats(time), self.scene.config.antialias)
         return cloud if self.rows is None else cloud.select(self.rows)
 
     def most_visible(self, count: int, cameras: Sequence[Camera], quiet: bool = True) -> "Clouds":

@@ -24,6 +24,9 @@ class Export:
     """Write this many PLY files, one per time, at times evenly spaced over [0, 1]."""
     layers: Literal["all", "static", "dynamic", "apart"] = "all"
     """Gaussians in PLY files: all, static or dynamic ones, or both apart in two files."""
+    up: Literal["capture", "x", "y", "z", "-x", "-y", "-z", "scene"] = "capture"
+    """What is up in the files: the capture's upward direction, estimated from its training cameras, or an axis of the
+    scene; scene keeps the scene's coordinates, in which the capture's cameras fit."""
     keys: int | None = None
     """Number of key times of a page, which interpolates between them; 30 by default."""
     seconds: float | None = None

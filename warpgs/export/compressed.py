@@ -15,7 +15,7 @@ from warpgs.model.gaussians import SH_C0
 from .cloud import Cloud, logit, sigmoid
 from .packing import dequantise, pack, pack_rotations, quantise, unpack, unpack_rotations
 from .ply import column, read_ply, write_ply
-from .standard import num_rest
+from .standard import num_rest, render_mode
 
 CHUNK = 256
 VECTOR_BITS = (11, 10, 11)
@@ -60,7 +60,7 @@ def write_compressed(path: Path, cloud: Cloud) -> int:
         values = cloud.sh[:, 1:].transpose(0, 2, 1).reshape(N, 3 * rest)
         integers = quantise(values, REST, 8).astype(np.uint8)
         tables["sh"] = _table(integers, [f"f_rest_{k}" for k in range(3 * rest)])
-    return write_ply(path, tables)
+    return write_ply(path, tables, render_mode(cloud))
 
 
 def read_compressed(path: Path) -> Cloud:

@@ -6,9 +6,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float64
+
 from warpgs.data.capture import Capture
 from warpgs.runs.run import Run
+from warpgs.video.camera_paths import UP
 
+from . import orientation
 from .clouds import Clouds
 from .command import Export
 
@@ -40,15 +45,46 @@ class Job:
     @property
     def capture_note(self) -> str:
         """A line about where the cameras come from."""
-        return self._capture[1]
+        capture, error = self._capture
+        return f"default cameras, because {error}" if capture is None else f"cameras of {capture.name}"
+
+    def rotation(self, y_up: bool) -> Float64[np.ndarray, "3 3"]:
+        """From the scene's coordinates to those of the files.
+
+        Args:
+            y_up: Whether readers assume that y points up instead of down.
+        """
+        up = self._up[0]
+        if up is None:
+            return np.eye(3)
+        return orientation.upright(up, y_up)
+
+    @property
+    def up_note(self) -> str:
+        """A line about the orientation of the files."""
+        return self._up[1]
+
+    @cached_property
+    def _up(self) -> tuple[tuple[float, ...] | None, str]:
+        """The upward direction in scene coordinates, None to keep them, and a line about it."""
+        option = self.options.up
+        if option == "scene":
+            return None, "in the coordinates of the scene"
+        if option in orientation.AXES:
+            return orientation.AXES[option], f"turned upright: {option} of the scene is up"
+        if self.capture is None:
+            return UP, f"-y is taken as up (otherwise give --up), because {self._capture[1]}"
+        up = tuple(orientation.vertical(self.capture).tolist())
+        shown = ", ".join(f"{value:.2f}" for value in up)
+        return up, f"turned upright: ({shown}) in scene coordinates is up, from the training cameras"
 
     @cached_property
     def _capture(self) -> tuple[Capture | None, str]:
+        """The capture, or None and why."""
         try:
-            capture = self.run.open_capture(self.options.quiet)
+            return self.run.open_capture(self.options.quiet), ""
         except (ValueError, OSError) as error:
-            return None, f"default cameras, because the capture cannot be opened: {error}"
-        return capture, f"cameras of {capture.name}"
+            return None, f"the capture cannot be opened: {error}"
 
 
 class Writer(NamedTuple):

@@ -10,22 +10,25 @@ from warpgs.video.camera_paths import evenly_spaced
 
 from .cloud import Cloud
 from .job import Job, Writer
+from .orientation import rotated
 
-OPTIONS = ("time", "frames", "layers")
+OPTIONS = ("time", "frames", "layers", "up")
 
 
-def per_time(suffix: str, write_cloud: Callable[[Path, Cloud], int]) -> Writer:
+def per_time(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool = False) -> Writer:
     """A format with one file per time and layer.
 
     Args:
         suffix: End of the file names, with its dot.
         write_cloud: Writes a cloud and returns the size of the file [bytes].
+        y_up: Whether readers assume that y points up, as in glTF, instead of down, as in the PLY file of 3DGS.
     """
-    return Writer(partial(_write, suffix, write_cloud), OPTIONS)
+    return Writer(partial(_write, suffix, write_cloud, y_up), OPTIONS)
 
 
-def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], job: Job) -> str:
+def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, job: Job) -> str:
     options, folder = job.options, job.folder
+    rotation = job.rotation(y_up)
     times = [options.time or 0.0] if options.frames is None else evenly_spaced(options.frames)
     names = {"all": ["scene"], "apart": ["static", "dynamic"]}.get(options.layers, [options.layers])
     if options.frames is not None:
@@ -33,14 +36,14 @@ def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], job: Job) -> 
             remove_numbered(folder, partial(_numbered, name, suffix))
     num_files, size, max_count = 0, 0, 0
     for k, time in enumerate(progress(times, "exporting", options.quiet or len(times) == 1)):
-        cloud = job.clouds.at(time)
+        cloud = rotated(job.clouds.at(time), rotation)
         for name in names:
             rows = cloud.finite if name == "scene" else cloud.finite & (cloud.is_dynamic == (name == "dynamic"))
             file = name + suffix if options.frames is None else _numbered(name, suffix, k)
             size += write_cloud(folder / file, cloud.select(rows))
             num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
     files = "1 file of" if num_files == 1 else f"{num_files} files of up to"
-    return f"{files} {max_count:,} Gaussians in {folder}, {size / 1e6:.1f} MB"
+    return f"{files} {max_count:,} Gaussians in {folder}, {size / 1e6:.1f} MB\n{job.up_note}"
 
 
 def _numbered(name: str, suffix: str, number: int) -> str:

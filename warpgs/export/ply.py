@@ -3,7 +3,7 @@
 The reader checks the sizes in the header against the size of the file before it allocates anything.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +28,14 @@ MAX_FILE = 8 << 30
 END = b"end_header\n"
 
 
-def write_ply(path: Path, tables: Mapping[str, np.ndarray]) -> int:
-    """Writes structured arrays as elements of a PLY file; returns its size [bytes].
+def write_ply(path: Path, tables: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> int:
+    """Writes structured arrays as elements of a PLY file, with comments; returns its size [bytes].
 
     Raises:
         OSError: If it cannot be written; the message names the file.
     """
     lines = ["ply", "format binary_little_endian 1.0", "comment written by warpgs"]
+    lines += [f"comment {comment}" for comment in comments]
     for element, table in tables.items():
         lines.append(f"element {element} {len(table)}")
         assert table.dtype.names

@@ -1,8 +1,9 @@
 """The PLY file of 3DGS, as its viewer, SuperSplat and the plug-ins of game engines read it.
 
-One row of floats per Gaussian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_0..44 (all of red, then green, then blue),
-opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Degree 3 is always written, because several readers
-expect rows of exactly that length; coefficients that the scene does not have are zero.
+One row of floats per Gaussian: x y z, nx ny nz (zero), f_dc_0..2, f_rest_* (all of red, then green, then blue),
+opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). There are as many f_rest_* as the degree of the cloud
+has: 0, 9, 24 or 45. The comment ``SplatRenderMode: mip`` (of Brush; SuperSplat reads it, too) asks renderers to
+compensate opacities for their low-pass filter, as training did.
 """
 
 from pathlib import Path
@@ -18,14 +19,19 @@ from .ply import column, read_ply, write_ply
 REST_COUNTS = tuple(num_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1))
 """Number of coefficients per channel of degree 1 and higher, by degree."""
 
-MAX_REST = REST_COUNTS[-1]
 
-COLUMNS = [
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
-    *(f"f_rest_{k}" for k in range(3 * MAX_REST)),
-    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-]
-BYTES_PER_GAUSSIAN = 4 * len(COLUMNS)
+def columns(num_rest: int) -> list[str]:
+    """Names of the properties of a file with ``num_rest`` coefficients per channel of degree 1 and higher."""
+    return [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{k}" for k in range(3 * num_rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+
+
+def render_mode(cloud: Cloud) -> list[str]:
+    """The comments of a PLY file that say how to render a cloud."""
+    return ["SplatRenderMode: mip"] if cloud.antialias else []
 
 
 def write_standard(path: Path, cloud: Cloud) -> int:
@@ -35,19 +41,18 @@ def write_standard(path: Path, cloud: Cloud) -> int:
         OSError: If it cannot be written; the message names the file.
     """
     N, rest = len(cloud), cloud.sh.shape[1] - 1
-    padded = np.zeros((N, MAX_REST, 3), np.float32)
-    padded[:, :rest] = cloud.sh[:, 1:]
     values = [
         cloud.means,
         np.zeros((N, 3), np.float32),
         cloud.sh[:, 0],
-        padded.transpose(0, 2, 1).reshape(N, 3 * MAX_REST),
+        cloud.sh[:, 1:].transpose(0, 2, 1).reshape(N, 3 * rest),
         cloud.logit_opacities[:, None],
         cloud.log_scales,
         cloud.quats,
     ]
     rows = np.ascontiguousarray(np.concatenate(values, 1, dtype="<f4"))
-    return write_ply(path, {"vertex": rows.view([(name, "<f4") for name in COLUMNS]).reshape(N)})
+    table = rows.view([(name, "<f4") for name in columns(rest)]).reshape(N)
+    return write_ply(path, {"vertex": table}, render_mode(cloud))
 
 
 def read_standard(path: Path) -> Cloud:
@@ -99,7 +104,7 @@ def _coefficients(path: Path, vertex: np.ndarray) -> np.ndarray:
     others = np.zeros((len(vertex), 0), np.float32)
     if rest:
         others = _block(path, vertex, [f"f_rest_{k}" for k in range(3 * rest)])
-    return np.concatenate([constant, others.reshape(-1, 3, rest).transpose(0, 2, 1)], 1)
+    return np.concatenate([constant, others.reshape(len(vertex), 3, rest).transpose(0, 2, 1)], 1)
 
 
 def _block(path: Path, vertex: np.ndarray, names: list[str]) -> np.ndarray:
