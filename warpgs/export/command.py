@@ -9,21 +9,22 @@ import tyro
 
 @dataclass(frozen=True)
 class Export:
-    """Exports the newest checkpoint of a run for other programs, as PLY files or as a web page that plays it."""
+    """Exports the newest checkpoint of a run for other programs, at one time or as a web page that plays it."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
     """Run folder."""
     format: str = "ply"
-    """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. html: one web page that
-    plays the scene offline."""
+    """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.
+    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). html: one web page
+    that plays the scene offline."""
     out: Path | None = None
     """Output folder; RUN/export by default."""
     time: float | None = None
-    """Time of a PLY file, in [0, 1]; 0 by default."""
+    """Time of a file, in [0, 1]; 0 by default."""
     frames: int | None = None
-    """Write this many PLY files, one per time, at times evenly spaced over [0, 1]."""
+    """Write this many files, one per time, at times evenly spaced over [0, 1]."""
     layers: Literal["all", "static", "dynamic", "apart"] = "all"
-    """Gaussians in PLY files: all, static or dynamic ones, or both apart in two files."""
+    """Gaussians in files of one time: all, static or dynamic ones, or both apart in two files."""
     up: Literal["capture", "x", "y", "z", "-x", "-y", "-z", "scene"] = "capture"
     """What is up in the files: the capture's upward direction, estimated from its training cameras, or an axis of the
     scene; scene keeps the scene's coordinates, in which the capture's cameras fit."""

@@ -40,7 +40,7 @@ def write_compressed(path: Path, cloud: Cloud) -> int:
     Raises:
         OSError: If it cannot be written; the message names the file.
     """
-    cloud = cloud.select(_morton_order(cloud.means))
+    cloud = cloud.select(morton_order(cloud.means))
     N = len(cloud)
     first = np.arange(0, N, CHUNK)
     log_scales = np.clip(cloud.log_scales, -SCALE_RANGE, SCALE_RANGE)
@@ -134,7 +134,7 @@ def _read_rest(path: Path, table: np.ndarray | None, num_vertices: int) -> np.nd
     return values.reshape(-1, 3, rest).transpose(0, 2, 1)
 
 
-def _morton_order(means: np.ndarray) -> np.ndarray:
+def morton_order(means: np.ndarray) -> np.ndarray:
     """Row indices along a Morton curve, so that the Gaussians of a chunk are close together."""
     if not len(means):
         return np.zeros(0, np.int64)
