@@ -125,5 +125,5 @@ def test_without_zstandard_the_error_says_what_to_do(finished_run, tmp_path, mon
     options = ["--format", "spz", "--up", "scene", "--out", str(tmp_path)]
     assert main(["export", str(finished_run), *options]) == 2
     error = capsys.readouterr().err
-    assert error.endswith("scene.spz needs zstandard: pip install zstandard, or export as spz3\n")
+    assert error.endswith("scene.spz needs zstandard: pip install zstandard\n")
     assert list(tmp_path.iterdir()) == []

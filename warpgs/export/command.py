@@ -9,14 +9,14 @@ import tyro
 
 @dataclass(frozen=True)
 class Export:
-    """Exports the newest checkpoint of a run for other programs, at one time or as a web page that plays it."""
+    """Exports the newest checkpoint of a run for other programs, at one time or moving."""
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
     """Run folder."""
     format: str = "ply"
     """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.
-    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). html: one web page
-    that plays the scene offline."""
+    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). usd: OpenUSD with
+    time samples. 4dgs: container of moving scenes. html: one web page that plays the scene offline."""
     out: Path | None = None
     """Output folder; RUN/export by default."""
     time: float | None = None
@@ -29,9 +29,9 @@ class Export:
     """What is up in the files: the capture's upward direction, estimated from its training cameras, or an axis of the
     scene; scene keeps the scene's coordinates, in which the capture's cameras fit."""
     keys: int | None = None
-    """Number of key times of a page, which interpolates between them; 30 by default."""
+    """Number of key times of html, usd and 4dgs, between which programs interpolate; 30 by default."""
     seconds: float | None = None
-    """Duration of the scene in a page; 5 by default."""
+    """Duration of the scene in html, usd and 4dgs [s]; 5 by default."""
     max_gaussians: int | None = None
     """Export at most this many Gaussians: those that the training cameras see most of."""
     max_megabytes: float | None = None

@@ -9,7 +9,6 @@ Axes are x right, y up, z towards the viewer.
 """
 
 import gzip
-import importlib
 import struct
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from warpgs.files import write_bytes
 from warpgs.ops.sh import degree_of
 
 from .cloud import Cloud, sigmoid
+from .moving import required
 from .per_time import per_time
 
 MAGIC = 0x5053474E
@@ -47,10 +47,7 @@ def write_spz(path: Path, cloud: Cloud) -> int:
         ValueError: If a position is too large.
     """
     streams = [stream.tobytes() for stream in _streams(path, cloud)]
-    try:
-        compressor = importlib.import_module("zstandard").ZstdCompressor(level=LEVEL)
-    except ImportError as error:
-        raise OSError(f"{path} needs zstandard: pip install zstandard, or export as spz3") from error
+    compressor = required(path, "zstandard", "zstandard").ZstdCompressor(level=LEVEL)
     compressed = [compressor.compress(stream) for stream in streams]
     contents = b"".join(struct.pack("<QQ", *map(len, sizes)) for sizes in zip(compressed, streams, strict=True))
     toc_offset = HEADER.size + 16
