@@ -2,7 +2,7 @@
 
 import sys
 
-from warpgs.training.command import main
+from warpgs.cli import train
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(train(sys.argv[1:], "train.py"))

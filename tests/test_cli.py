@@ -1,10 +1,126 @@
 """The command itself."""
 
 import importlib.metadata
+import os
+import re
+import subprocess
+import sys
 
-from warpgs.cli import main
+import pytest
+
+from warpgs.cli import COMMANDS, TRAIN_OPTIONS, main
+from warpgs.command_line import described, flags
+from warpgs.config import TrainConfig
 
 
 def test_it_says_its_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"warpgs {importlib.metadata.version('warpgs')}\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_says_the_version(command, capsys):
+    assert main([command, "--version"]) == 0
+    assert capsys.readouterr().out == f"warpgs {importlib.metadata.version('warpgs')}\n"
+
+
+def shown(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_list_of_commands_fits_on_a_screen(capsys):
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 24
+    assert max(map(len, lines)) <= 90
+    assert all(any(line.split()[:1] == [name] for line in lines) for name in COMMANDS)
+
+
+def test_help_of_train_is_short_and_help_all_complete(capsys):
+    short, complete = shown(capsys, "train", "--help"), shown(capsys, "train", "--help-all")
+    options = re.compile(r"^[│ ] --([a-z.-]+)", re.MULTILINE)
+    assert len(options.findall(short)) == len(TRAIN_OPTIONS) == 15
+    assert len(options.findall(complete)) > 60
+    assert "--densify.max-gaussians INT" in complete
+    assert "warpgs train --help-all" in short
+    assert shown(capsys, "train", "--help") == short
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_rewrapped_and_names_what_is_expected(command, capsys):
+    text = shown(capsys, command, "--help")
+    assert "{None}" not in text
+    assert "(default: None)" not in text
+    # a line ends early only at the end of a text
+    broken = re.findall(r"^[│ ] {10,}\S[^│\n]{1,25}[a-z,] {20,}│?\n[│ ] {10,}[a-z]", text, re.MULTILINE)
+    assert broken == []
+
+
+@pytest.mark.parametrize(
+    ("command", "metavars"),
+    [("prepare", "SOURCE CAPTURE"), ("check", "CAPTURE"), ("eval", "RUN"), ("export", "RUN"), ("render", "RUN")],
+)
+def test_positional_arguments_have_names(command, metavars, capsys):
+    assert (
+        shown(capsys, command, "--help")
+        .splitlines()[0]
+        .split("[-h] ")[1]
+        .replace("[OPTIONS] ", "")
+        .startswith(metavars)
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["exprot"], "warpgs: there is no command exprot; did you mean export?"),
+        (["xyz"], "warpgs: there is no command xyz; warpgs --help lists all"),
+        (["export", "--fromat", "ply"], "warpgs export: there is no option --fromat; did you mean --format?"),
+        (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
+        (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),
+        (["render", "r", "--zzz"], "warpgs render: there is no option --zzz; warpgs render --help lists all"),
+        (["export"], "warpgs export: missing: RUN Run folder. (required)"),
+        (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
+        (["train", "--preset", "x"], "warpgs train: argument --preset: invalid choice: 'x' (choose from "),
+        (
+            ["render", "r", "--layers", "x"],
+            "warpgs render: invalid choice 'x' for argument '--layers'. Expected one of",
+        ),
+        (["train", "--resume", "r", "--seed", "1"], "warpgs train: --resume takes everything but --device from the"),
+    ],
+)
+def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = end.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert error.startswith(message)
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+@pytest.mark.parametrize("arguments", [["render", "r", "--size"], ["export"]])
+def test_errors_are_the_same_with_and_without_unicode(arguments, encoding):
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    command = [sys.executable, "-m", "warpgs", *arguments]
+    ended = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert ended.returncode == 2
+    assert re.fullmatch(rb"warpgs \w+: missing[^\n]*\n", ended.stderr)
+
+
+def test_options_with_underscores_and_without_values_are_known(capsys):
+    known = set(flags(TrainConfig))
+    assert {"--no-graph", "--densify.max-gaussians", "--data"} <= known
+    assert "capture" in shown(capsys, "train", "--checkpoint_every", "3", "--no-graph", "--help")
+
+
+def test_annotations_are_restored_after_help():
+    before = dict(TrainConfig.__annotations__)
+    with described(TrainConfig, ("data",)):
+        assert TrainConfig.__annotations__ != before
+    assert TrainConfig.__annotations__ == before

@@ -56,7 +56,7 @@ def test_the_package_is_typed():
     assert (Path(warpgs.__file__).parent / "py.typed").is_file()
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS, "train"])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_imports_nothing_heavy(command):
     arguments = [command, "--help"] if command else ["--help"]
     assert imported_by(f"from warpgs.cli import main; main({arguments})") == set()

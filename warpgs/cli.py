@@ -1,59 +1,132 @@
 """The ``warpgs`` command."""
 
+import contextlib
+import difflib
+import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+import textwrap
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
-import tyro
-
-from .bench.command import Bench
-from .config import TrainConfig
-from .data.command import Check, Import
-from .errors import run_command
-from .evaluation.command import Eval
-from .export.command import Export
-from .prepare.command import Prepare
-from .report.command import Report
-from .sweep.command import Sweep
-from .training import command as training
-from .video.command import Render
-from .viewer.command import View
+from .errors import FAILED, run_command
 
 
-@runtime_checkable
-class Command(Protocol):
-    """A dataclass of options with a method ``run``."""
+class Command(NamedTuple):
+    """A command.
 
-    def run(self) -> object:
-        """Does what the options ask for; returns the exit code if that is not 0."""
+    Attributes:
+        home: Its dataclass of options, as module:class; its method ``run`` does what the options ask for. The class is
+            imported when the command is used, so that ``warpgs --help`` is fast.
+        summary: What it does, for the list of commands.
+    """
+
+    home: str
+    summary: str
+
+    def load(self) -> Any:
+        """The dataclass of options."""
+        module, name = self.home.split(":")
+        return getattr(importlib.import_module(module, __package__), name)
 
 
-COMMANDS: dict[str, Callable[..., Command]] = {
-    "bench": Bench,
-    "check": Check,
-    "eval": Eval,
-    "export": Export,
-    "import": Import,
-    "prepare": Prepare,
-    "render": Render,
-    "report": Report,
-    "sweep": Sweep,
-    "view": View,
+COMMANDS = {
+    "prepare": Command(".prepare.command:Prepare", "make a capture from a video or a folder of frames"),
+    "import": Command(".data.command:Import", "copy a capture of any layout into the layout of prepare"),
+    "check": Command(".data.command:Check", "check whether a capture is fit to train on"),
+    "train": Command(".config:TrainConfig", "train on a capture or on the built-in scene"),
+    "sweep": Command(".sweep.command:Sweep", "train many runs and make one table"),
+    "eval": Command(".evaluation.command:Eval", "evaluate a run: PSNR, SSIM, LPIPS, smoothness, FPS"),
+    "view": Command(".viewer.command:View", "look around in a run in the browser"),
+    "render": Command(".video.command:Render", "render a run to images and a video"),
+    "export": Command(".export.command:Export", "export a run for other programs"),
+    "report": Command(".report.command:Report", "write one HTML file about runs"),
+    "bench": Command(".bench.command:Bench", "measure rendering times"),
 }
-"""Every command but ``train``, whose defaults depend on its preset."""
+"""All commands, in the order of a user's way."""
+
+TRAIN_OPTIONS = (
+    *("data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "assume", "exposure"),
+    *("antialias", "checkpoint_every", "keep_checkpoints", "lpips"),
+)
+"""Options of ``train`` that --help shows; --help-all shows all."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if arguments == ["--version"]:
+    name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
+    if name in ("--help", "-h"):
+        print(usage())
+        return 0
+    if name == "--version" or rest == ["--version"]:
         print(f"warpgs {importlib.metadata.version('warpgs')}")
         return 0
-    if arguments[:1] == ["train"]:
-        return training.main(arguments[1:], "warpgs train")
-    commands: dict[str, Callable[..., Any]] = {**COMMANDS, "train": TrainConfig}
-    command: Command = tyro.extras.subcommand_cli_from_dict(
-        commands, prog="warpgs", description=__doc__, args=arguments
-    )
-    return run_command(command.run)
+    if name.startswith("--tyro"):
+        return _print_completion(arguments)
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, 1)
+        advice = f"did you mean {close[0]}?" if close else "warpgs --help lists all"
+        sys.stderr.write(f"warpgs: there is no command {name}; {advice}\n")
+        return FAILED
+    if name == "train":
+        return train(rest, "warpgs train")
+    from .command_line import parse  # imports tyro
+
+    options = parse(COMMANDS[name].load(), rest, f"warpgs {name}")
+    return run_command(options.run)
+
+
+def train(arguments: Sequence[str], prog: str) -> int:
+    """``warpgs train`` and ``train.py``: trains, then evaluates; returns the exit code."""
+    if "--version" in arguments:
+        return main(["--version"])
+    from .command_line import described, one_line_errors
+    from .training import command as training
+
+    config = COMMANDS["train"].load()
+    help_all = "--help-all" in arguments
+    if not help_all and not {"-h", "--help"} & set(arguments):
+
+        def start() -> int:
+            with one_line_errors(config, arguments, prog):
+                values = training.parse(arguments, prog)
+            return training.run(values)
+
+        return run_command(start, prog, training.ADVICE)
+    arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
+    try:
+        with one_line_errors(config, arguments, prog), described(config, None if help_all else TRAIN_OPTIONS):
+            return training.main(arguments, prog)
+    finally:
+        if not help_all:
+            print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.")
+
+
+def usage() -> str:
+    """The list of commands."""
+    lines = [f"  {name:<9} {command.summary}" for name, command in COMMANDS.items()]
+    text = """\
+        usage: warpgs COMMAND ...
+
+        SplitGaussian: dynamic scenes from one moving camera as static and dynamic 3D Gaussians.
+
+        commands:
+        {commands}
+
+        warpgs COMMAND --help shows the options of a command; warpgs --version shows the version.
+        """
+    return textwrap.dedent(text).format(commands="\n".join(lines)).strip()
+
+
+def _print_completion(arguments: list[str]) -> int:
+    import tyro
+
+    from .command_line import described
+
+    commands = {name: command.load() for name, command in COMMANDS.items()}
+    with contextlib.ExitStack() as stack:
+        for command in commands.values():
+            stack.enter_context(described(command))
+        tyro.extras.subcommand_cli_from_dict(commands, prog="warpgs", args=arguments)
+    return 0

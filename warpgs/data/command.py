@@ -12,7 +12,7 @@ import tyro
 class Check:
     """Checks whether a capture is fit to train on; exit code 1 if it is not."""
 
-    capture: tyro.conf.Positional[Path]
+    capture: Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional]
     """Folder of the capture."""
     dataset: str | None = None
     """Layout: iphone, nerfds, hypernerf, nerfstudio, blender, llff, colmap, vipe or megasam; recognized from the files
@@ -40,9 +40,9 @@ class Check:
 class Import:
     """Copies a capture of any layout into the own one (docs/capture-format.md), undistorted and in scene units."""
 
-    source: tyro.conf.Positional[Path]
+    source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
     """Folder of a capture: COLMAP, nerfstudio, D-NeRF, LLFF, NVIDIA, ViPE, MegaSaM, NeRF-DS, HyperNeRF or iPhone."""
-    capture: tyro.conf.Positional[Path]
+    capture: Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional]
     """Folder to write; it must not exist or be empty."""
     dataset: str | None = None
     """Layout of the source; recognized from its files by default."""

@@ -11,7 +11,7 @@ import tyro
 class Eval:
     """Evaluates a run's newest checkpoint; writes metrics.json, views.csv, images and a video into its folder."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folder."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""

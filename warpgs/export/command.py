@@ -11,7 +11,7 @@ import tyro
 class Export:
     """Exports the newest checkpoint of a run for other programs, at one time or moving."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folder."""
     format: str = "ply"
     """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.

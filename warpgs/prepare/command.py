@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Annotated
 
 import tyro
 
@@ -21,9 +22,9 @@ class Prepare:
     what a capture lacks, with its own cameras: ``warpgs prepare CAPTURE --add masks,depth,points``.
     """
 
-    source: tyro.conf.Positional[Path]
+    source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
     """Video, or folder of PNG or JPEG frames of one size; with --add the capture."""
-    capture: tyro.conf.Positional[Path | None] = None
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional] = None
     """Folder to write the capture to; not with --add."""
     add: str | None = None
     """Add these to a capture that lacks them: masks, depth and points, separated by commas."""

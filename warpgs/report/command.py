@@ -14,7 +14,7 @@ class Report:
     The file contains everything that it shows and loads nothing.
     """
 
-    run_folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="run"), tyro.conf.Positional]
+    run_folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folders, shown side by side."""
     out: Path | None = None
     """Output file; report.html by default, in the run folder if there is only one."""

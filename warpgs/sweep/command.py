@@ -15,7 +15,7 @@ class Sweep:
     training failed twice. Needs Ray: pip install 'warpgs[sweep]'.
     """
 
-    sweep: tyro.conf.Positional[str]
+    sweep: Annotated[str, tyro.conf.arg(metavar="SWEEP"), tyro.conf.Positional]
     """What to train: ablation (paper, Table 4), masks (Table 5), scenes (Tables 1 to 3), seeds, depth, or a TOML
     file (docs/cluster.md)."""
     data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAPTURE [CAPTURE ...]")] = ()

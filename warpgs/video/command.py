@@ -17,7 +17,7 @@ MAX_SIDE = 16_384
 class Render:
     """Renders a run's newest checkpoint to images and a video."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folder."""
     path: PathName | None = None
     """Camera path: the evaluation views (default); a fixed camera over time; the training camera's path at one fixed

@@ -13,7 +13,7 @@ import tyro
 class View:
     """Shows a run in the browser: move through space and time, switch layers, look through the training cameras."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run"), tyro.conf.Positional]
+    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folder."""
     host: str = "127.0.0.1"
     """Address to listen on. By default only this machine can connect; 0.0.0.0 accepts connections from everywhere."""

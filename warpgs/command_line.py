@@ -1,0 +1,165 @@
+"""Parsing of command lines by tyro, with help that fits the screen and errors in one line.
+
+Help texts are the docstrings of fields. Tyro keeps their line breaks, which are those of the source, and shows
+``{None}|PATH`` and ``(default: None)`` for what may be omitted; here they are rewrapped, and shown without.
+"""
+
+import ast
+import contextlib
+import dataclasses
+import difflib
+import inspect
+import io
+import re
+import sys
+import textwrap
+import types
+import typing
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+from .errors import FAILED
+
+Options = TypeVar("Options")
+
+METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH"}
+
+REWORDED = (
+    (r"^Missing from [^:]*: ", "missing: "),
+    (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
+)
+"""Parts of tyro's messages and what is said instead."""
+
+
+def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Options:
+    """The options of a command line.
+
+    Raises:
+        SystemExit: After ``--help``, or with ``FAILED`` after one line about a wrong option.
+    """
+    with one_line_errors(options, arguments, prog), described(options):
+        return tyro.cli(options, args=list(arguments), prog=prog)
+
+
+@contextlib.contextmanager
+def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Iterator[None]:
+    """Refuses options that do not exist, and turns tyro's boxes about other wrong options into one line on stderr.
+
+    Raises:
+        SystemExit: With ``FAILED``.
+    """
+    known = {*flags(options), "--help"}
+    for argument in arguments:
+        name = argument.split("=")[0].replace("_", "-")
+        if name.startswith("--") and name not in known and not name.startswith("--tyro"):
+            close = difflib.get_close_matches(name, known, 1)
+            advice = f"did you mean {close[0]}?" if close else f"{prog} --help lists all"
+            sys.stderr.write(f"{prog}: there is no option {name}; {advice}\n")
+            raise SystemExit(FAILED)
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            yield
+    except SystemExit as end:
+        if end.code:
+            sys.stderr.write(f"{prog}: {_unboxed(box.getvalue())}\n")
+            raise SystemExit(FAILED) from None
+        raise
+    sys.stderr.write(box.getvalue())
+
+
+def _unboxed(text: str) -> str:
+    """The first paragraph of tyro's message without its box, or argparse's message without its usage, in one line."""
+    lines = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│ ") for line in text.splitlines()]
+    lines = [line for line in lines if line and line[0] not in "╭╰"]
+    rules = [k for k, line in enumerate(lines) if not line.strip("─-")]
+    if rules[:1] == [1] and "│" not in text:  # below the title of a box without Unicode
+        lines, rules = lines[2:], [k - 2 for k in rules[1:]]
+    message = " ".join(" ".join(lines[: rules[0] if rules else None]).split()).split(" error: ")[-1]
+    for pattern, replacement in REWORDED:
+        message = re.sub(pattern, replacement, message)
+    return message[:1].lower() + message[1:]
+
+
+def flags(options: type, prefix: str = "") -> Iterator[str]:
+    """All options of a dataclass of options: ``--out``, ``--no-graph``, ``--model.depth`` …"""
+    for name, hint in typing.get_type_hints(options, include_extras=True).items():
+        settings = _settings(hint)
+        shown = (settings.name if settings and settings.name else name).replace("_", "-")
+        plain = _plain(hint)
+        if dataclasses.is_dataclass(plain):
+            yield from flags(typing.cast(type, plain), f"{prefix}{shown}.")
+            continue
+        yield f"--{prefix}{shown}"
+        if plain is bool:
+            yield f"--{prefix}no-{shown}"
+
+
+@contextlib.contextmanager
+def described(options: type, shown: Collection[str] | None = None) -> Iterator[None]:
+    """While it lasts, tyro shows rewrapped help of a dataclass of options and of those inside it.
+
+    Args:
+        options: The dataclass; its annotations are replaced, and restored afterwards.
+        shown: Names of the fields to show; all if None. The others are accepted, but not shown.
+    """
+    hints = typing.get_type_hints(options, include_extras=True)
+    before, texts = dict(options.__annotations__), docstrings(options)
+    with contextlib.ExitStack() as stack:
+        stack.callback(lambda: setattr(options, "__annotations__", before))
+        for name in before:
+            hint, plain = hints[name], _plain(hints[name])
+            if shown is not None and name not in shown:
+                options.__annotations__[name] = Annotated[hint, tyro.conf.Suppress]
+            elif dataclasses.is_dataclass(plain):
+                stack.enter_context(described(typing.cast(type, plain)))
+            else:
+                options.__annotations__[name] = _with_help(hint, texts.get(name, ""))
+        yield
+
+
+def docstrings(options: type) -> dict[str, str]:
+    """The docstring below each field of a dataclass, without line breaks and marks of code."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(options))).body
+    assert isinstance(definition, ast.ClassDef)
+    texts = {}
+    for field, text in zip(definition.body, definition.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+            texts[ast.unparse(field.target)] = " ".join(str(text.value.value).replace("``", "").split())
+    return texts
+
+
+def _with_help(hint: Any, text: str) -> Any:
+    given = _settings(hint)
+    name, metavar = (given.name, given.metavar) if given else (None, None)
+    metavar = metavar or _metavar(_plain(hint))
+    return Annotated[hint, tyro.conf.arg(name=name, metavar=metavar, help=text, help_behavior_hint=_default_hint)]
+
+
+def _metavar(plain: Any) -> str | None:
+    if typing.get_origin(plain) is typing.Literal:
+        return "{" + ",".join(map(str, typing.get_args(plain))) + "}"
+    return METAVARS.get(plain)
+
+
+def _default_hint(default: str) -> str:
+    """What follows the help of an option; many defaults are described by the help itself."""
+    return "" if default in ("None", "False", "") else f"(default: {default})"
+
+
+def _settings(hint: Any) -> Any:
+    """What ``tyro.conf.arg`` says in an annotation; None without it."""
+    return next((data for data in getattr(hint, "__metadata__", ()) if hasattr(data, "help_behavior_hint")), None)
+
+
+def _plain(hint: Any) -> Any:
+    """The type of an annotation without its metadata and ``| None``."""
+    if hasattr(hint, "__metadata__"):
+        return _plain(typing.get_args(hint)[0])
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        others = [part for part in typing.get_args(hint) if part is not type(None)]
+        return _plain(others[0]) if len(others) == 1 else hint
+    return hint
