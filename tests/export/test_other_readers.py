@@ -40,8 +40,8 @@ FILES = {
 def test_splat_transform_reads_the_scene(tmp_path, name, degree):
     pytest.importorskip("zstandard") if name == "a.spz" else None
     cloud, (write, y_up) = scenes.cloud(300, degree), FILES[name]
-    version = subprocess.run([str(SPLAT_TRANSFORM), "--version"], capture_output=True, text=True, check=True).stdout
-    y_up = y_up and " v2." in version
+    version = subprocess.run([str(SPLAT_TRANSFORM), "--version"], capture_output=True, text=True, check=True)
+    y_up = y_up and " v2." in version.stdout + version.stderr
     write(tmp_path / name, orientation.rotated(cloud, orientation.upright(UP, y_up)))
     command = [str(SPLAT_TRANSFORM), str(tmp_path / name), str(tmp_path / "back.ply")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
