@@ -82,6 +82,8 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
         (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),
         (["render", "r", "--zzz"], "warpgs render: there is no option --zzz; warpgs render --help lists all"),
+        (["\x1b[2J"], "warpgs: there is no command \\x1b[2J; warpgs --help lists all"),
+        (["export", "--\x1b[2J"], "warpgs export: there is no option --\\x1b[2J; "),
         (["export"], "warpgs export: missing: RUN Run folder. (required)"),
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
         (["train", "--preset", "x"], "warpgs train: argument --preset: invalid choice: 'x' (choose from "),

@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from .errors import FAILED, run_command
+from .errors import FAILED, run_command, visible
 
 
 class Command(NamedTuple):
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, 1)
         advice = f"did you mean {close[0]}?" if close else "warpgs --help lists all"
-        sys.stderr.write(f"warpgs: there is no command {name}; {advice}\n")
+        sys.stderr.write(f"warpgs: there is no command {visible(name)}; {advice}\n")
         return FAILED
     if name == "train":
         return train(rest, "warpgs train")

@@ -21,7 +21,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from .errors import FAILED
+from .errors import FAILED, visible
 
 Options = TypeVar("Options")
 
@@ -57,7 +57,7 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
         if name.startswith("--") and name not in known and not name.startswith("--tyro"):
             close = difflib.get_close_matches(name, known, 1)
             advice = f"did you mean {close[0]}?" if close else f"{prog} --help lists all"
-            sys.stderr.write(f"{prog}: there is no option {name}; {advice}\n")
+            sys.stderr.write(f"{prog}: there is no option {visible(name)}; {advice}\n")
             raise SystemExit(FAILED)
     box = io.StringIO()
     try:
@@ -65,7 +65,7 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
             yield
     except SystemExit as end:
         if end.code:
-            sys.stderr.write(f"{prog}: {_unboxed(box.getvalue())}\n")
+            sys.stderr.write(f"{prog}: {visible(_unboxed(box.getvalue()))}\n")
             raise SystemExit(FAILED) from None
         raise
     sys.stderr.write(box.getvalue())
