@@ -154,9 +154,9 @@ def test_an_ffmpeg_that_cannot_be_loaded_is_not_called_missing(tmp_path, monkeyp
     def fail(name):
         raise ImportError("libavcodec.so: failed to map segment: Cannot allocate memory")
 
-    monkeypatch.setattr(mp4.importlib, "import_module", fail)
+    monkeypatch.setattr(writer.importlib, "import_module", fail)
     with pytest.raises(OSError, match=r"^FFmpeg could not be loaded: libavcodec\.so: failed to map"):
-        mp4._ffmpeg()
+        writer._ffmpeg()
 
 
 def test_without_ffmpeg_the_error_says_how_to_install_it(tmp_path, monkeypatch):
