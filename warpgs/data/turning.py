@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-TOLERANCE = 0.003
+TOLERANCE = 0.002
 """Distance of a match from where the rotation moves it that counts as explained, relative to the longer side."""
 
 MIN_EXPLAINED = 0.8
 """Fraction of the matches of a pair that are explained if the camera only turns."""
 
-LEAST_PAIRS = 0.3
+LEAST_PAIRS = 0.2
 """Fraction of the pairs that may be explained worse."""
 
 MIN_MATCHES, MIN_PAIRS, MAX_PAIRS = 50, 8, 40
