@@ -266,6 +266,8 @@ class TrainConfig:
     """Device to train on; CUDA if there is a GPU."""
     seed: int = 0
     """Seed of all random numbers."""
+    depth: bool = True
+    """Use the capture's depth; without it, dynamic Gaussians start in front of the sparse points around them."""
     dap: bool = True
     """Depth-aware pretraining, and the depth loss in the stages after it."""
     vdp: bool = True

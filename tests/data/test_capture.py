@@ -13,13 +13,13 @@ def camera(x: float) -> Camera:
     return Camera(viewmat, torch.eye(3), 4, 2)
 
 
-def make_capture(xs=(0.0, 2.0, 4.0), cache_frames=256, train=None, mask=None):
+def make_capture(xs=(0.0, 2.0, 4.0), cache_frames=256, train=None, mask=None, depth=None):
     """A capture with cameras along x, and the list of the frames read so far."""
     cameras, read = {f"f{k}": camera(x) for k, x in enumerate(xs)}, []
 
     def frame(name: str) -> Frame:
         read.append(name)
-        return Frame(name, cameras[name], torch.zeros(2, 4, 3, dtype=torch.uint8), mask)
+        return Frame(name, cameras[name], torch.zeros(2, 4, 3, dtype=torch.uint8), mask, depth)
 
     train = tuple(cameras) if train is None else train
     return Capture("c", cameras, train, (), torch.zeros(0, 3), None, frame, cache_frames), read
@@ -94,3 +94,12 @@ def test_an_assumption_shares_the_cache_and_everything_but_the_mask():
     assert assumed.frame("f1").image is capture.frame("f1").image
     assert read == ["f1"]
     assert (assumed.train, assumed.extent, assumed.points) == (capture.train, capture.extent, capture.points)
+
+
+def test_without_depth_frames_have_none():
+    capture, read = make_capture(mask=SOME_STATIC, depth=torch.ones(2, 4))
+    bare = capture.without_depth().assuming("static")
+    assert bare.frame("f0").inverse_depth is None
+    assert bare.frame("f0").static_mask.all()
+    assert capture.frame("f0").inverse_depth is not None
+    assert read == ["f0"]

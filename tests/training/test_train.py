@@ -242,8 +242,14 @@ def test_train_prints_nothing_unless_it_is_given_a_log(config, capsys):
 def test_train_logs_its_folder_and_the_metrics(config):
     lines = []
     warpgs.train(config, log=lines.append)
-    assert any(line.startswith("builtin: 6 views, on cpu, into ") for line in lines)
+    assert any(line.startswith("builtin (read as nerfds): 6 views, on cpu, into ") for line in lines)
     assert any("PSNR" in line for line in lines)
+
+
+def test_without_depth_training_says_so_and_needs_no_pretraining(config):
+    lines = []
+    warpgs.train(dataclasses.replace(config, depth=False), log=lines.append)
+    assert any("in 0 of 6 views: training without depth" in line for line in lines)
 
 
 def test_train_resumes_with_the_config_of_the_run(config):

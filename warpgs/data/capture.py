@@ -55,6 +55,7 @@ class Capture:
         cache_frames: Number of frames to keep in memory.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
+        has_depth: Whether frames have the depth of the files; see ``without_depth``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
             unit of 3DGS's position learning rate and densification thresholds [scene units].
 
@@ -72,6 +73,7 @@ class Capture:
     cache_frames: int = 256
     unmasked: Assumption = "masks"
     assumption: Assumption = field(init=False)
+    has_depth: bool = field(init=False, default=True)
     extent: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -93,6 +95,12 @@ class Capture:
         capture.assumption = self.unmasked if assumption == "masks" else assumption
         return capture
 
+    def without_depth(self) -> "Capture":
+        """The same capture as if its files had no depth; the captures have one cache of frames."""
+        capture = copy.copy(self)
+        capture.has_depth = False
+        return capture
+
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.
 
@@ -103,6 +111,8 @@ class Capture:
         if name not in self.cameras:
             raise KeyError(name)
         frame = self._cached(name)
+        if not self.has_depth:
+            frame = replace(frame, inverse_depth=None)
         if self.assumption == "masks":
             return frame
         return replace(frame, static_mask=torch.full(frame.image.shape[:2], self.assumption == "static"))

@@ -7,6 +7,7 @@ from pathlib import Path
 from warpgs.config import TrainConfig, fitted_bands, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
+from warpgs.data.loaders import recognize
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.model.poses import PoseCorrections
@@ -93,7 +94,9 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
 def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
-    log(f"{trainer.capture.name}: {num_views} views, on {trainer.config.device}, into {trainer.run}")
+    config, name = trainer.config, trainer.capture.name
+    layout = "" if config.data is None else f" (read as {config.dataset or recognize(config.data)})"
+    log(f"{name}{layout}: {num_views} views, on {config.device}, into {trainer.run}")
     if jumps := int((trainer.gains != 1.0).any(1).sum()):
         low, high = trainer.gains.min().item(), trainer.gains.max().item()
         log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")

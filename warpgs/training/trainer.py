@@ -43,7 +43,7 @@ class Trainer:
         run: Run folder, for the checkpoints.
 
     Attributes:
-        capture: The capture, with the masks that ``config.assume`` implies.
+        capture: The capture, with the masks that ``config.assume`` implies, without depth if ``config.depth`` is off.
         scene: What is trained.
         iteration: Iterations done.
         gains: [T, 3] what the colours of each training frame are divided by.
@@ -58,6 +58,7 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
         self.config, self.run = config, run
+        capture = capture if config.depth else capture.without_depth()
         self.capture = capture.assuming(config.assume)
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
