@@ -277,8 +277,8 @@ def test_a_number_on_the_command_line_is_checked_by_its_bounds(data):
 def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp_path, monkeypatch):
     whole = initialize.align_to_points
 
-    def mostly_unknown(*arguments):
-        found = whole(*arguments)
+    def mostly_unknown(*arguments, **options):
+        found = whole(*arguments, **options)
         found.alignments[1:], found.errors[1:] = torch.nan, torch.inf
         return found
 
