@@ -75,7 +75,9 @@ PATIENT = dataclasses.replace(
         max_static_points=8_000,
         dynamic_points=3_000,
     ),
-    loss=LossConfig(ssim=0.0, dynamic_background="black", depth_tolerance=0.03, mask_margin=0.008),
+    loss=dataclasses.replace(
+        BEST.loss, ssim=0.0, depth=LossConfig.depth, depth_dynamic=LossConfig.depth_dynamic, depth_smooth=False
+    ),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8),
     schedule=Schedule(

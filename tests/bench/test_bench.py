@@ -1,6 +1,7 @@
 import dataclasses
 import functools
 import json
+import sys
 
 import pytest
 import torch
@@ -114,7 +115,7 @@ def test_a_folder_as_a_file_is_refused_before_anything_is_measured(capsys, tmp_p
 )
 def test_unknown_options_end_with_exit_code_2(arguments):
     with pytest.raises(SystemExit) as end:
-        main(arguments)
+        sys.exit(main(arguments))
     assert end.value.code == 2
 
 

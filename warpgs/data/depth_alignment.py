@@ -145,7 +145,7 @@ def smooth_factor(
     size = inverse_depth.shape
     even = torch.arange(len(ratios)) % 2 == 0
     half = _smoothed(row[even], column[even], ratios[even], size)
-    error = (ratios - half[row, column])[~even].expm1().abs().median().item()
+    error = (half[row, column] - ratios)[~even].expm1().abs().median().item()
     return _smoothed(row, column, ratios, size).exp().to(inverse_depth), error
 
 

@@ -110,7 +110,7 @@ def evaluate(
     capture: Capture,
     lpips: Lpips | None = None,
     on_view: Callable[[int, Frame, Float[Tensor, "H W 3"], Rendering], None] | None = None,
-    align: Callable[[Camera, Float[Tensor, "H W 3"]], Camera] | None = None,
+    align: Callable[[Frame], Camera] | None = None,
     quiet: bool = False,
 ) -> Evaluation:
     """Compares a scene with every evaluation frame of a capture.
@@ -123,7 +123,7 @@ def evaluate(
         capture: Where the frames come from.
         lpips: On the scene's device; LPIPS is not measured if None.
         on_view: Called with the index, frame, ground truth in [0, 1] and rendering of each view.
-        align: Moves the camera of a view, given the ground truth, before the view is rendered.
+        align: The camera to render a frame through, on the scene's device; the frame's own if None.
         quiet: Whether to hide the progress bar.
     """
     device = scene.device
@@ -131,8 +131,8 @@ def evaluate(
     for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
         frame = capture.frame(name)
         truth = frame.image.to(device).float() / 255.0
-        camera = frame.camera.to(device)
-        rendering = scene.render(camera if align is None else align(camera, truth), branches=True)
+        camera = frame.camera.to(device) if align is None else align(frame)
+        rendering = scene.render(camera, branches=True)
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)

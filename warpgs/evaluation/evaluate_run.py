@@ -2,14 +2,12 @@
 
 import dataclasses
 import subprocess
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from warpgs import visualize
-from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.files import write_json, write_png
 from warpgs.progress import progress
@@ -22,7 +20,7 @@ from warpgs.video.writer import Video
 from .evaluate import evaluate, write_views
 from .lpips import find
 from .motion import jitter
-from .poses import aligned_camera
+from .poses import alignment
 
 NUM_IMAGES = 6
 """Evaluation views to save as images, spread over the capture."""
@@ -64,7 +62,7 @@ def evaluate_run(
         if index in chosen:
             write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
 
-    align = partial(_align, scene, capture.extent) if run.config.optim.poses else None
+    align = alignment(scene, capture.extent)
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
     values = {**evaluation.summary(), **_motion(scene, capture), **_training(scene)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
@@ -73,12 +71,9 @@ def evaluate_run(
     return _summary(values)
 
 
-def _align(scene: TrainedScene, extent: float, camera: Camera, truth: torch.Tensor) -> Camera:
-    return aligned_camera(scene.splats(camera.time), camera, truth, extent, scene.config.antialias)
-
-
 def _motion(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
-    return {"jitter": jitter(scene.splats, [capture.cameras[name].time for name in capture.train])}
+    times = [capture.cameras[name].time for name in capture.train]
+    return {"jitter": jitter(scene.splats, times), "poses_aligned": scene.config.optim.poses > 0 and bool(capture.val)}
 
 
 def _training(scene: TrainedScene) -> dict[str, Any]:
@@ -89,7 +84,6 @@ def _training(scene: TrainedScene) -> dict[str, Any]:
         "peak_bytes": metadata.peak_bytes,
         "num_static": len(scene.scene.static),
         "num_dynamic": len(scene.scene.dynamic),
-        "poses_aligned": scene.config.optim.poses > 0,
     }
 
 

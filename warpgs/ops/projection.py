@@ -97,11 +97,14 @@ def record_projection(ctx: OpContext, geometry: Geometry, view: View, near: floa
 
 def _add_camera_gradients(ctx: OpContext, view: View, sums: Float[Tensor, "16"]) -> None:
     """Adds to the gradients of ``viewmat`` and ``K``; their constant last rows get none."""
-    v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)
-    v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
-    v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
-    ctx.add_gradient(view.viewmat, v_viewmat)
-    ctx.add_gradient(view.K, v_K)
+    if ctx.needs_gradient(view.viewmat):
+        v_viewmat = torch.zeros_like(view.viewmat)
+        v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
+        ctx.add_gradient(view.viewmat, v_viewmat)
+    if ctx.needs_gradient(view.K):
+        v_K = torch.zeros_like(view.K)
+        v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
+        ctx.add_gradient(view.K, v_K)
 
 
 def project(

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from warpgs import visualize
 from warpgs.data.images import decode
+from warpgs.evaluation.poses import alignment
 from warpgs.progress import progress
 from warpgs.runs.run import Device, Run
 
@@ -69,13 +70,14 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
     """
     run = Run.open(evaluated.folder, device)
     capture, scene = run.open_capture(quiet), run.trained_scene()
+    align = alignment(scene, capture.extent)
     strips = {}
     for name in progress(names, f"rendering {evaluated.label}", quiet):
         if name not in capture.cameras:
             raise ValueError(f"{capture.name} has no view {name}")
         frame = capture.frame(name)
         truth = frame.image.to(scene.device).float() / 255.0
-        image = scene.render(frame.camera.to(scene.device)).joint.image.clamp(0, 1)
+        image = scene.render(align(frame)).joint.image.clamp(0, 1)
         images = visualize.to_bytes(truth), visualize.to_bytes(image), visualize.error_image(image, truth)
         strips[name] = Strip(*map(data_uri, images))
     measured, newest = evaluated.metrics.get("iterations"), scene.metadata.iteration

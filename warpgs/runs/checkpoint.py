@@ -147,7 +147,9 @@ def load(path: Path) -> Checkpoint:
             if header.get("version") != str(VERSION):
                 raise ValueError(f"{path} has version {header.get('version')}, this program reads {VERSION}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    except SafetensorError as error:
         raise DamagedCheckpointError(path, error) from error
     if unknown := sorted(set(header) - set(HEADER_KEYS)):  # as a damaged "sha256" is
         raise DamagedCheckpointError(path, f"its header has {reprlib.repr(unknown[0])}")

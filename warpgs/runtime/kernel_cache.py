@@ -81,7 +81,10 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
 
 def _discard(folder: Path, reason: object) -> None:
     sys.stderr.write(f"warpgs: warning: the kernel cache is damaged ({reason}): {folder} is compiled again\n")
-    shutil.rmtree(folder)
+    gone = folder.with_name(f"{folder.name}.damaged{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):  # another process was faster
+        folder.rename(gone)
+    shutil.rmtree(gone, ignore_errors=True)
 
 
 def _read_seal(folder: Path) -> dict[str, str]:

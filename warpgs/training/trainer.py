@@ -202,11 +202,11 @@ class Trainer:
     def _roll_back(self, logger: TrainingLogger) -> None:
         """Returns to the newest checkpoint; from there, random numbers are different ones."""
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
-        if rollbacks > MAX_ROLLBACKS:
-            newest = checkpoint.list_checkpoints(self.run)[-1]
+        saved = checkpoint.list_checkpoints(self.run)
+        if rollbacks > MAX_ROLLBACKS or not saved:
             raise ValueError(
-                f"the loss or a parameter is not finite after iteration {failed_at}, even after {MAX_ROLLBACKS} "
-                f"returns to a checkpoint; {newest} holds the last valid state"
+                f"the loss or a parameter is not finite after iteration {failed_at}, even after {self.rollbacks} "
+                f"returns to a checkpoint; {saved[-1] if saved else 'no checkpoint'} holds the last valid state"
             )
         self.restore_newest(logger.log)
         self.rollbacks = rollbacks

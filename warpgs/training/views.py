@@ -119,18 +119,19 @@ class Views:
         else:
             stored = self._store(self._capture.frame(self._capture.train[index]))
             stored = stored.map(lambda tensor: tensor.to(self.device))
-        return self._view(stored, torch.tensor([index], device=self.device))
+        return self._view(stored, torch.full((1,), index, device=self.device))
 
     def pick(self, index: Int64[Tensor, "1"]) -> View:
         """The view of an index on the device; all views must be resident."""
         return self._view(self._all.map(lambda tensors: tensors.index_select(0, index)[0]), index)
 
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
-        """Multiplies the aligned inverse depth of a view by a factor, from now on; the alignment stays the same."""
+        """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
         name = self._capture.train[index]
         self._depth_factors[name] = (alignment.cpu(), factor.half().cpu())
         if self.resident:
             self._all.inverse_depth[index] = self._store(self._capture.frame(name)).inverse_depth
+            del self._depth_factors[name]
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
