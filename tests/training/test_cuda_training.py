@@ -29,7 +29,8 @@ def trainer_on_cuda(data, run, **changes):
 
 def parameters_after_steps(data, run, **changes):
     """Parameters after iterations of stage II with constant numbers of Gaussians."""
-    trainer = trainer_on_cuda(data, run, **changes)
+    optim = dataclasses.replace(tiny.CONFIG.optim, poses=1e-3)
+    trainer = trainer_on_cuda(data, run, optim=optim, **changes)
     trainer._add_dynamic_gaussians()
     with torch.no_grad():  # the rotation of a sphere would get gradients from rounding errors only
         trainer.scene.dynamic.log_scales += torch.linspace(-0.5, 0.5, 3, device="cuda")
@@ -38,7 +39,7 @@ def parameters_after_steps(data, run, **changes):
         trainer.iteration = iteration
         trainer.step(plan, trainer._sample(plan))
     torch.cuda.synchronize()
-    return {name: p.detach().clone() for name, p in trainer.scene.named_parameters()}
+    return {name: p.detach().clone() for name, p in trainer.step.parameters().items()}
 
 
 def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path):

@@ -9,7 +9,10 @@ import tyro
 
 @dataclass(frozen=True)
 class Eval:
-    """Evaluates a run's newest checkpoint; writes metrics.json, views.csv, images and a video into its folder."""
+    """Evaluates a run's newest checkpoint; writes metrics.json, views.csv, images and a video into its folder.
+
+    If training corrected camera poses (preset best), held-out cameras are aligned to the scene by their images first.
+    """
 
     run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
     """Run folder."""

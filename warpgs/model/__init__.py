@@ -1,1 +1,1 @@
-"""The trained scene: static and dynamic Gaussians and the two networks."""
+"""The trained scene: static and dynamic Gaussians, the two networks, and corrections of camera poses."""

@@ -1,4 +1,4 @@
-"""Adam over Gaussians and networks, and its learning rates."""
+"""Adam over Gaussians, networks and camera poses, and its learning rates."""
 
 from collections.abc import Mapping
 
