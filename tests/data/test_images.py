@@ -77,6 +77,24 @@ def test_a_truncated_jpeg_is_refused_by_name(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_a_jpeg_with_data_of_a_phone_behind_the_image_is_read(tmp_path, capfd):
+    jpeg(tmp_path / "a.jpg")
+    data = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "b.jpg").write_bytes(data + b"\0\0ftypmp42 a video SEFT")
+    assert np.array_equal(images.read_image(tmp_path / "b.jpg", SIZE), images.read_image(tmp_path / "a.jpg", SIZE))
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("keep", [300, -200])
+def test_the_end_of_a_preview_does_not_hide_that_a_jpeg_is_truncated(tmp_path, keep):
+    jpeg(tmp_path / "a.jpg")
+    data, preview = (tmp_path / "a.jpg").read_bytes(), b"Exif\0\0\xff\xd8\xff\xd9"
+    segment = b"\xff\xe1" + struct.pack(">H", 2 + len(preview)) + preview
+    (tmp_path / "a.jpg").write_bytes(data[:2] + segment + data[2:keep])
+    with pytest.raises(ValueError, match=r"a\.jpg is truncated"):
+        images.read_image(tmp_path / "a.jpg", SIZE)
+
+
 def chunk(name, content):
     return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 

@@ -1,7 +1,6 @@
 """Reading images, masks and depth; damaged files and files of another size are refused."""
 
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -31,13 +30,11 @@ MAX_BYTES_PER_PIXEL = 9
 MAX_PARTS = 1_000_000
 """Maximum number of chunks of a PNG or segments of a JPEG file."""
 
-MAX_PADDING = 1 << 16
-"""Maximum number of zeros after the end of a JPEG file."""
-
 FILL_RADIUS = 3
 """Neighbourhood used to inpaint unknown pixels [px]."""
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_START_OF_SCAN = 0xDA
 
 
 def decode(
@@ -134,26 +131,36 @@ def _check_png(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def _check_jpeg(path: Path, data: bytes) -> tuple[int, int]:
-    """Checks the end marker; returns width and height from the frame header."""
-    if not data[-MAX_PADDING:].rstrip(b"\0").endswith(b"\xff\xd9"):
+    """Checks the end marker of the image; returns width and height from the frame header.
+
+    Phones append data to the image (Samsung's SEFT, motion photos), and previews in segments have end markers of their
+    own, so it is looked for in the scans.
+    """
+    size, end = _jpeg_header(data)
+    if data.find(b"\xff\xd9", end) < 0:
         raise ValueError(f"{path} is truncated: its end marker is missing")
-    for marker, content in _jpeg_segments(data):
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(content[3:5], "big"), int.from_bytes(content[1:3], "big")
-    raise ValueError(f"{path} is damaged: it has no frame header")
+    if size is None:
+        raise ValueError(f"{path} is damaged: it has no frame header")
+    return size
 
 
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    start = len(_JPEG)
+def _jpeg_header(data: bytes) -> tuple[tuple[int, int] | None, int]:
+    """Width and height, None if no frame header is found, and the offset at which the first scan begins."""
+    size, start = None, len(_JPEG)
     for _ in range(MAX_PARTS):
         if start + 4 > len(data) or data[start] != 0xFF:
-            return
-        if data[start + 1] == 0xFF:  # padding before a marker
+            break
+        marker = data[start + 1]
+        if marker == 0xFF:  # padding before a marker
             start += 1
             continue
-        length = int.from_bytes(data[start + 2 : start + 4], "big")
-        yield data[start + 1], data[start + 4 : start + 2 + length]
-        start += 2 + length
+        if size is None and 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = (int.from_bytes(data[k : k + 2], "big") for k in (start + 5, start + 7))
+            size = width, height
+        start += 2 + int.from_bytes(data[start + 2 : start + 4], "big")
+        if marker == _START_OF_SCAN:
+            break
+    return size, start
 
 
 def to_8_bits(image: np.ndarray) -> np.ndarray:
