@@ -84,7 +84,7 @@ DAMAGES = [
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(FISHEYE), "OPENCV_FISHEYE is not supported; first"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(4, BENT)), "too strong"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [-5.0, 1, 1])), "must be positive"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
     (
         "colmap",
@@ -126,7 +126,7 @@ DAMAGES = [
     ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", transform_matrix=[[1]]), "shape"),
     ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", unrotate), "is not a rotation"),
     ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", shift_far), "finite"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", fl_x=0), "must be positive"),
+    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", fl_x=0), "focal lengths"),
     ("blender", lambda r: layouts.edit_transforms(r / "transforms_train.json", time=1.5), r"time must be in \[0, 1\]"),
     ("blender", lambda r: edit_json(r / "transforms_test.json", camera_angle_x=4), "between 0 and π"),
     ("blender", lambda r: edit_json(r / "transforms_train.json", camera_angle_x=None), "no fl_x or camera_angle_x"),
@@ -156,7 +156,7 @@ DAMAGES = [
     ("megasam", lambda r: save_npz(next(r.iterdir()), depths=None), "has no array depths"),
     ("megasam", lambda r: save_npz(next(r.iterdir()), cam_c2w=np.zeros((12, 4, 4))), "not a rotation"),
     ("megasam", lambda r: save_npz(next(r.iterdir()), intrinsic=np.ones((3, 3))), "must have no skew"),
-    ("megasam", lambda r: save_npz(next(r.iterdir()), intrinsic=np.diag([0.0, 1, 1])), "must be positive"),
+    ("megasam", lambda r: save_npz(next(r.iterdir()), intrinsic=np.diag([0.0, 1, 1])), "focal lengths"),
     ("megasam", lambda r: shutil.copy(next(r.iterdir()), r / "b_sgd_cvd_hr.npz"), "2 videos of MegaSaM"),
 ]
 
@@ -221,6 +221,13 @@ def test_exr_depth_is_read_and_every_truncation_refused(compression, size):
             read_exr_channel(data[:end], "Z")
     with pytest.raises(ValueError, match="no floating-point channel R"):
         read_exr_channel(data, "R")
+
+
+def test_exr_depth_with_too_many_pixels_is_refused_before_memory_is_allocated():
+    window = struct.pack("<4i", 0, 0, 6, 3)
+    data = layouts.exr(np.ones((4, 7), np.float16)).replace(window, struct.pack("<4i", 0, 0, 15_999, 15_999))
+    with pytest.raises(ValueError, match="OpenEXR image of 16000×16000 pixels"):
+        read_exr_channel(data, "Z")
 
 
 def test_openexr_itself_writes_what_is_read(tmp_path):

@@ -83,3 +83,21 @@ def test_masks_and_depth_get_no_new_values():
 def test_a_distortion_that_is_not_invertible_is_refused():
     with pytest.raises(ValueError, match="too strong"):
         filling_zoom(dataclasses.replace(PINHOLE, radial=(-20.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"focal": (1e-4, 100.0)}, "focal lengths must be at least 0.001 px"),
+        ({"width": 16_385}, "image size 16385×120, expected 1 to 16384 pixels per side"),
+        ({"width": 16_000, "height": 16_000}, "expected at most 100,000,000 pixels together"),
+    ],
+)
+def test_a_lens_out_of_bounds_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(PINHOLE, **changes).checked()
+
+
+def test_a_resized_lens_has_the_same_view():
+    small = Lens(64, 48, (50.0, 52.0), (30.0, 25.0)).resized(32, 24)
+    assert small == Lens(32, 24, (25.0, 26.0), (15.0, 12.5))

@@ -10,12 +10,8 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.files import read_json, read_numbers
 
-from .images import MAX_PIXELS, MAX_SIDE
 from .lens import Lens, pinhole_matrix
 from .units import SceneUnits
-
-MIN_FOCAL = 1e-3
-"""Minimum focal length and pixel aspect ratio [px, 1]; the reciprocals of smaller ones overflow."""
 
 MAX_ROTATION_ERROR = 1e-3
 """Maximum entry of R Rᵀ − 1 for a rotation R; the files have at least six digits."""
@@ -44,7 +40,7 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
     viewmat = np.eye(4)
     try:
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ units.from_world(position)
-        K = pinhole_matrix(lens)
+        K = pinhole_matrix(lens.checked())
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     viewmat_tensor, K_tensor = (torch.tensor(m, dtype=torch.float32) for m in (viewmat, K))
@@ -53,10 +49,6 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
 
 def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     focal, aspect = _number(path, fields, "focal_length"), _number(path, fields, "pixel_aspect_ratio", 1.0)
-    if min(focal, aspect) < MIN_FOCAL:
-        raise ValueError(
-            f"{path}: focal_length and pixel_aspect_ratio must be at least {MIN_FOCAL}, got {focal}, {aspect}"
-        )
     if skew := _number(path, fields, "skew", 0.0):
         raise ValueError(f"{path}: cameras must have no skew, got {skew}")
     x, y = read_numbers(path, fields, "principal_point", (2,)) / factor
@@ -67,8 +59,6 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     full = read_numbers(path, fields, "image_size", (2,))
     # Rounded as in Nerfies, whose code created the images.
     width, height = (round(float(side) / factor) for side in full)
-    if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE or width * height > MAX_PIXELS:
-        raise ValueError(f"{path}: image_size {full.tolist()} is out of range")
     return Lens(
         width=width,
         height=height,

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .images import MAX_PIXELS, MAX_SIDE
+
 MAGIC = b"v/1\x01"
 
 TILED, MULTI_PART, DEEP = 0x200, 0x1000, 0x800
@@ -19,8 +21,6 @@ LINES = {0: 1, 2: 1, 3: 16}
 """Lines per block of each compression: none, ZIPS and ZIP."""
 
 PIXEL_TYPES: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
-
-MAX_SIDE = 16_384
 
 
 class _Header(NamedTuple):
@@ -66,7 +66,7 @@ def _header(data: bytes) -> _Header:
         raise ValueError("an OpenEXR header without channels, compression or data window")
     left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
     width, height = right - left + 1, bottom - top + 1
-    if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
+    if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE or width * height > MAX_PIXELS:
         raise ValueError(f"an OpenEXR image of {width}×{height} pixels")
     compression = attributes["compression"][0]
     if compression not in LINES:

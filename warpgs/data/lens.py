@@ -19,7 +19,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from .images import MAX_SIDE
+from .images import MAX_PIXELS, MAX_SIDE
+
+MIN_FOCAL = 1e-3
+"""Minimum focal length [px]; the reciprocals of smaller ones overflow."""
 
 MAX_ZOOM = 2.0
 """Maximum zoom of the undistorted image; distortion that needs more is considered an error in the file."""
@@ -48,14 +51,16 @@ class Lens:
         """The same lens.
 
         Raises:
-            ValueError: If a number is not finite, a focal length is not positive, the size is out of range, or the
-                distortion is too strong to undistort.
+            ValueError: If a number is not finite, a focal length is below ``MIN_FOCAL``, the size is out of range, or
+                the distortion is too strong to undistort.
         """
         values = (*self.focal, *self.center, *self.radial, *self.tangential)
-        if not np.isfinite(values).all() or min(self.focal) <= 0:
-            raise ValueError(f"focal lengths must be positive and intrinsics finite, got {values}")
+        if not np.isfinite(values).all() or min(self.focal) < MIN_FOCAL:
+            raise ValueError(f"focal lengths must be at least {MIN_FOCAL} px and intrinsics finite, got {values}")
         if not 0 < min(self.width, self.height) <= max(self.width, self.height) <= MAX_SIDE:
-            raise ValueError(f"{self.width}×{self.height} pixels, expected 1 to {MAX_SIDE} per side")
+            raise ValueError(f"image size {self.width}×{self.height}, expected 1 to {MAX_SIDE} pixels per side")
+        if self.width * self.height > MAX_PIXELS:
+            raise ValueError(f"image size {self.width}×{self.height}, expected at most {MAX_PIXELS:,} pixels together")
         filling_zoom(self)
         return self
 
