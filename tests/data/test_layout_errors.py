@@ -7,6 +7,7 @@ import struct
 import zipfile
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from warpgs.data.exr import read_exr_channel
 from warpgs.data.loaders import load_capture
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
+from warpgs.data.video_frames import VideoFrames
 
 
 @pytest.fixture(scope="module")
@@ -244,3 +246,15 @@ def test_an_npz_array_that_claims_too_much_is_refused_before_it_is_read(tmp_path
     assert read_npz(tmp_path / "a.npz", ["x"])["x"].shape == (1_000_000,)
     with pytest.raises(ValueError, match="its arrays have 8,000,128 bytes, more than the maximum of 1,000"):
         read_npz(tmp_path / "a.npz", ["x"], 1000)
+
+
+def test_a_video_cannot_make_ffmpeg_open_addresses(written, monkeypatch):
+    opened, open_video = [], av.open
+
+    def open_and_note(path, **arguments):
+        opened.append(arguments["options"]["protocol_whitelist"])
+        return open_video(path, **arguments)
+
+    monkeypatch.setattr(av, "open", open_and_note)
+    assert VideoFrames(written["vipe"] / "rgb/clip.mp4").size == layouts.SIZE
+    assert opened == ["file"]

@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -29,6 +28,7 @@ from warpgs.progress import progress
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
 from .degraded_depth import DegradedDepth
+from .images import decode
 from .lens import Lens
 from .synthetic import complete_or_absent, content_folder
 from .units import SceneUnits
@@ -243,6 +243,6 @@ def _write_degraded(exact: Path, folder: Path) -> None:
     files = sorted((exact / "depth/1x").glob("*.png"))
     errors = DegradedDepth(len(files))
     for k, path in enumerate(files):
-        inverse = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.float64)
-        mask = np.asarray(cv2.imread(str(exact / f"resized_mask/1x/{path.name}.png"), cv2.IMREAD_UNCHANGED))
+        inverse = decode(path).astype(np.float64)
+        mask = decode(exact / f"resized_mask/1x/{path.name}.png")
         writer.write_depth(folder, path.stem, errors(k, inverse, mask == 0))

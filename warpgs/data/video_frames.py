@@ -14,6 +14,9 @@ from .images import MAX_PIXELS
 MAX_BYTES = 64 << 30
 """Maximum size of a video [bytes]."""
 
+READ_LOCAL_FILES = {"protocol_whitelist": "file"}
+"""Options of FFmpeg, with which playlists cannot make it open addresses."""
+
 
 class VideoFrames:
     """Decodes a video's frames on request; in the order of the frames that takes one pass.
@@ -49,7 +52,7 @@ class VideoFrames:
 
     def _decoded(self) -> Iterator[np.ndarray]:
         try:
-            with av.open(str(self.path)) as container:
+            with av.open(str(self.path), options=READ_LOCAL_FILES) as container:
                 if not container.streams.video:
                     raise ValueError(f"{self.path} has no video")
                 stream = container.streams.video[0]

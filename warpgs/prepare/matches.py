@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Bool, Float
 
+from warpgs.data.images import decode
 from warpgs.data.turning import Matches
 
 OVERLAP = 10
@@ -101,9 +102,7 @@ def _static(opened: Any, image: Any, masks: Path | None, is_wanted: bool) -> Boo
     positions = _positions(opened, image.image_id)
     if not is_wanted or masks is None:
         return np.full(len(positions), is_wanted)
-    mask = cv2.imread(str(masks / f"{image.name}.png"), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise ValueError(f"{masks / image.name}.png is missing or damaged")
+    mask = decode(masks / f"{image.name}.png", cv2.IMREAD_GRAYSCALE)
     column, row = np.clip(positions.astype(int), 0, [mask.shape[1] - 1, mask.shape[0] - 1]).T
     return mask[row, column] > 0
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.data.images import MAX_SIDE
+from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.files import require_file
 from warpgs.progress import progress
 
@@ -29,9 +30,6 @@ MAX_BYTES = 1 << 42
 
 MAX_COUNTED = 1_000_000
 """Maximum number of frames of a video; later ones are ignored."""
-
-READ_LOCAL_FILES = {"protocol_whitelist": "file"}
-"""Playlists must not make FFmpeg open addresses."""
 
 
 class TakenImage(NamedTuple):
