@@ -342,6 +342,13 @@ def test_a_full_disk_is_reported_before_work_starts(shots, tmp_path, monkeypatch
         prepare(shots, tmp_path / "made")
 
 
+def test_a_replacement_does_not_keep_the_colors_of_old_points(tmp_path):
+    np.save(tmp_path / "point_colors.npy", np.zeros((2, 3), np.uint8))
+    journal = Journal(tmp_path, {}, force=True, log=None)
+    journal.clear(journal.work / "frames")
+    assert not (tmp_path / "point_colors.npy").exists()
+
+
 def test_colmap_does_not_start_on_a_full_disk(shots, tmp_path, monkeypatch):
     class Usage:
         free = 10**12

@@ -14,8 +14,8 @@ REPORT = "prepare.json"
 """Report in the finished capture: options, result and seconds of every step, notes."""
 
 OUTPUTS = (
-    "rgb", "resized_mask", "camera", "depth", "points.npy", "scene.json", "metadata.json", "dataset.json",
-    "masks.png", "depth.png", REPORT,
+    "rgb", "resized_mask", "camera", "depth", "points.npy", "point_colors.npy", "scene.json", "metadata.json",
+    "dataset.json", "masks.png", "depth.png", REPORT,
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
