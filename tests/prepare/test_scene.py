@@ -8,7 +8,7 @@ import pytest
 from tests.prepare import boards
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import load_capture, recognize
-from warpgs.prepare.cameras import Cameras, pinhole_lens, resized_lens
+from warpgs.prepare.cameras import Cameras, pinhole_lens
 from warpgs.prepare.scene import scene_units, static_points
 
 
@@ -68,11 +68,6 @@ def test_a_pinhole_lens_is_unchanged_and_a_distorted_one_zooms_in():
     distorted = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
     assert pinhole_lens(distorted).focal[0] >= 50.0
     assert pinhole_lens(distorted).is_pinhole
-
-
-def test_a_resized_lens_has_the_same_view():
-    small = resized_lens(Lens(64, 48, (50.0, 52.0), (30.0, 25.0)), 32, 24)
-    assert (small.width, small.focal, small.center) == (32, (25.0, 26.0), (15.0, 12.5))
 
 
 def test_points_in_dynamic_regions_are_omitted():

@@ -99,8 +99,3 @@ def pinhole_lens(lens: Lens) -> Lens:
     """The pinhole lens of the images that ``undistort`` makes."""
     K = pinhole_matrix(lens)
     return Lens(lens.width, lens.height, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
-
-
-def resized_lens(lens: Lens, width: int, height: int) -> Lens:
-    """The lens of images that were resized to another size."""
-    return lens.resized(width, height)

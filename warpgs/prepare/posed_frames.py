@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from warpgs.data.lens import Lens
 
-from .cameras import Cameras, resized_lens
+from .cameras import Cameras
 from .flow import Flows
 from .images import read_images, resize_to_side
 from .triangulation import MIN_RELATIVE_DEPTH, Observation
@@ -132,7 +132,7 @@ def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: flo
     """
     images = [resize_to_side(image, side, max_factor) for image in read_images(folder, cameras.names)]
     height, width = images[0].shape[:2]
-    return PosedFrames(images, resized_lens(cameras.lens, width, height), cameras.poses, cameras.points)
+    return PosedFrames(images, cameras.lens.resized(width, height), cameras.poses, cameras.points)
 
 
 def pixel_rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
