@@ -5,7 +5,10 @@ import tarfile
 import zipfile
 from pathlib import Path
 
-SDIST = ("README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", "constraints.txt", "train.py")
+SDIST = (
+    "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", "constraints.txt",
+    "constraints-oldest.txt", "train.py",
+)  # fmt: skip
 """Files of the root that belong to the sdist, which also has the folders ``FOLDERS``."""
 
 FOLDERS = ("docs", "examples", "tests")

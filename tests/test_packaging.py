@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 
@@ -33,3 +34,18 @@ def test_the_version_is_the_same_everywhere(project):
     version = project["project"]["version"]
     assert re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == version
     assert f"\n## {version}\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_oldest_versions_that_are_tested_are_the_oldest_that_are_accepted(project):
+    lines = (ROOT / "constraints-oldest.txt").read_text().splitlines()
+    oldest = dict(line.split("==") for line in lines if not line.startswith("#"))
+    required = [Requirement(line) for line in project["project"]["dependencies"]]
+    unfit = [r.name for r in required if r.name in oldest and not r.specifier.contains(oldest[r.name])]
+    unpinned = {r.name for r in required if r.name not in oldest and not r.marker}
+    assert (unfit, unpinned) == ([], set())
+
+
+def test_python_3_10_gets_the_parser_of_toml_that_sweep_imports(project):
+    markers = {r.name: r.marker for r in map(Requirement, project["project"]["dependencies"])}
+    assert markers["tomli"].evaluate({"python_version": "3.10"})
+    assert not markers["tomli"].evaluate({"python_version": "3.11"})
