@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.prepare import boards
-from warpgs.prepare import sfm
+from warpgs.prepare import colmap, sfm
 from warpgs.prepare.cameras import NoCamerasError
 from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
@@ -120,6 +120,25 @@ def test_a_camera_that_only_turns_is_refused_and_named(turning, tmp_path):
     with pytest.raises(NoCamerasError, match=r"the camera only turns: a rotation explains \d+% of the matches"):
         recover_cameras(turning, names, tmp_path / "work", Settings(thorough=False))
     assert not (tmp_path / "work/model").exists()  # it was refused before mapping
+
+
+def test_a_camera_that_passes_a_wall_needs_its_focal_length(tmp_path, monkeypatch):
+    """Static surfaces shift as a whole, as in front of a camera of long focal length that turns."""
+    size, generator = (640, 480), np.random.default_rng(0)
+    firsts = [generator.uniform((0, 0), size, (100, 2)) for _ in range(12)]
+    pairs = [(first, first - (2.0 * k, 0.0)) for k, first in enumerate(firsts, 1)]
+    monkeypatch.setattr(colmap, "verified_matches", lambda database: (pairs, size))
+
+    def check(focal: float | None) -> None:
+        work = str(tmp_path)
+        job = colmap.Job(work, ["a"], work, "PINHOLE", None, False, False, focal, False)
+        colmap._check_parallax(job, tmp_path / "features.db")
+
+    with pytest.raises(NoCamerasError, match=r"over flat ground, give its focal length: --focal PX$"):
+        check(None)
+    check(500.0)
+    with pytest.raises(NoCamerasError, match=r"instead of turning on the spot$"):  # it is given already
+        check(4000.0)
 
 
 def test_refinement_uses_the_features_of_the_first_pass(tmp_path):

@@ -181,9 +181,12 @@ def _check_parallax(job: Job, database: Path) -> None:
             "is undetermined; move the camera sideways"
         )
     if turning.only_turns:
+        # Before a plane, moving sideways looks like turning with a long focal length.
+        known = "; if it does move, past a wall or over flat ground, give its focal length: --focal PX"
         raise NoCamerasError(
             f"the camera only turns: a rotation explains {turning.explained:.0%} of the matches between frames, so "
             "depth is undetermined; walk around the scene or move the camera sideways instead of turning on the spot"
+            + (known if job.focal is None else "")
         )
 
 
