@@ -65,6 +65,16 @@ def test_images_of_a_camera_that_only_turns_are_an_error_whatever_its_poses(root
     assert not report.is_fit
 
 
+def test_a_camera_that_passes_a_wall_is_told_by_its_focal_length_from_one_that_turns(root):
+    """With a longer focal length, a rotation would shift the image of the wall as the camera does."""
+    wall = boards.texture(3, (150, 140, 120), 400, (40, 120))
+    for k, path in enumerate(sorted((root / "rgb/1x").iterdir())):
+        cv2.imwrite(str(path), wall[100:292, 8 * k : 8 * k + 256])
+    report = check_capture(root)
+    assert "with the best focal length" in texts(report, "warning")
+    assert "only turns" not in texts(report, "error")
+
+
 def test_inverted_masks_are_an_error(root):
     for path in (root / "resized_mask/1x").iterdir():
         cv2.imwrite(str(path), 255 - cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))

@@ -210,12 +210,21 @@ def _turning(capture: Capture) -> Iterator[Finding]:
     """Whether the images show parallax at all."""
     names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
     found = turning_of([capture.frame(name) for name in _sampled(names, SAMPLES)])
-    if found is not None and found.only_turns:
+    if found is None or not any(turning.only_turns for turning in found):
+        return
+    searched, known = (f"{turning.explained:.0%}" for turning in found)
+    if all(turning.only_turns for turning in found):
         text = (
-            f"the camera only turns: a rotation explains {found.explained:.0%} of the matches between frames, so depth "
-            "and positions are undetermined; move the camera sideways"
+            f"the camera only turns: a rotation explains {searched} of the matches between frames, so depth and "
+            "positions are undetermined; move the camera sideways"
         )
         yield Finding("error", "cameras", text)
+    else:
+        text = (
+            f"a rotation explains {searched} of the matches between frames with the best focal length, {known} with "
+            "that of the cameras: the camera only turns and its focal length is wrong, or it moves before a plane"
+        )
+        yield Finding("warning", "cameras", text)
 
 
 def _points_at_cameras(capture: Capture, cameras: list[Camera]) -> Iterator[Finding]:

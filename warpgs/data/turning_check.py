@@ -24,11 +24,14 @@ MAX_EPIPOLAR_ERROR = 2.0
 """Of the matches that count [px]."""
 
 
-def turning_of(frames: Sequence[Frame]) -> Turning | None:
+def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:
     """How well turning alone explains the images in static regions; None if that cannot be told.
 
     Args:
         frames: Some frames in temporal order, evenly spread.
+
+    Returns:
+        With the focal length that explains most, whatever the cameras say, and with that of the cameras.
     """
     sizes = {frame.camera.size for frame in frames}
     if len(sizes) != 1:
@@ -39,7 +42,9 @@ def turning_of(frames: Sequence[Frame]) -> Turning | None:
     features = [_features(frame, size) for frame in frames]
     pairs = [p for p in itertools.combinations(range(len(frames)), 2) if p[1] - p[0] <= MAX_STEP]
     matches = [found for a, b in pairs if (found := _match(features[a], features[b])) is not None]
-    return find_turning(matches, size)
+    focal = factor * float(np.median([float(frame.camera.K[0, 0]) for frame in frames]))
+    searched, known = find_turning(matches, size), find_turning(matches, size, focal)
+    return None if searched is None or known is None else (searched, known)
 
 
 def _features(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
