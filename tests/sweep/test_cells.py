@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from tests.data import layouts
 from warpgs.config import TrainConfig
 from warpgs.presets import PRESETS
 from warpgs.sweep.cells import arguments, find_scenes, finished_metrics, plan_cells
@@ -88,6 +89,16 @@ def test_a_folder_of_captures_stands_for_the_captures_in_it(tmp_path):
     found = find_scenes([str(tmp_path)])
     assert found == {"as": str(tmp_path / "as"), "bell": str(tmp_path / "bell")}
     assert find_scenes([str(tmp_path / "as")]) == {"as": str(tmp_path / "as")}
+
+
+@pytest.mark.parametrize("write", [layouts.write_colmap, layouts.write_nerfstudio, layouts.write_llff])
+def test_a_folder_of_captures_may_have_any_layout(write, tmp_path):
+    for name in ("bell", "as"):
+        write(tmp_path / name)
+    (tmp_path / "notes.txt").write_text("")
+    found = find_scenes([str(tmp_path)])
+    assert list(found.items()) == [("as", str(tmp_path / "as")), ("bell", str(tmp_path / "bell"))]
+    assert find_scenes([str(tmp_path / "bell")]) == {"bell": str(tmp_path / "bell")}
 
 
 def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):

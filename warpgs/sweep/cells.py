@@ -1,6 +1,7 @@
 """The cells of a sweep: every variant on every capture with every seed, each a run folder of its own."""
 
 import dataclasses
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -86,10 +87,19 @@ def _named(text: str) -> Iterator[tuple[str, str]]:
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
     else:
         root = Path(text).resolve()
-        inside = [] if (root / "dataset.json").exists() else sorted(root.glob("*/dataset.json"))
-        yield from ((path.parent.name, str(path.parent)) for path in inside)
+        inside = _captures_in(root)
+        yield from ((path.name, str(path)) for path in inside)
         if not inside:
             yield root.name, str(root)
+
+
+def _captures_in(root: Path) -> list[Path]:
+    """The captures in a folder, by name; none if it is a capture itself."""
+    from warpgs.data.loaders import is_capture  # imports torch
+
+    if not root.is_dir() or is_capture(root):
+        return []
+    return [path for path in sorted(root.iterdir()) if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
 
 
 def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides: Mapping[str, Any]) -> list[Cell]:

@@ -23,7 +23,7 @@ from .nerfds import NerfDsLoader
 from .nerfstudio import NerfstudioLoader
 from .vipe import VipeLoader
 
-__all__ = ["LOADERS", "Loader", "load_capture", "recognize"]
+__all__ = ["LOADERS", "Loader", "is_capture", "load_capture", "recognize"]
 
 
 class Loader(Protocol):
@@ -84,6 +84,11 @@ def load_capture(
     root = builtin_folder(root) if is_builtin(root) else Path(root)
     loader = LOADERS[dataset or recognize(root)]
     return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
+
+
+def is_capture(root: Path) -> bool:
+    """Whether a folder looks like a capture: it has a dataset.json, or a loader recognizes its files."""
+    return (root / "dataset.json").exists() or any(loader.recognizes(root) for loader in LOADERS.values())
 
 
 def recognize(root: Path) -> str:
