@@ -147,8 +147,12 @@ def test_other_layouts_are_to_be_imported_first(tmp_path):
 
 def test_the_depth_of_iphone_captures_is_that_of_the_sensor(tmp_path):
     root = captures.write_capture(tmp_path / "toy", "iphone")
-    with pytest.raises(ValueError, match="is an iPhone capture, whose depth is that of its sensor"):
-        add_parts(root, AddOptions(["depth"]))
+    next((root / "depth").glob("*/*.npy")).unlink()
+    before = sorted(root.rglob("*"))
+    lines = []
+    add_parts(root, AddOptions(["depth", "points"]), lines.append)
+    assert lines == ["depth: that of the sensor stays", "points: 10 are there"]
+    assert sorted(root.rglob("*")) == before
 
 
 def test_too_few_frames_for_masks_are_refused(tmp_path):

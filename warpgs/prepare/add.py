@@ -72,9 +72,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     layout = recognize(root)
     if not isinstance(LOADERS[layout], NerfiesLoader):
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
-    if layout == "iphone" and "depth" in options.parts:
-        raise ValueError(f"{root} is an iPhone capture, whose depth is that of its sensor; add masks or points only")
-    job = _Job(root, load_capture(root), read_units(root / "scene.json"), options, log)
+    job = _Job(root, layout, load_capture(root), read_units(root / "scene.json"), options, log)
     for part in PARTS:
         if part in options.parts:
             getattr(job, f"add_{part}")()
@@ -96,6 +94,7 @@ class _Job:
     """One call of ``add_parts``; ``estimated`` holds frames and depth by the method's name."""
 
     root: Path
+    layout: str
     capture: Capture
     units: SceneUnits
     options: AddOptions
@@ -131,7 +130,10 @@ class _Job:
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 
     def add_depth(self) -> None:
-        """Writes depth of the frames that lack it, and depth.png."""
+        """Writes depth of the frames that lack it, and depth.png; not of iPhone captures, whose depth is in metres."""
+        if self.layout == "iphone":
+            self._say("depth: that of the sensor stays")
+            return
         names = self._names()
         missing = [name for name in names if self.capture.frame(name).inverse_depth is None]
         if not missing:
