@@ -83,6 +83,20 @@ def test_masks_that_are_there_stay(root):
     assert not written_mask(root, "shot003").any()
 
 
+@pytest.mark.usefixtures("red")
+def test_masks_are_not_split_over_two_folders(root):
+    """Masks of the training frames in mask/, none of the evaluation frames."""
+    train = load_capture(root).train
+    for name in train:
+        captures.write_png(root / f"mask/1x/{name}.png.png", np.full((192, 256), 255, np.uint8))
+    with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
+        add_parts(root, AddOptions(["masks"], masks="red"))
+    assert not (root / "resized_mask").exists()
+    (root / "mask").rename(root / "resized_mask")
+    add_parts(root, AddOptions(["masks"], masks="red"))
+    assert [written_mask(root, name).any() for name in NAMES] == [name not in train for name in NAMES]
+
+
 def test_depth_and_points_are_those_of_the_scene(root):
     points = np.load(root / "points.npy")
     (root / "points.npy").unlink()

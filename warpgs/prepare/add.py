@@ -108,6 +108,11 @@ class _Job:
         if not missing:
             self._say("masks: all frames have them")
             return
+        if (self.root / "mask").is_dir() and not (self.root / "resized_mask").is_dir():
+            # The loader reads one of the two folders: those in mask/ would be lost to it.
+            raise ValueError(
+                f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
+            )
         if len(names) < MIN_FOR_MOTION:
             raise ValueError(
                 f"{len(names)} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
