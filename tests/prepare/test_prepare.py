@@ -224,7 +224,11 @@ def test_masks_of_another_aspect_ratio_are_refused_and_smaller_ones_enlarged(tmp
     cv2.imwrite(str(tmp_path / "half.png"), mask[::2, ::2])
     cv2.imwrite(str(tmp_path / "upright.png"), np.rot90(mask))
     assert (read_dynamic(tmp_path / "half.png", boards.SIZE) == (mask == 0)).mean() > 0.99
-    with pytest.raises(ValueError, match=r"upright\.png: the mask is 192×256, .* the 256×192 frame"):
+    double = np.full((2 * mask.shape[0], 2 * mask.shape[1]), 255, np.uint8)
+    double[41, 60] = 0
+    cv2.imwrite(str(tmp_path / "double.png"), double)
+    assert np.argwhere(read_dynamic(tmp_path / "double.png", boards.SIZE)).tolist() == [[20, 30]]
+    with pytest.raises(ValueError, match=r"upright\.png: the mask is 192×256, which has not the shape of 256×192"):
         read_dynamic(tmp_path / "upright.png", boards.SIZE)
 
 

@@ -7,11 +7,10 @@ capture, which are undistorted.
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from warpgs.data.images import image_size, read_mask
+from warpgs.data.resized import read_resized_mask
 
 from .frames import SourceFrame
 
@@ -43,14 +42,9 @@ def _file(folder: Path, stems: Iterable[str]) -> Path | None:
 def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """[H, W] true where a mask file is dynamic, resized to ``size`` (width, height).
 
+    A pixel of a reduced mask is dynamic if any part of it is.
+
     Raises:
         ValueError: If it is damaged or its aspect ratio is not that of the frame.
     """
-    width, height = image_size(path)
-    tolerance = 0.5 * (width + height + sum(size))  # both may have been rounded to whole pixels
-    if abs(width * size[1] - height * size[0]) > tolerance:
-        raise ValueError(
-            f"{path}: the mask is {width}×{height}, which is not the shape of the {size[0]}×{size[1]} frame"
-        )
-    static = read_mask(path, (width, height)).astype(np.uint8)
-    return cv2.resize(static, size, interpolation=cv2.INTER_NEAREST_EXACT) == 0
+    return ~read_resized_mask(path, size)
