@@ -145,6 +145,10 @@ def test_a_hypernerf_capture_stays_one(tmp_path):
         (["--add", "masks", "--masks", "none"], "--masks must be one of motion, sam2 to add it, got none"),
         (["--add", "depth", "--depth", "none"], "--depth must be one of flow, anything to add it, got none"),
         (["elsewhere", "--add", "depth"], "with --add, give the capture only"),
+        (["--add", "depth", "--force"], "--force cannot be used with --add, which keeps the frames and cameras"),
+        (["--add", "depth", "--holdout", "8"], "--holdout cannot be used with --add"),
+        (["--add", "depth", "--focal", "500"], "--focal cannot be used with --add"),
+        (["--add", "depth", "--longest-side", "480"], "--longest-side cannot be used with --add"),
         ([], "prepare needs a source and a folder for the capture"),
     ],
 )

@@ -3,7 +3,7 @@
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -12,6 +12,9 @@ from typing import Annotated
 import tyro
 
 from .options import LensModel, Options, Selection
+
+USED_BY_ADD = ("source", "add", "masks", "depth", "weights", "quiet")
+"""Options that mean something with ``--add``."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,7 @@ class Prepare:
         if self.add is not None:
             from .add import AddOptions, add_parts
 
-            if self.capture is not None:
-                raise ValueError(f"with --add, give the capture only, without {self.capture}")
+            self._check_alone()
             add_parts(self.source, AddOptions(self.add.split(","), self.masks, self.depth, self.weights), log)
             return
         if self.capture is None:
@@ -76,6 +78,16 @@ class Prepare:
                 prepare(self.source, self.capture, options, force=self.force, log=log)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
+
+    def _check_alone(self) -> None:
+        """Refuses what --add has no use for."""
+        if self.capture is not None:
+            raise ValueError(f"with --add, give the capture only, without {self.capture}")
+        for field in fields(self):
+            if field.name not in USED_BY_ADD and getattr(self, field.name) != field.default:
+                raise ValueError(
+                    f"--{field.name.replace('_', '-')} cannot be used with --add, which keeps the frames and cameras"
+                )
 
 
 @contextmanager
