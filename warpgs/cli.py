@@ -100,7 +100,8 @@ def train(arguments: Sequence[str], prog: str) -> int:
             return training.main(arguments, prog)
     finally:
         if not help_all:
-            print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.")
+            with contextlib.suppress(BrokenPipeError):  # of --help | head
+                print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.", flush=True)
 
 
 def usage() -> str:
