@@ -21,7 +21,7 @@ CELLS_PER_SIGMA = 2.0
 """Standard deviation of the filter that smooths factors at points, in mean distances between points."""
 
 PRIOR_WEIGHT = 0.1
-"""Weight of a factor of 1, in points at no distance: where there are no points, depth is not changed."""
+"""Weight of a factor of 1, in points at distance 0: far from all points, depth stays as it is."""
 
 ROBUST_SCALE = 0.1
 """Error of the logarithm of a factor at which the weight of a point is halved: some points are behind surfaces."""
@@ -63,6 +63,16 @@ def fit_scale_offset(values: Float[Tensor, " S"], targets: Float[Tensor, " S"]) 
     return torch.stack([a, b]).to(values.dtype)
 
 
+def _samples(
+    inverse_depth: Float[Tensor, "H W"], static: Tensor, camera: Camera, points: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, " S"], Float[Tensor, " S"]]:
+    """Known inverse depth of a frame at the visible sparse points in its static region, and that of the points."""
+    row, column, z, inside = camera.project(points)
+    values = inverse_depth[row, column]
+    known = inside & values.isfinite() & static[row, column]
+    return values[known], 1.0 / z[known]
+
+
 def align_to_points(
     inverse_depth: Float[Tensor, "H W"],
     static: Tensor,
@@ -70,10 +80,7 @@ def align_to_points(
     points: Float[Tensor, "P 3"],
 ) -> Float[Tensor, "2"]:
     """Scale and offset that align a frame's inverse depth with the visible sparse points in its static region."""
-    row, column, z, inside = camera.project(points)
-    values = inverse_depth[row, column]
-    known = inside & values.isfinite() & static[row, column]
-    return fit_scale_offset(values[known], 1.0 / z[known])
+    return fit_scale_offset(*_samples(inverse_depth, static, camera, points))
 
 
 DepthProblem = Literal["unknown", "few points", "constant", "inverted"]
@@ -90,14 +97,12 @@ def alignment_problem(
     """Why ``align_to_points`` finds no alignment of a frame; None if it finds one."""
     if not bool(inverse_depth.isfinite().any()):
         return "unknown"
-    row, column, z, inside = camera.project(points)
-    values = inverse_depth[row, column]
-    known = inside & values.isfinite() & static[row, column]
-    if int(known.sum()) < MIN_SAMPLES:
+    values, targets = _samples(inverse_depth, static, camera, points)
+    if len(values) < MIN_SAMPLES:
         return "few points"
-    if bool(fit_scale_offset(values[known], 1.0 / z[known]).isfinite().all()):
+    if bool(fit_scale_offset(values, targets).isfinite().all()):
         return None
-    return "constant" if float(values[known].max()) == float(values[known].min()) else "inverted"
+    return "constant" if float(values.max()) == float(values.min()) else "inverted"
 
 
 def relative_errors(
@@ -159,8 +164,8 @@ def _smoothed(
     cell = (row * rows // height) * columns + column * columns // width
     sums = partial(torch.bincount, cell, minlength=rows * columns)
     smooth, weights = values.new_zeros(rows, columns), torch.ones_like(values)
+    density = 2.0 * math.pi * CELLS_PER_SIGMA**2  # the filter has a sum of 1 instead of a peak of 1
     for _ in range(ROBUST_ITERATIONS):
-        density = 2.0 * math.pi * CELLS_PER_SIGMA**2  # the filter has a sum of 1 instead of a peak of 1
         total, count = (
             density * cv2.GaussianBlur(sums(part).float().view(rows, columns).numpy(), (0, 0), CELLS_PER_SIGMA)
             for part in (weights * values, weights)
