@@ -64,21 +64,20 @@ def evaluate_run(
 
     align = alignment(scene, capture.extent)
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
-    values = {**evaluation.summary(), **_motion(scene, capture), **_training(scene)}
+    values = {**evaluation.summary(), **_of_run(scene, capture)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)
 
 
-def _motion(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
+def _of_run(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
+    """What is known of the run apart from its views."""
     times = [capture.cameras[name].time for name in capture.train]
-    return {"jitter": jitter(scene.splats, times), "poses_aligned": scene.config.optim.poses > 0 and bool(capture.val)}
-
-
-def _training(scene: TrainedScene) -> dict[str, Any]:
     metadata = scene.metadata
     return {
+        "jitter": jitter(scene.splats, times),
+        "poses_aligned": scene.config.optim.poses > 0 and bool(capture.val),
         "iterations": metadata.iteration,
         "train_seconds": metadata.train_seconds,
         "peak_bytes": metadata.peak_bytes,
