@@ -53,7 +53,7 @@ class DegradedDepth:
 
 
 def _waves(random: np.random.Generator, count: int) -> Float[np.ndarray, "N N"]:
-    """Random amplitudes of cosines along both axes, of unit variance together; the constant one is left out."""
+    """Random amplitudes of cosines along both axes, of unit variance together, without the constant one."""
     amplitudes = random.standard_normal((count, count))
     amplitudes[0, 0] = 0.0
     energy = amplitudes**2 * np.array([1.0] + [0.5] * (count - 1)) * np.array([[1.0]] + [[0.5]] * (count - 1))
