@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from warpgs.files import (
+    natural_order,
     partial_path,
     read_array,
     read_bounded,
@@ -214,3 +215,11 @@ def test_a_damaged_array_header_is_refused(tmp_path, header):
     (tmp_path / "a.npy").write_bytes(data)
     with pytest.raises(ValueError, match="is damaged or not"):
         read_array(tmp_path / "a.npy", 100)
+
+
+def test_names_with_numbers_are_in_the_order_of_their_values():
+    ordered = ["a", "shot", "shot0.png", "shot02.png", "shot2.png", "shot10.png", "shot1403636579763555584.png"]
+    ordered += ["shot1403636579813555456.png", "shot" + "9" * 5000]
+    found = ordered[::-1]
+    found.sort(key=natural_order)
+    assert found == ordered

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import os
+import re
 import reprlib
 import stat
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +27,21 @@ their products overflow in single precision."""
 
 MAX_NPY_HEADER = 1 << 20
 """Maximum size of what precedes the numbers of a .npy file [bytes]."""
+
+
+def first_file(paths: Iterable[Path]) -> Path | None:
+    """The first of some paths that is a file."""
+    return next((path for path in paths if path.is_file()), None)
+
+
+def natural_order(name: str) -> tuple[list[str | tuple[int, str]], str]:
+    """Key that sorts names with numbers by their values: shot2 before shot10.
+
+    Numbers stay text, compared by length and digits: ``int`` refuses very long ones, which a damaged file may hold.
+    """
+    parts = re.split(r"([0-9]+)", name)  # text and numbers alternate
+    digits = [part.lstrip("0") for part in parts]
+    return [(len(digits[k]), digits[k]) if k % 2 else part for k, part in enumerate(parts)], name
 
 
 def partial_path(path: Path) -> Path:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from warpgs.cameras import Camera
 from warpgs.files import read_json, read_numbers
@@ -15,6 +16,11 @@ from .units import SceneUnits
 
 MAX_ROTATION_ERROR = 1e-3
 """Maximum entry of R Rᵀ − 1 for a rotation R; the files have at least six digits."""
+
+
+def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
+    """Whether a matrix from a file is a rotation, to the digits that files have."""
+    return not (np.abs(matrix @ matrix.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(matrix) < 0)
 
 
 def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tuple[Camera, Lens]:
@@ -35,7 +41,7 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
     fields = read_json(path, "every frame needs its camera")
     lens = _lens(path, fields, factor)
     rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+    if not is_rotation(rotation):
         raise ValueError(f"{path}: orientation is not a rotation")
     viewmat = np.eye(4)
     try:

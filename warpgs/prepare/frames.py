@@ -1,7 +1,6 @@
 """Frames taken from a video or a folder: evenly spaced over time, the sharpest of each interval, scaled down."""
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from jaxtyping import UInt8
 
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
-from warpgs.files import read_json, write_json, write_png
+from warpgs.files import natural_order, read_json, write_json, write_png
 from warpgs.progress import progress
 
 from .images import resize_to_side, sharpness
@@ -168,7 +167,7 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     if selection.start or selection.end is not None:
         raise ValueError("--start and --end are for videos: a folder has no times")
     images = (p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
-    paths = sorted(images, key=_natural_order)
+    paths = sorted(images, key=lambda path: natural_order(path.name))
     if not paths:
         raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images")
     count = min(selection.count or len(paths), len(paths))
@@ -178,12 +177,6 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
         yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1], max(best[1].shape[:2]))
-
-
-def _natural_order(path: Path) -> tuple[list[str | int], str]:
-    """Sorts shot2 before shot10."""
-    parts = re.split(r"([0-9]+)", path.name)  # text and numbers alternate
-    return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
 
 
 def _read(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,6 +1,5 @@
 """COLMAP: a model in sparse/0 (text or binary) beside images/, as 3DGS, gsplat and nerfstudio's tools write it."""
 
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -9,13 +8,13 @@ from warpgs.data.capture import Capture
 from warpgs.data.colmap import MODEL_FOLDERS, ModelImage, find_model, load_model
 from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
+from warpgs.files import first_file, natural_order
 
 from .posed import (
     LoadOptions,
     PosedFrame,
     World,
     every_eighth,
-    natural_order,
     plain_names,
     posed_capture,
     times_of_names,
@@ -80,8 +79,3 @@ class _Files:
             None if mask is None else partial(read_resized_mask, mask),
             None if depth is None else partial(read_depth, depth),
         )
-
-
-def first_file(paths: Iterable[Path]) -> Path | None:
-    """The first of some paths that is a file."""
-    return next((path for path in paths if path.is_file()), None)

@@ -20,10 +20,9 @@ from warpgs.data.images import image_size, read_depth
 from warpgs.data.lens import Lens
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.data.units import scene_units
-from warpgs.files import read_array
+from warpgs.files import first_file, natural_order, read_array
 
-from .colmap import first_file
-from .posed import LoadOptions, PosedFrame, World, every_eighth, natural_order, posed_capture, world_to_camera
+from .posed import LoadOptions, PosedFrame, World, every_eighth, posed_capture, world_to_camera
 
 INDEX = "poses_bounds.npy"
 

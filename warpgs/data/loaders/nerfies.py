@@ -7,7 +7,7 @@ covisible/<factor>x/val/<id>.png.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.files import read_json
+from warpgs.files import first_file, read_json
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
 
@@ -152,21 +152,17 @@ def _find_files(root: Path, factor: int, split: Split) -> dict[str, _FrameFiles]
     depths = [root / "depth" / s for s in (size, "1x")]
     files = {}
     for name in [*split.train, *split.val]:
-        image = _first(rgb / size / f"{name}{ending}" for ending in (".png", ".jpg"))
+        image = first_file(rgb / size / f"{name}{ending}" for ending in (".png", ".jpg"))
         if image is None:
             raise ValueError(f"{rgb / size / name}.png is missing: dataset.json lists the frame")
-        mask = None if masks is None else _first(masks / size / f"{name}{e}" for e in (".png.png", ".png"))
-        depth = _first(folder / f"{name}{ending}" for folder in depths for ending in (".npy", ".png"))
-        covisible = _first([root / "covisible" / size / "val" / f"{name}.png"])
+        mask = None if masks is None else first_file(masks / size / f"{name}{e}" for e in (".png.png", ".png"))
+        depth = first_file(folder / f"{name}{ending}" for folder in depths for ending in (".npy", ".png"))
+        covisible = first_file([root / "covisible" / size / "val" / f"{name}.png"])
         files[name] = _FrameFiles(image, mask, depth, covisible)
     for name in split.train:
         if masks is not None and files[name].mask is None:
             raise ValueError(f"{masks / size / name}.png.png is missing: every training frame needs its mask")
     return files
-
-
-def _first(paths: Iterable[Path]) -> Path | None:
-    return next((path for path in paths if path.is_file()), None)
 
 
 @dataclass(frozen=True)

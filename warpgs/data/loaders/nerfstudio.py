@@ -9,14 +9,13 @@ from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.ply import read_ply_points
 from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
-from warpgs.files import read_numbers
+from warpgs.files import natural_order, read_numbers
 
 from .posed import (
     LoadOptions,
     PosedFrame,
     World,
     every_eighth,
-    natural_order,
     plain_names,
     points_of_depth,
     posed_capture,

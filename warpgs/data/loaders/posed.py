@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
+from warpgs.data.camera_files import is_rotation
 from warpgs.data.capture import Assumption, Capture, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
@@ -23,9 +24,6 @@ from warpgs.data.units import SceneUnits, scene_units
 
 HOLDOUT = 8
 """Every eighth frame is for evaluation where the files do not say which ones are."""
-
-MAX_ROTATION_ERROR = 1e-3
-"""Maximum entry of R Rᵀ − 1 for a rotation R; the files have at least six digits."""
 
 MAX_DEPTH_FRAMES, DEPTH_SIDE = 24, 320
 """Number of frames that points are taken from where there are none, and longest side of their images [px]."""
@@ -161,7 +159,7 @@ def world_to_camera(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarr
     rotation = camera_to_world[:, :3].T
     if not np.isfinite(camera_to_world).all():
         raise ValueError("the pose is not finite")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+    if not is_rotation(rotation):
         raise ValueError("the pose is not a rotation and a translation")
     return np.hstack([rotation, -rotation @ camera_to_world[:, 3:]])
 
@@ -184,11 +182,6 @@ def times_of_names(names: Sequence[str]) -> list[float]:
     numbers = [re.search(r"(\d{1,15})$", name) for name in names]
     found = [float(number[1]) for number in numbers if number]
     return found if len(found) == len(names) else [float(k) for k in range(len(names))]
-
-
-def natural_order(name: str) -> list[tuple[int, str]]:
-    """Key that sorts names with numbers by their values."""
-    return [(int(part[:15]), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def plain_names(paths: Sequence[str]) -> list[str]:
