@@ -29,7 +29,7 @@ SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_point
 MODEL = ModelConfig(position_bands=2, time_bands=2, depth=2, width=8, skip=1, max_static_points=50, dynamic_points=20)
 
 # Pretraining takes iterations 0 to 5, stage I 6 to 21 (densified after 9, 13 and 17, opacities reset after 14, pruned
-# after 11, 17 and 21, deformed from 9 on), stage II 22 to 31.
+# after 11, 17 and 21, the weakest after 21, deformed from 9 on), stage II 22 to 31.
 SCHEDULE = Schedule(
     pretrain=6,
     stage1=16,
@@ -50,7 +50,7 @@ CONFIG = TrainConfig(
     device="cpu",
     model=MODEL,
     loss=LossConfig(ssim=0.0),
-    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, max_size=1.0),
+    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, max_size=1.0, weakest=0.01),
     schedule=SCHEDULE,
     checkpoint_every=7,
     keep_checkpoints=100,

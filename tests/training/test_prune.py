@@ -1,4 +1,4 @@
-"""Visibility-driven pruning of static Gaussians (paper Eq. 15)."""
+"""Pruning by visibility (paper Eq. 15), and of the Gaussians that contribute least."""
 
 import dataclasses
 
@@ -13,7 +13,8 @@ from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import make_optimizer
-from warpgs.training.prune import prune_invisible, visibility
+from warpgs.training.prune import blend_weights, prune_invisible, prune_weakest, visibility
+from warpgs.training.schedule import Phase
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
 AHEAD = make_camera()
@@ -175,3 +176,37 @@ def test_a_scene_without_static_gaussians_has_nothing_to_prune():
     scene, optimizer = make_scene_and_optimizer(Gaussians.empty(0), random_gaussians())
     assert visibility(scene, CAMERAS, 3).shape == (0,)
     assert prune_invisible(scene, optimizer, CAMERAS, 3, threshold=0.1) == 0
+
+
+def test_blend_weights_are_summed_over_the_joint_images_of_all_views(tmp_path):
+    trainer = tiny.trainer(tiny.write(tmp_path / "capture"), tmp_path / "run")
+    trainer._add_dynamic_gaussians()
+    scene, views = trainer.scene, trainer.views
+    expected = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float64)
+    for view in map(views.__getitem__, range(len(views))):
+        with torch.no_grad():
+            splats = as_dict(scene.splats(view.time, sh_degree=1))
+            expected += reference(splats, view.camera, torch.zeros(3, dtype=torch.float64))[2].sum((1, 2))
+    phase = Phase("stage2", True, True, 1, with_depth=False, with_joint=True)
+    assert error(blend_weights(scene, views, phase), expected) < 1e-5 * expected.max()
+    assert (expected > 0).sum() > len(expected) / 2
+
+
+def test_the_weakest_are_those_that_together_hold_the_share():
+    scene, optimizer = make_scene_and_optimizer(random_gaussians(), in_front([2.0] * 4, [0.1] * 4, [0.5] * 4))
+    weights = torch.full((64,), 2.0)
+    weights[[3, 7, 61]] = torch.tensor([1.0, 0.5, 0.0])
+    before = scene.static.means.detach().clone(), scene.dynamic.means.detach().clone()
+    share = 1.6 / weights.sum().item()  # 0 + 0.5 + 1.0 fit, 2.0 more do not
+    assert prune_weakest(scene, optimizer, weights, share) == 3
+    kept = [index for index in range(60) if index not in (3, 7)]
+    assert torch.equal(scene.static.means, before[0][kept])
+    assert torch.equal(scene.dynamic.means, before[1][[0, 2, 3]])
+
+
+def test_a_share_of_zero_removes_what_contributes_nothing():
+    scene, optimizer = make_scene_and_optimizer(random_gaussians())
+    weights = torch.ones(60)
+    weights[5] = 0.0
+    assert prune_weakest(scene, optimizer, weights, 0.0) == 1
+    assert len(scene.static) == 59

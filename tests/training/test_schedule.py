@@ -240,6 +240,13 @@ def test_static_gaussians_are_pruned_at_intervals_and_at_the_end_of_stage_1():
     assert iterations_where("prune") == after(30, 60, 90, 100)
 
 
+def test_the_weakest_are_pruned_once_densification_has_ended():
+    weakest = DensifyConfig(every=10, weakest=0.02)
+    assert iterations_where("prune_weakest", densify=weakest) == after(60, 90, 100)
+    assert iterations_where("prune_weakest", densify=weakest, vdp=False) == after(60, 90, 100)
+    assert iterations_where("prune_weakest") == []
+
+
 def test_without_visibility_driven_pruning_nothing_is_pruned():
     assert iterations_where("prune", vdp=False) == []
 

@@ -1,4 +1,4 @@
-"""Visibility-driven pruning of static Gaussians (paper Eq. 15)."""
+"""Pruning: of static Gaussians by visibility (paper Eq. 15), and of both branches by their share of the images."""
 
 from collections.abc import Iterable
 
@@ -13,6 +13,8 @@ from warpgs.ops.adam import Adam
 from warpgs.rendering import render
 
 from . import optimizer as optim
+from .schedule import Phase
+from .views import Views
 
 MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
@@ -59,3 +61,44 @@ def prune_invisible(
     removed = len(scene.static) - len(kept)
     optim.gather(optimizer, scene.static, kept, num_kept=len(kept))
     return removed
+
+
+@torch.no_grad()
+def blend_weights(scene: SplitScene, views: Views, phase: Phase, antialias: bool = False) -> Float[Tensor, " N"]:
+    """Sum of alpha times transmittance of every Gaussian, static ones first, over the joint images of all views.
+
+    Args:
+        scene: The scene.
+        views: Training views, on the scene's device.
+        phase: Says which networks and which degree of spherical harmonics are in use.
+        antialias: As in ``RenderSettings``.
+    """
+    total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
+    settings = RenderSettings(statistics=True, antialias=antialias)
+    for index in range(len(views)):
+        view = views[index]
+        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
+        weights = render(splats, view.camera, settings=settings).weights
+        assert weights is not None
+        total += weights
+    return total
+
+
+@torch.no_grad()
+def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], share: float) -> int:
+    """Removes the Gaussians with the smallest weights that together hold at most a share of all; returns their number.
+
+    Args:
+        scene: Changed in place, together with the optimizer's moments.
+        optimizer: From ``optimizer.make_optimizer``.
+        weights: [N] from ``blend_weights``.
+        share: In [0, 1).
+    """
+    ascending, order = weights.double().sort()
+    kept = torch.ones_like(weights, dtype=torch.bool)
+    kept[order[ascending.cumsum(0) <= share * ascending.sum()]] = False
+    branches = (scene.static, scene.dynamic)
+    for gaussians, keeps in zip(branches, kept.split([len(gaussians) for gaussians in branches]), strict=True):
+        indices = keeps.nonzero()[:, 0]
+        optim.gather(optimizer, gaussians, indices, num_kept=len(indices))
+    return int((~kept).sum())

@@ -61,8 +61,8 @@ class IterationPlan:
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, realign: What to do after the iteration: densify, reset opacities, prune by visibility,
-            align depth again.
+        densify, reset, prune, prune_weakest, realign: What to do after the iteration: densify, reset opacities, prune
+            by visibility, prune the Gaussians that contribute least, align depth again.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
@@ -75,6 +75,7 @@ class IterationPlan:
     densify: bool
     reset: bool
     prune: bool
+    prune_weakest: bool
     realign: bool
     remove_large: bool
 
@@ -129,6 +130,7 @@ class Protocol:
         is_growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
         progress = iteration / self.num_iterations
         decay = max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until))
+        prunes = self._prunes(iteration)
         return IterationPlan(
             phase=phase,
             progress=progress,
@@ -138,7 +140,8 @@ class Protocol:
             time_noise=NOISE * decay if in_stage1 >= 0 else 0.0,
             densify=is_growing and done % self.config.densify.every == 0,
             reset=is_growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
-            prune=self._prunes(iteration),
+            prune=self.config.vdp and prunes,
+            prune_weakest=self.config.densify.weakest > 0.0 and prunes and done >= schedule.densify_until,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
@@ -157,7 +160,7 @@ class Protocol:
 
     def _prunes(self, iteration: int) -> bool:
         """Whether to prune: at intervals in stage I and at its end, but not at the end of the run."""
-        if not self.config.vdp or self.stage_at(iteration).name != "stage1" or iteration + 1 == self.num_iterations:
+        if self.stage_at(iteration).name != "stage1" or iteration + 1 == self.num_iterations:
             return False
         done = iteration + 1 - self.stage1.start
         return done % self.config.schedule.prune_every == 0 or iteration + 1 == self.stage2.start

@@ -19,7 +19,7 @@ from . import initialize
 from .densify import DensifyLimits, densify, reset_opacities
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
-from .prune import prune_invisible
+from .prune import blend_weights, prune_invisible, prune_weakest
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
 from .views import Views
@@ -133,10 +133,14 @@ class Trainer:
                 scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
             )
             logger.log(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
+        if plan.prune_weakest:
+            weights = blend_weights(scene, self.views, plan.phase, self.config.antialias)
+            removed = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
+            logger.log(f"iteration {self.iteration + 1}: {removed:,} Gaussians pruned that contribute least")
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
-        if plan.densify or plan.prune:
+        if plan.densify or plan.prune or plan.prune_weakest:
             self.step.reset_statistics()
 
     def _densify(self, remove_large: bool) -> None:
