@@ -22,7 +22,7 @@ BEST = TrainConfig(
         mask_margin=0.008,
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
-    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.01),
+    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.01, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
@@ -79,7 +79,7 @@ PATIENT = dataclasses.replace(
         BEST.loss, ssim=0.0, depth=LossConfig.depth, depth_dynamic=LossConfig.depth_dynamic, depth_smooth=False
     ),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
-    densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8),
+    densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8, reseed=0.05),
     schedule=Schedule(
         pretrain=300,
         stage1=2_400,

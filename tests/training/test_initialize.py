@@ -8,7 +8,7 @@ import torch
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.training import initialize
+from warpgs.training import dynamic_points, initialize
 from warpgs.training.point_cloud import color_points, gaussians_at, scene_box, subsample, unproject
 from warpgs.training.views import Views
 
@@ -293,14 +293,14 @@ def test_without_depth_dynamic_gaussians_start_in_front_of_the_points_around_the
     row, column, depth, _ = CAMERA.project(gaussians.means.detach())
     assert len(gaussians) == NETWORK.dynamic_points
     assert not static_mask()[row, column].any()
-    assert error(depth, torch.full_like(depth, 2.0 * initialize.DEPTH_FACTOR)) < 1e-4
+    assert error(depth, torch.full_like(depth, 2.0 * dynamic_points.DEPTH_FACTOR)) < 1e-4
 
 
 def test_only_the_points_around_a_dynamic_pixel_count():
     around, corner = points_around_the_block(torch.full((8,), 3.0)), torch.zeros(1, dtype=torch.long)
     points = torch.cat([around, around, CAMERA.unproject(corner, corner, torch.ones(1))])
     depth = CAMERA.project(dynamic_gaussians(make_capture(points), ALIGNMENT).means.detach())[2]
-    assert error(depth, torch.full_like(depth, 3.0 * initialize.DEPTH_FACTOR)) < 1e-4
+    assert error(depth, torch.full_like(depth, 3.0 * dynamic_points.DEPTH_FACTOR)) < 1e-4
 
 
 @pytest.mark.parametrize("inverse_depth", [None, torch.full((HEIGHT, WIDTH), torch.nan)])

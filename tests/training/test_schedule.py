@@ -247,6 +247,12 @@ def test_the_weakest_are_pruned_once_densification_has_ended():
     assert iterations_where("prune_weakest") == []
 
 
+def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_network_has_warmed_up():
+    reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
+    assert iterations_where("reseed", densify=reseed, schedule=often) == after(50, 60)
+    assert iterations_where("reseed", schedule=often) == []
+
+
 def test_without_visibility_driven_pruning_nothing_is_pruned():
     assert iterations_where("prune", vdp=False) == []
 

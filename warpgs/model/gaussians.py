@@ -92,7 +92,7 @@ class Gaussians(nn.Module):
 
     @torch.no_grad()
     def gather(self, parents: Int64[Tensor, " M"]) -> None:
-        """Replaces the Gaussians by copies of ``parents``; nothing else changes their number.
+        """Replaces the Gaussians by copies of ``parents``.
 
         Gradients are dropped. ``training.optimizer.gather`` also updates the optimizer's state.
 
@@ -101,4 +101,14 @@ class Gaussians(nn.Module):
         """
         for parameter in self.parameters():
             parameter.data = parameter.data[parents]
+            parameter.grad = None
+
+    @torch.no_grad()
+    def append(self, added: "Gaussians") -> None:
+        """Appends Gaussians of the same degree of spherical harmonics, from any device.
+
+        Gradients are dropped. ``training.optimizer.append`` also updates the optimizer's state.
+        """
+        for name, parameter in self.named_parameters():
+            parameter.data = torch.cat([parameter.data, getattr(added, name).to(parameter.device)])
             parameter.grad = None

@@ -1,6 +1,6 @@
 """The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
-from collections.abc import Iterable
+import math
 from typing import NamedTuple
 
 import torch
@@ -14,33 +14,12 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 
-from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample, unproject
-from .views import View, Views
+from .dynamic_points import max_scale, unproject_pixels
+from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .views import Views
 
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views from which points without colours are coloured."""
-
-MAX_PIXELS_PER_GAUSSIAN = 8
-"""Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
-
-MIN_KNOWN_FRACTION = 0.1
-"""Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
-known only where nothing moves."""
-
-NUM_NEAREST_POINTS = 8
-"""Number of points around a dynamic pixel that its depth is estimated from where it is unknown."""
-
-DEPTH_FACTOR = 0.9
-"""Estimated depth of a dynamic pixel, relative to the nearest of these points."""
-
-MAX_POINTS_PER_IMAGE = 2_000
-"""Maximum number of points per image among which they are searched."""
-
-PIXELS_PER_CHUNK = 8_192
-"""Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
-
-MAX_SCALE_FRACTION = 0.5
-"""Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
 
 
 def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
@@ -94,68 +73,14 @@ def dynamic_gaussians(
     max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if capture.assumption == "dynamic" and len(capture.points):
         return gaussians_at(*_colored_points(config, capture, generator), degree)
-    num_dynamic = sum(int((~views[index].static_mask).sum()) for index in range(len(views)))
-    if num_dynamic == 0:
+    found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, max_count, generator)
+    if found is None:
         return Gaussians.empty(0, degree)
-    fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num_dynamic)
-    depths = (depth_alignment.metric_depth(views[k].inverse_depth, alignments[k]) for k in range(len(views)))
-    positions, colors = _unproject_dynamic(views, depths, fraction, generator)
-    if len(positions) >= MIN_KNOWN_FRACTION * fraction * num_dynamic:
-        chosen = subsample(positions, max_count, generator)
-        return gaussians_at(positions[chosen], colors[chosen], degree)
-    points = capture.points.to(views.device)
-    depths = (_depth_before_points(views[k], points, generator) for k in range(len(views)))
-    positions, colors = _unproject_dynamic(views, depths, fraction, generator)
-    if len(positions) == 0:
+    if len(found.positions) == 0:
         positions = random_points(capture.points, max_count, generator)
-        colors = torch.full_like(positions, 0.5)
-    chosen = subsample(positions, max_count, generator)
-    max_scale = MAX_SCALE_FRACTION * config.densify.max_size * capture.extent
-    return gaussians_at(positions[chosen], colors[chosen], degree, max_scale)
-
-
-def _unproject_dynamic(
-    views: Views, depths: Iterable[Float[Tensor, "H W"]], fraction: float, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Positions and colours of a random fraction of all views' dynamic pixels, on the CPU.
-
-    Args:
-        views: The views.
-        depths: [H, W] depth of each.
-        fraction: At most 1.
-        generator: CPU generator that chooses them.
-    """
-    parts = []
-    for index, depth in enumerate(depths):
-        view = views[index]
-        mask = ~view.static_mask
-        if fraction < 1.0:
-            mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
-        points, colors = unproject(depth, mask, view.image, view.camera)
-        parts.append((points.cpu(), colors.cpu()))
-    positions, colors = (torch.cat(values) for values in zip(*parts, strict=True))
-    return positions, colors
-
-
-def _depth_before_points(view: View, points: Float[Tensor, "P 3"], generator: torch.Generator) -> Float[Tensor, "H W"]:
-    """Depth of each dynamic pixel just before the nearest of the points around it; NaN elsewhere.
-
-    Dynamic objects occlude the static points around them. One camera does not determine their depth; with this one they
-    look right from the training view and occlude little else.
-    """
-    depth = torch.full(view.static_mask.shape, torch.nan, device=points.device)
-    row, column, z, inside = view.camera.project(points)
-    visible = inside.nonzero()[:, 0]
-    visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]
-    pixels = (~view.static_mask).nonzero()
-    if len(visible) == 0:
-        return depth
-    positions = torch.stack([row[visible], column[visible]], 1).float()
-    for part in pixels.split(PIXELS_PER_CHUNK):
-        distances = torch.cdist(part.float(), positions)
-        around = distances.topk(min(NUM_NEAREST_POINTS, len(visible)), largest=False).indices
-        depth[part[:, 0], part[:, 1]] = DEPTH_FACTOR * z[visible][around].amin(1)
-    return depth
+        return gaussians_at(positions, torch.full_like(positions, 0.5), degree, max_scale(config, capture.extent))
+    largest = math.inf if found.depth_known else max_scale(config, capture.extent)
+    return gaussians_at(found.positions, found.colors, degree, largest)
 
 
 class DepthAlignment(NamedTuple):

@@ -116,6 +116,23 @@ def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], 
 
 
 @torch.no_grad()
+def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
+    """Appends Gaussians, whose moments start at 0.
+
+    Args:
+        optimizer: From ``make_optimizer``.
+        gaussians: Changed in place.
+        added: Gaussians of the same degree of spherical harmonics, from any device.
+    """
+    gaussians.append(added)
+    for name, parameter in gaussians.named_parameters():
+        state = optimizer.state.get(parameter, {})
+        for moment in MOMENTS:
+            if moment in state:
+                state[moment] = torch.cat([state[moment], torch.zeros_like(getattr(added, name).to(parameter.device))])
+
+
+@torch.no_grad()
 def reset_moments(optimizer: Adam, parameter: nn.Parameter) -> None:
     """Sets Adam's moments of a parameter to 0, because its values were replaced."""
     state = optimizer.state.get(parameter, {})

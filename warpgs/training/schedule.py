@@ -61,8 +61,9 @@ class IterationPlan:
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, prune_weakest, realign: What to do after the iteration: densify, reset opacities, prune
-            by visibility, prune the Gaussians that contribute least, align depth again.
+        densify, reset, prune, prune_weakest, reseed, realign: What to do after the iteration: densify, reset opacities,
+            prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where none
+            shows what moves, align depth again.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
@@ -76,6 +77,7 @@ class IterationPlan:
     reset: bool
     prune: bool
     prune_weakest: bool
+    reseed: bool
     realign: bool
     remove_large: bool
 
@@ -103,6 +105,7 @@ class Protocol:
         # Iterations of stage I from which the networks are in use; in stage II they always are.
         starts = {"deformation": schedule.deform_from, "appearance": schedule.appearance_from}
         self._network_starts = {name: min(start, stage1) for name, start in starts.items()}
+        self._reseed_from = self._network_starts["deformation"] + schedule.warmup
 
     def stage_at(self, iteration: int) -> Stage:
         """The stage that an iteration belongs to."""
@@ -142,6 +145,7 @@ class Protocol:
             reset=is_growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
             prune=self.config.vdp and prunes,
             prune_weakest=self.config.densify.weakest > 0.0 and prunes and done >= schedule.densify_until,
+            reseed=self.config.densify.reseed > 0.0 and prunes and is_growing and done > self._reseed_from,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )

@@ -16,10 +16,13 @@ from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 
 from . import initialize
+from . import optimizer as optim
 from .densify import DensifyLimits, densify, reset_opacities
+from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .prune import blend_weights, prune_invisible, prune_weakest
+from .reseed import gaussians_that_show, lost_pixels, lost_share
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
 from .views import Views
@@ -133,6 +136,8 @@ class Trainer:
                 scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
             )
             logger.log(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
+        if plan.reseed:
+            self._reseed(plan.phase, logger)
         if plan.prune_weakest:
             weights = blend_weights(scene, self.views, plan.phase, self.config.antialias)
             removed = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
@@ -140,7 +145,7 @@ class Trainer:
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
-        if plan.densify or plan.prune or plan.prune_weakest:
+        if plan.densify or plan.prune or plan.reseed or plan.prune_weakest:
             self.step.reset_statistics()
 
     def _densify(self, remove_large: bool) -> None:
@@ -148,15 +153,37 @@ class Trainer:
         config, branches = self.config.densify, (self.scene.static, self.scene.dynamic)
         means = self.step.statistics.mean().split([len(gaussians) for gaussians in branches])
         generator = self._generator("densify")
-        most = config.max_gaussians
-        if config.min_pixels:
-            most = min(most, self.views.num_pixels // config.min_pixels)
-        capacity = most - sum(len(gaussians) for gaussians in branches)
+        capacity = self._capacity()
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]
         for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
             part = capacity * count // max(1, sum(candidates))
             limits = DensifyLimits(self.capture.extent, part, remove_large)
             densify(gaussians, self.step.optimizer, gradients, config, limits, generator)
+
+    def _capacity(self) -> int:
+        """Number of Gaussians that may be added."""
+        config, most = self.config.densify, self.config.densify.max_gaussians
+        if config.min_pixels:
+            most = min(most, self.views.num_pixels // config.min_pixels)
+        return most - len(self.scene.static) - len(self.scene.dynamic)
+
+    def _reseed(self, phase: Phase, logger: TrainingLogger) -> None:
+        """Adds dynamic Gaussians where none shows what moves."""
+        config, scene, views = self.config, self.scene, self.views
+        mask_of = lost_pixels(scene, phase, config.antialias)
+        share = lost_share(views, mask_of)
+        count = min(self._capacity(), round(share * config.model.dynamic_points))
+        if share < config.densify.reseed or count <= 0:
+            return
+        generator = self._generator("reseed")
+        found = unproject_pixels(self.capture, views, self.alignments, mask_of, count, generator)
+        if found is not None:
+            added = gaussians_that_show(found, scene, views, config, self.capture.extent)
+            optim.append(self.step.optimizer, scene.dynamic, added)
+            logger.log(
+                f"iteration {self.iteration + 1}: no dynamic Gaussian shows {share:.0%} of the dynamic pixels; "
+                f"{len(added):,} added there"
+            )
 
     def _add_dynamic_gaussians(self) -> None:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned."""

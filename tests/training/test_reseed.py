@@ -1,0 +1,134 @@
+"""New dynamic Gaussians where none shows what moves."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests import tiny
+from tests.reference.render import as_dict
+from tests.reference.render import render as reference
+from tests.scenes import error, select
+from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.training import optimizer as optim
+from warpgs.training.dynamic_points import DynamicPoints
+from warpgs.training.logger import TrainingLogger
+from warpgs.training.reseed import gaussians_that_show, lost_pixels, lost_share
+from warpgs.training.schedule import Phase
+
+PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("reseed") / "capture")
+
+
+@pytest.fixture
+def trainer(capture, tmp_path):
+    """Its dynamic Gaussians are opaque, and its deformation network moves them a little."""
+    config = dataclasses.replace(
+        tiny.CONFIG,
+        model=dataclasses.replace(tiny.MODEL, dynamic_points=200),
+        densify=dataclasses.replace(tiny.CONFIG.densify, reseed=0.05, max_gaussians=1_000),
+        schedule=dataclasses.replace(tiny.SCHEDULE, warmup=0),
+    )
+    trainer = tiny.trainer(capture, tmp_path / "run", config)
+    trainer._add_dynamic_gaussians()
+    trainer.scene.dynamic.logit_opacities.data[:] = 3.0
+    deform(trainer.scene, 0.05)
+    return trainer
+
+
+def deform(scene, size):
+    for parameter in scene.deformation.parameters():
+        parameter.data += size * torch.randn(parameter.shape)
+
+
+def lose_half(trainer):
+    """Removes the dynamic Gaussians of one half of the scene."""
+    x = trainer.scene.dynamic.means[:, 0]
+    kept = (x > x.median()).nonzero()[:, 0]
+    optim.gather(trainer.step.optimizer, trainer.scene.dynamic, kept, len(kept))
+
+
+def test_lost_are_the_dynamic_pixels_that_dynamic_gaussians_alone_leave_transparent(trainer):
+    lose_half(trainer)
+    mask_of = lost_pixels(trainer.scene, PHASE, antialias=False)
+    view = trainer.views[2]
+    with torch.no_grad():
+        splats = trainer.scene.splats(view.time, sh_degree=1)
+        dynamic = as_dict(select(splats, splats.is_dynamic))
+        alpha = reference(dynamic, view.camera, torch.zeros(3, dtype=torch.float64))[1]
+    expected = ~view.static_mask & (alpha < 0.1)
+    assert torch.equal(mask_of(view), expected)
+    assert 0 < expected.sum() < (~view.static_mask).sum()
+
+
+def test_the_share_of_lost_pixels_grows_with_what_is_lost(trainer):
+    mask_of = lost_pixels(trainer.scene, PHASE, antialias=False)
+    before = lost_share(trainer.views, mask_of)
+    lose_half(trainer)
+    half = lost_share(trainer.views, mask_of)
+    trainer.scene.dynamic = Gaussians.empty(0, 1)
+    assert before < 0.1 < half < 1.0
+    assert lost_share(trainer.views, mask_of) == 1.0
+
+
+def test_added_gaussians_are_deformed_to_where_they_were_seen(trainer):
+    positions = trainer.scene.dynamic.means.detach().clone()
+    found = DynamicPoints(positions, torch.rand(len(positions), 3), torch.arange(len(positions)) % 3, True)
+    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, extent=1.0)
+    assert len(added) == len(positions)
+    for index in range(3):
+        chosen = found.views == index
+        means = added.means[chosen]
+        with torch.no_grad():
+            offsets = trainer.scene.deformation(means, trainer.views[index].time)[:, :3]
+        assert offsets.norm(dim=1).min() > 1e-4
+        assert error(means + offsets, positions[chosen]) < 0.01
+
+
+def test_points_that_no_canonical_position_is_found_for_are_left_out(trainer):
+    deform(trainer.scene, 3.0)
+    positions = trainer.scene.dynamic.means.detach().clone()
+    found = DynamicPoints(
+        positions, torch.rand(len(positions), 3), torch.zeros(len(positions), dtype=torch.int64), True
+    )
+    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, extent=1.0)
+    assert len(added) < len(positions)
+
+
+def test_appended_gaussians_start_without_moments_and_the_others_keep_theirs(trainer):
+    dynamic, optimizer = trainer.scene.dynamic, trainer.step.optimizer
+    for parameter in trainer.step.parameters().values():
+        parameter.grad = torch.rand_like(parameter)
+    optimizer.step()
+    before = {name: optimizer.state[getattr(dynamic, name)]["exp_avg"].clone() for name in PARAMETERS}
+    num, added = len(dynamic), Gaussians.empty(3, 1)
+    optim.append(optimizer, dynamic, added)
+    assert len(dynamic) == num + 3
+    for name in PARAMETERS:
+        moments = optimizer.state[getattr(dynamic, name)]["exp_avg"]
+        assert torch.equal(moments[:num], before[name])
+        assert before[name].any() == (before[name].numel() > 0)
+        assert not moments[num:].any()
+        assert torch.equal(getattr(dynamic, name)[num:], getattr(added, name))
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_an_object_whose_gaussians_are_lost_gets_new_ones(trainer, capsys, lost):
+    trainer.iteration = 11
+    plan = trainer.protocol.at(11)
+    assert plan.reseed
+    assert not trainer.protocol.at(12).reseed
+    if lost:
+        lose_half(trainer)
+    num, mask_of = len(trainer.scene.dynamic), lost_pixels(trainer.scene, PHASE, antialias=False)
+    with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
+        trainer._reseed(plan.phase, logger)
+    added = len(trainer.scene.dynamic) - num
+    assert (added > 0) == lost
+    assert (f"{added:,} added there" in capsys.readouterr().out) == lost
+    trainer.scene.dynamic.logit_opacities.data[:] = 3.0
+    assert lost_share(trainer.views, mask_of) < 0.1

@@ -1,0 +1,135 @@
+"""Points at which dynamic Gaussians start: pixels of what moves, unprojected."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from warpgs.config import TrainConfig
+from warpgs.data import depth_alignment
+from warpgs.data.capture import Capture
+
+from .point_cloud import subsample, unproject
+from .views import View, Views
+
+MAX_PIXELS_PER_GAUSSIAN = 8
+"""Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
+
+MIN_KNOWN_FRACTION = 0.1
+"""Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
+known only where nothing moves."""
+
+NUM_NEAREST_POINTS = 8
+"""Number of points around a dynamic pixel that its depth is estimated from where it is unknown."""
+
+DEPTH_FACTOR = 0.9
+"""Estimated depth of a dynamic pixel, relative to the nearest of these points."""
+
+MAX_POINTS_PER_IMAGE = 2_000
+"""Maximum number of points per image among which they are searched."""
+
+PIXELS_PER_CHUNK = 8_192
+"""Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
+
+MAX_SCALE_FRACTION = 0.5
+"""Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
+
+
+class DynamicPoints(NamedTuple):
+    """Points on what moves, each as one view sees it; on the CPU.
+
+    Attributes:
+        positions: [S, 3] positions at the time of the view.
+        colors: [S, 3] in [0, 1].
+        views: [S] index of the view.
+        depth_known: Whether they are at the views' aligned depth; otherwise before the sparse points around them.
+    """
+
+    positions: Float[Tensor, "S 3"]
+    colors: Float[Tensor, "S 3"]
+    views: Int64[Tensor, " S"]
+    depth_known: bool
+
+
+def max_scale(config: TrainConfig, extent: float) -> float:
+    """Maximum standard deviation of initial dynamic Gaussians of unknown depth, by the capture's extent."""
+    return MAX_SCALE_FRACTION * config.densify.max_size * extent
+
+
+@torch.no_grad()
+def unproject_pixels(
+    capture: Capture,
+    views: Views,
+    alignments: Float[Tensor, "T 2"],
+    mask_of: Callable[[View], Bool[Tensor, "H W"]],
+    max_count: int,
+    generator: torch.Generator,
+) -> DynamicPoints | None:
+    """At most ``max_count`` random pixels of masks, unprojected by aligned depth.
+
+    Where depth is known at too few of them, they are put before the sparse points around them; none if no points are
+    seen there either.
+
+    Args:
+        capture: The capture, with the sparse points.
+        views: Its training views.
+        alignments: [T, 2] scale and offset of each view's inverse depth.
+        mask_of: The pixels of a view.
+        max_count: Maximum number of points.
+        generator: CPU generator that chooses the pixels.
+
+    Returns:
+        The points; None if the masks are empty.
+    """
+    num = sum(int(mask_of(views[index]).sum()) for index in range(len(views)))
+    if num == 0:
+        return None
+    fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num)
+    points = capture.points.to(views.device)
+
+    def unprojected(depth_known: bool) -> DynamicPoints:
+        parts = []
+        for index in range(len(views)):
+            view = views[index]
+            mask = mask_of(view)
+            if depth_known:
+                depth = depth_alignment.metric_depth(view.inverse_depth, alignments[index])
+            else:
+                depth = _depth_before_points(view, mask, points, generator)
+            if fraction < 1.0:
+                mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
+            positions, colors = unproject(depth, mask, view.image, view.camera)
+            parts.append((positions.cpu(), colors.cpu(), torch.full((len(positions),), index)))
+        positions, colors, indices = (torch.cat(values) for values in zip(*parts, strict=True))
+        return DynamicPoints(positions, colors, indices, depth_known)
+
+    found = unprojected(depth_known=True)
+    if len(found.positions) < MIN_KNOWN_FRACTION * fraction * num:
+        found = unprojected(depth_known=False)
+    chosen = subsample(found.positions, max_count, generator)
+    return DynamicPoints(found.positions[chosen], found.colors[chosen], found.views[chosen], found.depth_known)
+
+
+def _depth_before_points(
+    view: View, mask: Bool[Tensor, "H W"], points: Float[Tensor, "P 3"], generator: torch.Generator
+) -> Float[Tensor, "H W"]:
+    """Depth of each pixel of a mask just before the nearest of the points around it; NaN elsewhere.
+
+    Dynamic objects occlude the static points around them. One camera does not determine their depth; with this one they
+    look right from the training view and occlude little else.
+    """
+    depth = torch.full(view.static_mask.shape, torch.nan, device=points.device)
+    row, column, z, inside = view.camera.project(points)
+    visible = inside.nonzero()[:, 0]
+    visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]
+    pixels = mask.nonzero()
+    if len(visible) == 0:
+        return depth
+    positions = torch.stack([row[visible], column[visible]], 1).float()
+    for part in pixels.split(PIXELS_PER_CHUNK):
+        distances = torch.cdist(part.float(), positions)
+        around = distances.topk(min(NUM_NEAREST_POINTS, len(visible)), largest=False).indices
+        depth[part[:, 0], part[:, 1]] = DEPTH_FACTOR * z[visible][around].amin(1)
+    return depth

@@ -1,0 +1,90 @@
+"""New dynamic Gaussians where none shows what moves.
+
+In its first steps the deformation network may carry all dynamic Gaussians of one object to another one. Where they
+were, no Gaussian receives a gradient any more, so the object stays lost.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from warpgs.config import RenderSettings, TrainConfig
+from warpgs.model.gaussians import Gaussians
+from warpgs.model.scene import SplitScene
+from warpgs.rendering import render
+
+from .dynamic_points import DynamicPoints, max_scale
+from .point_cloud import gaussians_at
+from .schedule import Phase
+from .views import View, Views
+
+MAX_LOST_ALPHA = 0.1
+"""Alpha of the dynamic image below which a dynamic pixel counts as lost; opacities that were just reset are above it
+where Gaussians overlap."""
+
+INVERSION_STEPS = 8
+"""Fixed-point iterations with which the deformation is inverted."""
+
+MAX_INVERSION_ERROR = 0.01
+"""Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
+
+
+def lost_pixels(scene: SplitScene, phase: Phase, antialias: bool) -> Callable[[View], Bool[Tensor, "H W"]]:
+    """The function that finds the pixels of a view that are dynamic, and that no dynamic Gaussian shows.
+
+    Args:
+        scene: The scene.
+        phase: Says which networks and which degree of spherical harmonics are in use.
+        antialias: As in ``RenderSettings``.
+    """
+    settings = RenderSettings(branches=True, antialias=antialias)
+
+    @torch.no_grad()
+    def mask_of(view: View) -> Bool[Tensor, "H W"]:
+        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
+        layer = render(splats, view.camera, settings=settings).dynamic
+        assert layer is not None
+        lost = ~view.static_mask & (layer.alpha < MAX_LOST_ALPHA)
+        return lost if view.mask_border is None else lost & ~view.mask_border
+
+    return mask_of
+
+
+def lost_share(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) -> float:
+    """Share of all views' dynamic pixels that are lost, in [0, 1]; 0 if nothing is dynamic."""
+    lost = dynamic = 0
+    for index in range(len(views)):
+        view = views[index]
+        lost, dynamic = lost + int(mask_of(view).sum()), dynamic + int((~view.static_mask).sum())
+    return lost / max(1, dynamic)
+
+
+@torch.no_grad()
+def gaussians_that_show(
+    found: DynamicPoints, scene: SplitScene, views: Views, config: TrainConfig, extent: float
+) -> Gaussians:
+    """Dynamic Gaussians that the network deforms to points, each at the time of its view.
+
+    Their canonical positions x solve x + d(x, t) = p. Points at which the iteration does not come within
+    ``MAX_INVERSION_ERROR`` are left out.
+
+    Args:
+        found: The points p.
+        scene: Its deformation network d must be in use.
+        views: The views of the points.
+        config: Degree of spherical harmonics and limits of size.
+        extent: Extent of the capture [scene units].
+    """
+    canonical, kept = torch.empty_like(found.positions), torch.zeros(len(found.positions), dtype=torch.bool)
+    for index in found.views.unique().tolist():
+        chosen = found.views == index
+        seen, time = found.positions[chosen].to(views.device), views[index].time
+        x = seen
+        for _ in range(INVERSION_STEPS):
+            x = seen - scene.deformation(x, time)[:, :3]
+        errors = (x + scene.deformation(x, time)[:, :3] - seen).norm(dim=1)
+        canonical[chosen], kept[chosen] = x.cpu(), (errors <= MAX_INVERSION_ERROR * extent).cpu()
+    largest = max_scale(config, extent)
+    return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, largest)
