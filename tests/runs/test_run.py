@@ -266,3 +266,51 @@ def test_a_missing_field_of_a_checkpoint_is_named(run, data, missing):
     tiny.edit_metadata(path, lambda values: values.pop(missing))
     with pytest.raises(ValueError, match=f"{path} is damaged: it has no {missing}"):
         evaluate_run.evaluate_run(run, load_capture(data), quiet=True)
+
+
+# Corrected cameras --------------------------------------------------------------------------------------------------
+
+
+def run_with_poses(data, folder):
+    """A run whose checkpoint corrects the training cameras; nothing is trained."""
+    config = dataclasses.replace(
+        tiny.CONFIG, data=data, out=folder, optim=dataclasses.replace(tiny.CONFIG.optim, poses=1e-3)
+    )
+    trainer = tiny.trainer(data, folder, config)
+    for parameter in trainer.views.poses.parameters():
+        parameter.data[:] = 0.01 * torch.randn(parameter.shape)
+    trainer.save()
+    return Run.create(folder, config), trainer
+
+
+def test_training_cameras_are_where_training_moved_them_and_the_others_stay(data, tmp_path, capture):
+    run, trainer = run_with_poses(data, tmp_path / "run")
+    corrected = run.open_corrected_capture(quiet=True)
+    for name, expected in zip(capture.train, trainer.views.cameras(), strict=True):
+        assert torch.equal(corrected.cameras[name].viewmat, expected.viewmat)
+        assert torch.equal(corrected.frame(name).camera.viewmat, expected.viewmat)
+        assert not torch.equal(corrected.cameras[name].viewmat, capture.cameras[name].viewmat)
+    for name in capture.val:
+        assert torch.equal(corrected.cameras[name].viewmat, capture.cameras[name].viewmat)
+    assert corrected.extent == capture.extent
+    assert torch.equal(
+        run.open_capture(quiet=True).frame(capture.train[0]).camera.viewmat, capture.cameras[capture.train[0]].viewmat
+    )
+
+
+def test_without_corrections_or_checkpoint_the_cameras_are_those_of_the_capture(data, tmp_path, capture):
+    run, _ = run_with_poses(data, tmp_path / "run")
+    for path in checkpoint.list_checkpoints(run.folder):
+        path.unlink()
+    assert torch.equal(
+        run.open_corrected_capture(quiet=True).cameras[capture.train[0]].viewmat,
+        capture.cameras[capture.train[0]].viewmat,
+    )
+
+
+def test_corrections_of_other_frames_are_refused(data, tmp_path):
+    run, _ = run_with_poses(data, tmp_path / "run")
+    path = run.newest_checkpoint()
+    tiny.edit_metadata(path, lambda facts: facts.update(views=facts["views"][:-1]))
+    with pytest.raises(ValueError, match="other frames"):
+        run.open_corrected_capture(quiet=True)

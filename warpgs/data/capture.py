@@ -1,7 +1,7 @@
 """A capture: posed images of a dynamic scene, read frame by frame."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal
@@ -101,6 +101,12 @@ class Capture:
         capture.has_depth = False
         return capture
 
+    def with_cameras(self, cameras: Mapping[str, Camera]) -> "Capture":
+        """The same capture with other cameras of some frames; the captures have one cache of frames."""
+        capture = copy.copy(self)
+        capture.cameras = self.cameras | dict(cameras)
+        return capture
+
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.
 
@@ -110,7 +116,7 @@ class Capture:
         """
         if name not in self.cameras:
             raise KeyError(name)
-        frame = self._cached(name)
+        frame = replace(self._cached(name), camera=self.cameras[name])
         if not self.has_depth:
             frame = replace(frame, inverse_depth=None)
         if self.assumption == "masks":

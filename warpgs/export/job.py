@@ -82,7 +82,7 @@ class Job:
     def _capture(self) -> tuple[Capture | None, str]:
         """The capture, or None and why."""
         try:
-            return self.run.open_capture(self.options.quiet), ""
+            return self.run.open_corrected_capture(self.options.quiet), ""
         except (ValueError, OSError) as error:
             return None, f"the capture cannot be opened: {error}"
 

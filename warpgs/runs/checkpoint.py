@@ -16,6 +16,7 @@ from torch import Tensor
 
 from warpgs.config import MAX_VALUE, ModelConfig
 from warpgs.files import atomic_path, require_file
+from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 
 VERSION = 2
@@ -223,6 +224,22 @@ def set_aside(path: Path) -> Path:
         OSError: If it cannot be renamed.
     """
     return path.replace(path.with_name(path.name + ".damaged"))
+
+
+def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:
+    """The corrections of the training cameras, on the CPU.
+
+    Args:
+        checkpoint: Of a run that corrected poses.
+        unit: Of ``PoseCorrections``: the extent of the capture [scene units].
+
+    Raises:
+        DamagedCheckpointError: If they are missing, or not one for each training view.
+    """
+    poses = PoseCorrections(len(checkpoint.metadata.views), unit)
+    state = poses.state_dict()
+    poses.load_state_dict({name: checkpoint.tensor(f"poses.{name}", t.shape) for name, t in state.items()})
+    return poses
 
 
 def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:

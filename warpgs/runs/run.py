@@ -120,6 +120,27 @@ class Run:
         """The capture that the run was trained on; raises as ``open_capture``."""
         return open_capture(self.config, quiet)
 
+    def open_corrected_capture(self, quiet: bool = False) -> Capture:
+        """The capture, with the training cameras where training moved them.
+
+        Raises:
+            ValueError: As ``open_capture``, or if the newest checkpoint is damaged or of other frames.
+            OSError: As ``open_capture``.
+        """
+        capture, path = self.open_capture(quiet), self.newest_checkpoint()
+        if not self.config.optim.poses or path is None:
+            return capture
+        loaded = checkpoint.load(path)
+        if loaded.metadata.views != capture.train:
+            raise ValueError(f"{path} was trained on other frames than {capture.name} has now")
+        poses = checkpoint.load_poses(loaded, capture.extent)
+        cameras = [capture.cameras[name] for name in capture.train]
+        with torch.no_grad():
+            moved = [poses(camera.viewmat, torch.tensor([k])) for k, camera in enumerate(cameras)]
+        pairs = zip(cameras, moved, strict=True)
+        corrected = [dataclasses.replace(camera, viewmat=viewmat) for camera, viewmat in pairs]
+        return capture.with_cameras(dict(zip(capture.train, corrected, strict=True)))
+
     def newest_checkpoint(self) -> Path | None:
         """The checkpoint of the last saved iteration; None if there is none yet."""
         saved = checkpoint.list_checkpoints(self.folder)

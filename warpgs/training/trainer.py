@@ -288,10 +288,7 @@ class Trainer:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
         if self.views.poses is not None:
-            state = self.views.poses.state_dict()
-            self.views.poses.load_state_dict(
-                {name: loaded.tensor(f"poses.{name}", t.shape) for name, t in state.items()}
-            )
+            self.views.poses.load_state_dict(checkpoint.load_poses(loaded, self.capture.extent).state_dict())
         self._set_scene(checkpoint.load_scene(loaded, self.config.model))
         for name, parameter in self.step.parameters().items():
             if f"adam.step.{name}" in loaded.tensors:

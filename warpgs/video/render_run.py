@@ -47,7 +47,7 @@ def render_run(options: Render) -> str:
     _check(options)
     run = Run.open(options.run_folder, options.device, options.data)
     scene = run.trained_scene()
-    capture = run.open_capture(options.quiet)
+    capture = run.open_corrected_capture(options.quiet)
     dynamic, static = scene.scene.dynamic.means.cpu(), scene.scene.static.means.cpu()
     means = torch.cat([dynamic, static])
     centers = torch.stack([capture.cameras[name].position for name in capture.train])

@@ -49,7 +49,7 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
 def training_cameras(source: Source, warn: Callable[[str], None]) -> TrainingCameras | None:
     """The training cameras of a run; None, with a warning, if its capture cannot be read."""
     try:
-        return TrainingCameras(source.run.open_capture())
+        return TrainingCameras(source.run.open_corrected_capture())
     except (ValueError, OSError) as error:
         warn(f"without training cameras: {one_line(error)}")
         return None
