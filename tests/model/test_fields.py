@@ -11,6 +11,7 @@ from warpgs.model.fields import FIELDS, make_deformation
 from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.trunk import Trunk
+from warpgs.presets import PRESETS
 
 CENTER = torch.tensor([1.0, -2.0, 0.5])
 HALF_SIZE = torch.tensor([2.0, 2.0, 2.0])
@@ -53,10 +54,10 @@ def random_means(num=9):
     return CENTER + 2.0 * torch.rand(num, 3, generator=generator()) - 1.0
 
 
-def plain_trunk(parameters, means, skip):
+def plain_trunk(parameters, means, skip, raw=True):
     """The layers one by one in double precision; parameters are [weight, bias, weight, bias …]."""
-    position = encode((means.double() - CENTER.double()) / HALF_SIZE.double(), 3)
-    encoding = torch.cat([position, encode(TIME.double()[:, None], 2).repeat(len(means), 1)], 1)
+    position = encode((means.double() - CENTER.double()) / HALF_SIZE.double(), 3, raw)
+    encoding = torch.cat([position, encode(TIME.double()[:, None], 2, raw).repeat(len(means), 1)], 1)
     pairs = list(zip(parameters[::2], parameters[1::2], strict=True))
     values = encoding
     for number, (weight, bias) in enumerate(pairs[:-1]):
@@ -72,9 +73,10 @@ def double_parameters(trunk):
 
 
 @pytest.mark.parametrize(("depth", "skip"), SHAPES)
-def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip):
-    trunk = make_trunk(depth=depth, skip=skip)
-    expected = plain_trunk(double_parameters(trunk), random_means(), skip)
+@pytest.mark.parametrize("raw", [True, False])
+def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip, raw):
+    trunk = make_trunk(depth=depth, skip=skip, raw_input=raw)
+    expected = plain_trunk(double_parameters(trunk), random_means(), skip, raw)
     assert relative_error(trunk(random_means(), TIME), expected) < 2e-6
 
 
@@ -116,6 +118,12 @@ def test_the_default_trunk_has_eight_layers_of_256_units():
     shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
     columns = [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
     assert shapes == [*((256, c) for c in columns), (OUTPUTS, 256)]
+
+
+def test_the_trunk_of_the_paper_reads_80_sines_and_cosines_and_reads_them_again_after_its_fifth_layer():
+    trunk = Trunk(PRESETS["paper"].model, CENTER, HALF_SIZE, OUTPUTS)
+    columns = [weight.shape[1] for weight, _ in trunk.layers(trunk.values)]
+    assert columns == [80, 256, 256, 256, 256, 256 + 80, 256, 256, 256]
 
 
 def test_positions_are_normalized_by_the_box():

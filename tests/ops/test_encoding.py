@@ -13,6 +13,7 @@ from warpgs.runtime.tape import OpContext
 
 TIME = torch.tensor([0.3])
 BOX = (torch.zeros(3), torch.ones(3))
+RAW = pytest.mark.parametrize("raw", [True, False])
 
 
 def random_means(num):
@@ -20,30 +21,32 @@ def random_means(num):
 
 
 def encode_unit_box(means, *bands, time=TIME, **options):
-    return encode(means, time, bands, *BOX, **options)
+    return encode(means, time, bands, BOX, **options)
 
 
-def waves(values, bands):
+def waves(values, bands, raw=True):
     """Equation 6 in Python floats, with the frequencies of a value side by side."""
     angles = [2**k * math.pi * x for x in values for k in range(bands)]
-    return [*values, *map(math.sin, angles), *map(math.cos, angles)]
+    return [*(values if raw else []), *map(math.sin, angles), *map(math.cos, angles)]
 
 
-def test_the_encoding_equals_the_reference():
+@RAW
+def test_the_encoding_equals_the_reference(raw):
     means, center, half_size = random_means(50), torch.tensor([0.1, 2.0, -1.0]), torch.tensor([1.0, 3.0, 0.5])
-    positions = reference((means.double() - center) / half_size, 6)
-    times = reference(TIME.double()[:, None], 4).expand(50, -1)
-    encoded = encode(means, TIME, (6, 4), center, half_size)[:, : encoded_size(6, 4)]
+    positions = reference((means.double() - center) / half_size, 6, raw)
+    times = reference(TIME.double()[:, None], 4, raw).expand(50, -1)
+    encoded = encode(means, TIME, (6, 4), (center, half_size), raw=raw)[:, : encoded_size(6, 4, raw)]
     # p is rounded before the highest frequency multiplies its error by 32 π.
     assert error(encoded, torch.cat([positions, times], 1)) < 2e-5
 
 
 @pytest.mark.parametrize("bands", [(1, 2), (4, 1), (10, 10)])
-def test_the_encoding_is_equation_6_for_position_and_time(bands):
+@RAW
+def test_the_encoding_is_equation_6_for_position_and_time(bands, raw):
     means = random_means(6)
-    encoded = encode_unit_box(means, *bands)
+    encoded = encode_unit_box(means, *bands, raw=raw)
     for row in range(6):
-        expected = waves(means[row].tolist(), bands[0]) + waves(TIME.tolist(), bands[1])
+        expected = waves(means[row].tolist(), bands[0], raw) + waves(TIME.tolist(), bands[1], raw)
         assert error(encoded[row, : len(expected)], torch.tensor(expected, dtype=torch.float64)) < 1e-6
 
 
@@ -53,9 +56,10 @@ def test_half_precision_is_rounded_single_precision():
 
 
 @pytest.mark.parametrize("bands", [(10, 10), (3, 2), (0, 0), (1, 3)])
-def test_rows_are_padded_with_zeros_to_a_multiple_of_the_alignment(bands):
-    encoded = encode_unit_box(random_means(2), *bands)
-    size = encoded_size(*bands)
+@RAW
+def test_rows_are_padded_with_zeros_to_a_multiple_of_the_alignment(bands, raw):
+    encoded = encode_unit_box(random_means(2), *bands, raw=raw)
+    size = encoded_size(*bands, raw)
     assert encoded.shape == (2, math.ceil(size / ALIGNMENT) * ALIGNMENT)
     assert not encoded[:, size:].any()
     assert encoded[:, :size].any(0).all()
@@ -68,13 +72,14 @@ def test_the_encoding_starts_at_the_offset(half):
     assert torch.equal(with_offset[:, 16:], encode_unit_box(means, 4, 2, half=half))
 
 
-def test_several_threads_per_row_write_the_same_as_one():
+@RAW
+def test_several_threads_per_row_write_the_same_as_one(raw):
     means = random_means(5)
-    expected = encode_unit_box(means, 10, 3, offset=8)
+    expected = encode_unit_box(means, 10, 3, offset=8, raw=raw)
     encoding = torch.empty_like(expected)
     ctx = OpContext(means.device, [])
     threads = 5 * 4 << CUDA_LANES_LOG2
-    ctx.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, CUDA_LANES_LOG2, encoding)
+    ctx.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, int(raw), CUDA_LANES_LOG2, encoding)
     assert torch.equal(encoding[:, 8:], expected[:, 8:])
 
 

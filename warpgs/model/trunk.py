@@ -32,13 +32,13 @@ class Trunk(nn.Module):
         self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"], outputs: int
     ) -> None:
         super().__init__()
-        self.bands = (config.position_bands, config.time_bands)
+        self.bands, self.raw = (config.position_bands, config.time_bands), config.raw_input
         self.skip = config.skip if config.skip < config.depth else 0
         self.reserved_columns = config.width if self.skip else 0
         self.uses_half = config.half and config.width % ALIGNMENT == 0
         self.register_buffer("center", center.clone())
         self.register_buffer("half_size", half_size.clone())
-        encoded = encoded_size(*self.bands)
+        encoded = encoded_size(*self.bands, self.raw)
         columns = [encoded] + [config.width + (encoded if k == self.skip else 0) for k in range(1, config.depth)]
         self.sizes = [*((config.width, c) for c in columns), (outputs, config.width)]
         padding = aligned(encoded) - encoded
@@ -58,5 +58,6 @@ class Trunk(nn.Module):
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N outputs"]:
         """Evaluates the network at N positions and one time in [0, 1]. No gradient flows to the positions."""
         half = self.uses_half and means.is_cuda
-        inputs = encode(means.detach(), time, self.bands, self.center, self.half_size, self.reserved_columns, half)
+        box = (self.center, self.half_size)
+        inputs = encode(means.detach(), time, self.bands, box, self.reserved_columns, half, self.raw)
         return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0])

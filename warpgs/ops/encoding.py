@@ -16,10 +16,10 @@ def encode(
     means: Float[Tensor, "N 3"],
     time: Float[Tensor, "1"],
     bands: tuple[int, int],
-    center: Float[Tensor, "3"],
-    half_size: Float[Tensor, "3"],
+    box: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
     offset: int = 0,
     half: bool = False,
+    raw: bool = True,
 ) -> Float[Tensor, "N columns"]:
     """[γ(p), γ(t)] of paper Eq. 6 for p = (means − center) / half_size; not differentiable.
 
@@ -27,16 +27,18 @@ def encode(
         means: [N, 3] positions.
         time: [1] time in [0, 1], the same for all positions.
         bands: Numbers L of frequencies of positions and of time; the lowest frequency has wavelength 2.
-        center, half_size: [3] each, the box that is mapped to [-1, 1]³.
+        box: Center and half size, [3] each, of the box that is mapped to [-1, 1]³.
         offset: Number of columns before the encoding, left uninitialised.
         half: Whether to return half precision.
+        raw: Whether p and t themselves come first.
 
     Returns:
-        [N, offset + columns]: p, then sin(2ᵏ π p), then cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros.
+        [N, offset + columns]: p if ``raw``, sin(2ᵏ π p), cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros.
 
     Raises:
         ValueError: On a wrong shape, dtype or device.
     """
+    center, half_size = box
     sizes: dict[str, int] = {}
     check_tensor("means", means, ("N", 3), sizes)
     check_tensor("time", time, (1,), sizes)
@@ -45,10 +47,10 @@ def encode(
     check_same_device({"means": means, "time": time, "center": center, "half_size": half_size})
     with torch.no_grad():
         ctx = OpContext(means.device, [])
-        columns = aligned(encoded_size(*bands))
+        columns = aligned(encoded_size(*bands, raw))
         encoding = ctx.empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
         lanes_log2 = kernels.CUDA_LANES_LOG2 if ctx.is_cuda else 0
-        arguments = (means, time, center, half_size, *bands, offset, lanes_log2, encoding)
+        arguments = (means, time, center, half_size, *bands, offset, int(raw), lanes_log2, encoding)
         ctx.launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
 
@@ -58,6 +60,6 @@ def aligned(number: int) -> int:
     return number + -number % ALIGNMENT
 
 
-def encoded_size(position_bands: int, time_bands: int) -> int:
+def encoded_size(position_bands: int, time_bands: int, raw: bool = True) -> int:
     """Number of columns of ``encode`` without the padding."""
-    return 3 * (1 + 2 * position_bands) + 1 + 2 * time_bands
+    return 3 * (int(raw) + 2 * position_bands) + int(raw) + 2 * time_bands
