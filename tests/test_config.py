@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from warpgs.config import ModelConfig, TrainConfig, fitted_bands, scaled, validate
+from warpgs.config import ModelConfig, TrainConfig, scaled, validate
 from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
+from warpgs.training.train import fitted_bands
 
 
 def changed(name, value, config=PRESETS["paper"]):
@@ -57,6 +58,14 @@ def test_inconsistent_sh_degrees_are_refused(degree, appearance_degree):
     config = changed("model.sh_degree", degree)
     with pytest.raises(ValueError, match=r"appearance_degree <= model\.sh_degree <= 3"):
         validate(changed("model.appearance_degree", appearance_degree, config))
+
+
+@pytest.mark.parametrize("bands", ["position_bands", "time_bands"])
+def test_networks_without_any_input_of_position_or_time_are_refused(bands):
+    model = ModelConfig(**{bands: 0})
+    validate(TrainConfig(model=model))
+    with pytest.raises(ValueError, match=r"without model\.raw_input the networks need"):
+        validate(TrainConfig(model=dataclasses.replace(model, raw_input=False)))
 
 
 def test_a_schedule_with_only_pretraining_is_refused():

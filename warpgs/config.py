@@ -75,6 +75,9 @@ class ModelConfig:
     """Number of frequencies L in the encoding of positions (paper Eq. 6)."""
     time_bands: Annotated[int, Bounds(max=64)] = 10
     """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
+    raw_input: bool = True
+    """Whether position and time themselves are inputs of the networks beside their encodings, as in Deformable-3DGS;
+    not in paper Eq. 6."""
     min_period: float = 0.0
     """Minimum period of these frequencies, in training frames; higher frequencies are dropped, because they overfit to
     the training times. 0: none are dropped (paper)."""
@@ -87,7 +90,8 @@ class ModelConfig:
     appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
     """Number of units per hidden layer of the appearance network; that of both networks if None."""
     skip: int = 4
-    """Hidden layer after which the encoding is concatenated again; nowhere if it is the last one or beyond."""
+    """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS); nowhere if it is the last one
+    or beyond."""
     deformation: str = "mlp"
     """Deformation model of the dynamic Gaussians (a key of FIELDS in warpgs/model/fields.py)."""
     sh_degree: int = 1
@@ -104,6 +108,9 @@ class ModelConfig:
     """Maximum number of initial static Gaussians."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
+    dynamic_start: Literal["points", "uniform"] = "points"
+    """Where dynamic Gaussians start if their depth is unknown: in front of the sparse points around them, or uniformly
+    in the scene's box, as in the code of the paper's authors; the paper names no start."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,11 @@ class LossConfig:
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
     """Final λ_depth; it decays exponentially."""
+    depth_gate: bool = True
+    """Whether depth is compared only where the rendered opacity exceeds a half; paper Eq. 14 compares it everywhere."""
+    branches_in_stage2: bool = True
+    """Whether stage II keeps the terms of the single branches (Eq. 9, 12 and 14) beside the joint image, as the sum in
+    Eq. 15 does; else it compares the joint image alone, as the authors' code does."""
     depth_tolerance: float = 0.0
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
     by 1 + (error / tolerance)², and depth that is hardly better than a constant is not used. If 0, all views have the
@@ -144,7 +156,13 @@ class OptimConfig:
     """Learning rates of Adam; those of Deformable-3DGS where the paper names none."""
 
     means: float = 1.6e-4
-    """Positions, relative to the extent of the capture; decays exponentially to 1 % over the run."""
+    """Positions, times ``means_scale``; decays exponentially to 1 %."""
+    means_scale: Annotated[float | None, Bounds(positive=True)] = None
+    """Factor of the rate of positions: the extent of the capture if None (3DGS), 5 in Deformable-3DGS, which the paper
+    builds upon: 8e-4 is also the rate that it prints (section Experimental Setup)."""
+    means_anneal: Literal["run", "trained"] = "run"
+    """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
+    trained: static ones until stage II (paper, section Static Component), dynamic ones from stage I."""
     quats: float = 1e-3
     """Rotations."""
     scales: float = 5e-3
@@ -217,9 +235,9 @@ class Schedule:
     """Iterations between visibility-driven prunings, in stage I."""
     deform_from: int = 3_000
     """Iteration from which dynamic Gaussians are deformed."""
-    appearance_from: int = 0
-    """Iteration from which the appearance network changes static Gaussians. The paper starts it in stage II; by then
-    moving shadows have become Gaussians at wrong depths (docs/results.md)."""
+    appearance_from: int | None = 0
+    """Iteration from which the appearance network changes static Gaussians; in stage II alone if None (paper, section
+    Training Protocol). By then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
     joint_from: int | None = None
     """Iteration of stage I from which the joint image is compared; in stage II alone if None (paper)."""
     warmup: int = 1_000
@@ -263,9 +281,9 @@ class TrainConfig:
     resume: Path | None = None
     """Run folder to continue from its newest checkpoint."""
     preset: Literal["paper", "best", "fast", "patient", "quick"] = "paper"
-    """Defaults of everything below: best (one GPU, minutes), paper (72k iterations, closer to the paper), fast (one
-    GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). On the command line the
-    default is best for a capture and quick for the built-in scene."""
+    """Defaults of everything below: best (one GPU, minutes), paper (as published, 72k iterations; docs/method.md),
+    fast (one GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). On the command line
+    the default is best for a capture and quick for the built-in scene."""
     iterations: Annotated[int | None, Bounds(min=3)] = None
     """Total iterations; every schedule is rescaled to it."""
     device: Literal["cuda", "cpu"] | None = None
@@ -273,9 +291,9 @@ class TrainConfig:
     seed: int = 0
     """Seed of all random numbers."""
     depth: bool = True
-    """Use the capture's depth; without it, dynamic Gaussians start in front of the sparse points around them."""
+    """Use the capture's depth; without it there is no pretraining, no depth loss, and no depth to start from."""
     dap: bool = True
-    """Depth-aware pretraining, and the depth loss in the stages after it."""
+    """Depth-aware pretraining; without it, its iterations are added to stage I, and depth is still compared there."""
     vdp: bool = True
     """Visibility-driven pruning."""
     app: bool = True
@@ -323,6 +341,11 @@ def validate(config: TrainConfig) -> None:
             "expected model.appearance_degree <= model.sh_degree <= 3, "
             f"got {model.appearance_degree} and {model.sh_degree}"
         )
+    if not model.raw_input and 0 in (model.position_bands, model.time_bands):
+        raise ValueError(
+            "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "
+            f"got {model.position_bands} and {model.time_bands}"
+        )
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
 
@@ -336,19 +359,6 @@ def _check_bounds(prefix: str, config: Any) -> None:
         elif isinstance(value, int | float):
             bounds = (data for data in getattr(hint, "__metadata__", ()) if isinstance(data, Bounds))
             next(bounds, Bounds()).check(prefix + name, value)
-
-
-def fitted_bands(model: ModelConfig, num_frames: int) -> int:
-    """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
-
-    See ``ModelConfig.min_period``.
-
-    Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
-    """
-    if model.min_period == 0 or model.time_bands == 0:
-        return model.time_bands
-    periods = 2.0 * (num_frames - 1) / model.min_period
-    return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))
 
 
 def scaled(config: TrainConfig) -> TrainConfig:

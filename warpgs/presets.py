@@ -4,6 +4,23 @@ import dataclasses
 
 from .config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig
 
+PAPER = TrainConfig(
+    preset="paper",
+    model=ModelConfig(
+        raw_input=False,
+        skip=5,
+        sh_degree=3,
+        appearance_degree=3,
+        appearance_opacity=True,
+        dynamic_points=100_000,
+        dynamic_start="uniform",
+    ),
+    loss=LossConfig(dynamic_background="black", depth=1.0, depth_dynamic=0.0, depth_end=0.01, depth_gate=False),
+    optim=OptimConfig(means_scale=5.0, means_anneal="trained"),
+    schedule=Schedule(densify_from=600, densify_until=14_900, appearance_from=None, warmup=0),
+)
+"""The paper, and the code that it builds upon where it says nothing; docs/method.md explains every value."""
+
 BEST = TrainConfig(
     preset="best",
     static_geometry=True,
@@ -121,5 +138,5 @@ QUICK = dataclasses.replace(
     ),
 )
 
-PRESETS = {"paper": TrainConfig(), "best": BEST, "fast": FAST, "patient": PATIENT, "quick": QUICK}
+PRESETS = {"paper": PAPER, "best": BEST, "fast": FAST, "patient": PATIENT, "quick": QUICK}
 """Defaults by name."""

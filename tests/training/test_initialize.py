@@ -296,6 +296,28 @@ def test_without_depth_dynamic_gaussians_start_in_front_of_the_points_around_the
     assert error(depth, torch.full_like(depth, 2.0 * dynamic_points.DEPTH_FACTOR)) < 1e-4
 
 
+@pytest.mark.parametrize("inverse_depth", [None, mostly_unknown()])
+def test_without_depth_dynamic_gaussians_can_start_uniformly_in_the_box(inverse_depth):
+    points = random_points(300)
+    model = dataclasses.replace(NETWORK, dynamic_start="uniform", dynamic_points=2_000)
+    config = dataclasses.replace(CONFIG, model=model)
+    gaussians = dynamic_gaussians(make_capture(points, inverse_depth=inverse_depth), ALIGNMENT, config)
+    center, half_size = scene_box(points)
+    inside = (gaussians.means - center) / half_size
+    assert len(gaussians) == 2_000
+    assert inside.abs().max() <= 1.0
+    # Uniform in [-1, 1]: mean 0 and variance 1/3.
+    assert inside.mean(0).abs().max() < 0.05
+    assert (inside.var(0) - 1 / 3).abs().max() < 0.03
+
+
+def test_with_depth_dynamic_gaussians_start_at_it_even_if_they_would_be_uniform_without():
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, dynamic_start="uniform"))
+    gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT, config)
+    depth = CAMERA.project(gaussians.means.detach())[2]
+    assert error(depth, torch.full_like(depth, DEPTH)) < 5e-3
+
+
 def test_only_the_points_around_a_dynamic_pixel_count():
     around, corner = points_around_the_block(torch.full((8,), 3.0)), torch.zeros(1, dtype=torch.long)
     points = torch.cat([around, around, CAMERA.unproject(corner, corner, torch.ones(1))])

@@ -11,7 +11,15 @@ from tests.scenes import error, generator
 from warpgs.config import ModelConfig, OptimConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.training.optimizer import GROUPS, exponential, gather, learning_rates, make_optimizer, reset_moments
+from warpgs.training.optimizer import (
+    BRANCHES,
+    GROUPS,
+    exponential,
+    gather,
+    learning_rates,
+    make_optimizer,
+    reset_moments,
+)
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=2, width=3)
 NETWORKS = ("deformation", "appearance")
@@ -64,8 +72,9 @@ def trained(num_steps=3, rate=0.01, **sizes):
 WARM = dict.fromkeys(NETWORKS, 1.0)
 
 
-def rates_at(progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM):
-    return learning_rates(config, extent, progress, network_progress, warmup_factors)
+def rates_at(progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM, means_progress=None):
+    means_progress = dict.fromkeys(BRANCHES, progress) if means_progress is None else means_progress
+    return learning_rates(config, extent, progress, means_progress, network_progress, warmup_factors)
 
 
 # The optimizer -------------------------------------------------------------------------------------------------------
@@ -261,6 +270,20 @@ def test_the_rate_of_positions_decays_to_a_hundredth_in_units_of_the_extent(prog
     rates = rates_at(progress, START, extent=3.0)
     for branch in ("static", "dynamic"):
         assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * factor)
+
+
+@pytest.mark.parametrize("extent", [0.3, 7.0])
+def test_the_rate_of_positions_can_have_a_scale_of_its_own_whatever_the_scene(extent):
+    config = OptimConfig(means=1.6e-4, means_scale=5.0)
+    start, end = (rates_at(k, START, extent, config)["dynamic.means"] for k in (0.0, 1.0))
+    assert start == pytest.approx(8e-4)
+    assert end == pytest.approx(8e-6)
+
+
+def test_the_rate_of_positions_decays_by_branch():
+    rates = rates_at(0.3, START, means_progress={"static": 1.0, "dynamic": 0.5})
+    assert rates["static.means"] == pytest.approx(0.1 * 0.01)
+    assert rates["dynamic.means"] == pytest.approx(0.1 * 0.1)
 
 
 def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_extent():

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig, scaled
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig, scaled
 from warpgs.presets import PRESETS
 from warpgs.training.loss_terms import TERMS
 from warpgs.training.schedule import Phase, Protocol
@@ -126,6 +126,22 @@ def test_the_appearance_network_is_always_used_in_stage_2():
     assert iterations_in_phases_where("use_appearance", schedule={"appearance_from": 1000}) == list(range(STAGE2, END))
 
 
+@pytest.mark.parametrize("has_depth", [True, False])
+def test_the_appearance_network_can_wait_for_stage_2(has_depth):
+    plan = plans(has_depth, schedule={"appearance_from": None})
+    assert [k for k, p in enumerate(plan) if p.phase.use_appearance] == list(range(STAGE2, END))
+    assert not iterations_in_phases_where("use_appearance", stage2=False, schedule={"appearance_from": None})
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
+    loss = dataclasses.replace(CONFIG.loss, branches_in_stage2=keeps)
+    active = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE2).phase, loss)}
+    assert active == ({"static", "dynamic", "joint", "depth", "depth_dynamic"} if keeps else {"joint"})
+    before = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE1).phase, loss)}
+    assert before == {"static", "dynamic", "depth", "depth_dynamic"}
+
+
 def test_without_the_appearance_network_stage_2_has_its_joint_term():
     assert iterations_in_phases_where("use_appearance", app=False) == []
     assert iterations_with_joint_term(app=False) == list(range(STAGE2, END))
@@ -176,11 +192,15 @@ def test_the_depth_weight_decays_exponentially_over_the_run():
 
 
 @pytest.mark.parametrize(
-    ("has_depth", "changes"), [(False, {}), (True, {"dap": False}), (True, {"loss": LossConfig(depth=0.0)})]
+    ("has_depth", "changes"), [(False, {}), (False, {"dap": False}), (True, {"loss": LossConfig(depth=0.0)})]
 )
 def test_without_depth_its_weight_is_zero(has_depth, changes):
     assert iterations_where("depth_weight", has_depth, **changes) == []
     assert iterations_in_phases_where("with_depth", has_depth, **changes) == []
+
+
+def test_without_pretraining_depth_is_compared_all_the_same():
+    assert iterations_where("depth_weight", dap=False) == list(range(END))
 
 
 @pytest.mark.parametrize("end", [0.0, 2.0])
@@ -192,6 +212,31 @@ def test_the_depth_weight_may_decay_to_zero_or_stay_constant(end):
 
 def test_progress_rises_linearly_from_zero_to_one():
     assert [plan.progress for plan in plans()] == pytest.approx([k / END for k in range(END)])
+
+
+def means_progress(branch, **changes):
+    return [plan.means_progress[branch] for plan in plans(**changes)]
+
+
+TRAINED = OptimConfig(means_anneal="trained")
+
+
+@pytest.mark.parametrize("branch", ["static", "dynamic"])
+def test_by_default_the_rate_of_positions_decays_over_the_run(branch):
+    assert means_progress(branch) == [plan.progress for plan in plans()]
+
+
+def test_the_rate_of_static_positions_can_decay_until_stage_2_in_which_they_are_constant():
+    expected = [min(1.0, k / STAGE2) for k in range(END)]
+    assert means_progress("static", optim=TRAINED) == pytest.approx(expected)
+    whole = [k / END for k in range(END)]
+    assert means_progress("static", optim=TRAINED, static_geometry=True) == pytest.approx(whole)
+    assert means_progress("static", optim=TRAINED, stage2=False) == pytest.approx(whole)
+
+
+def test_the_rate_of_dynamic_positions_can_decay_from_stage_1_on_in_which_they_begin():
+    expected = [0.0] * STAGE1 + [k / (END - STAGE1) for k in range(END - STAGE1)]
+    assert means_progress("dynamic", optim=TRAINED) == pytest.approx(expected)
 
 
 def network_progress(name, **schedule):

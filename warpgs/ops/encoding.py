@@ -25,7 +25,7 @@ def encode(
 
     Args:
         means: [N, 3] positions.
-        time: [1] time in [0, 1], the same for all positions.
+        time: [1] time in [0, 1], of all positions.
         bands: Numbers L of frequencies of positions and of time; the lowest frequency has wavelength 2.
         box: Center and half size, [3] each, of the box that is mapped to [-1, 1]³.
         offset: Number of columns before the encoding, left uninitialised.
@@ -38,21 +38,23 @@ def encode(
     Raises:
         ValueError: On a wrong shape, dtype or device.
     """
-    center, half_size = box
-    sizes: dict[str, int] = {}
-    check_tensor("means", means, ("N", 3), sizes)
-    check_tensor("time", time, (1,), sizes)
-    check_tensor("center", center, (3,), sizes)
-    check_tensor("half_size", half_size, (3,), sizes)
-    check_same_device({"means": means, "time": time, "center": center, "half_size": half_size})
+    _check_inputs(means, {"time": time, "center": box[0], "half_size": box[1]})
     with torch.no_grad():
         ctx = OpContext(means.device, [])
         columns = aligned(encoded_size(*bands, raw))
         encoding = ctx.empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
         lanes_log2 = kernels.CUDA_LANES_LOG2 if ctx.is_cuda else 0
-        arguments = (means, time, center, half_size, *bands, offset, int(raw), lanes_log2, encoding)
+        arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
         ctx.launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
+
+
+def _check_inputs(means: Tensor, vectors: dict[str, Tensor]) -> None:
+    sizes: dict[str, int] = {}
+    check_tensor("means", means, ("N", 3), sizes)
+    for name, vector in vectors.items():
+        check_tensor(name, vector, (1 if name == "time" else 3,), sizes)
+    check_same_device({"means": means, **vectors})
 
 
 def aligned(number: int) -> int:

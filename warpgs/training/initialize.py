@@ -66,9 +66,9 @@ def dynamic_gaussians(
 ) -> Gaussians:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth.
 
-    Without depth they start in front of the points around them, without visible points at random positions in the
-    scene's box. If everything is assumed to be dynamic, they start at the sparse points. If nothing is dynamic, there
-    are none.
+    Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
+    points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
+    points. If nothing is dynamic, there are none.
     """
     max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if capture.assumption == "dynamic" and len(capture.points):
@@ -76,7 +76,8 @@ def dynamic_gaussians(
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, max_count, generator)
     if found is None:
         return Gaussians.empty(0, degree)
-    if len(found.positions) == 0:
+    is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
+    if is_uniform or len(found.positions) == 0:
         positions = random_points(capture.points, max_count, generator)
         return gaussians_at(positions, torch.full_like(positions, 0.5), degree, max_scale(config, capture.extent))
     largest = math.inf if found.depth_known else max_scale(config, capture.extent)

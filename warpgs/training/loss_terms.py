@@ -3,14 +3,17 @@
 To add one, write a ``LossTerm`` in a new file, add a line to ``TERMS`` and a test.
 """
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from warpgs.config import LossConfig
 from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import Layer
 
 from . import losses
 from .losses import LossInputs, LossTerm
+from .schedule import Phase
 
 
 def static(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -39,7 +42,9 @@ def _depth_error(inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "
     assert layer.depth is not None
     assert inputs.alignment is not None
     assert inputs.depth_trust is not None
-    error = depth_error(layer.depth, layer.alpha, inputs.view.inverse_depth, inputs.alignment, region)
+    # The op skips pixels with an opacity of at most a half.
+    alpha = layer.alpha if inputs.config.depth_gate else torch.ones_like(layer.alpha)
+    error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region)
     return error * inputs.depth_trust
 
 
@@ -53,15 +58,19 @@ def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask)
 
 
+def _compares_branches(phase: Phase, config: LossConfig) -> bool:
+    return phase.stage != "stage2" or config.branches_in_stage2
+
+
 TERMS: dict[str, LossTerm] = {
     "static": LossTerm(
         static,
-        is_active=lambda phase, config: True,
+        is_active=_compares_branches,
         weight=lambda plan, config: config.static,
     ),
     "dynamic": LossTerm(
         dynamic,
-        is_active=lambda phase, config: phase.stage != "pretrain",
+        is_active=lambda phase, config: phase.stage != "pretrain" and _compares_branches(phase, config),
         weight=lambda plan, config: config.dynamic,
     ),
     "joint": LossTerm(

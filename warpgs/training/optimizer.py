@@ -61,6 +61,7 @@ def learning_rates(
     config: OptimConfig,
     extent: float,
     progress: float,
+    means_progress: Mapping[str, float],
     network_progress: Mapping[str, float],
     warmup_factors: Mapping[str, float],
 ) -> dict[str, float]:
@@ -68,13 +69,14 @@ def learning_rates(
 
     Args:
         config: Rates.
-        extent: Extent of the capture [scene units]; the rate of positions is proportional to it.
+        extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
         progress: Fraction of the run done, in [0, 1].
+        means_progress: By branch, fraction done of the decay of its positions' rate.
         network_progress: By network, fraction done of the iterations in which it is trained.
         warmup_factors: By network, factor of its rate.
     """
+    scale = extent if config.means_scale is None else config.means_scale
     gaussians = {
-        "means": exponential(config.means, MEANS_DECAY * config.means, progress) * extent,
         "quats": config.quats,
         "log_scales": config.scales,
         "logit_opacities": config.opacities,
@@ -82,6 +84,8 @@ def learning_rates(
         "sh_rest": config.sh_rest,
     }
     rates = {f"{branch}.{name}": rate for branch in BRANCHES for name, rate in gaussians.items()}
+    for branch in BRANCHES:
+        rates[f"{branch}.means"] = exponential(config.means, MEANS_DECAY * config.means, means_progress[branch]) * scale
     for name in NETWORKS:
         rate = exponential(config.networks, config.networks_end, network_progress[name])
         rates[name] = warmup_factors[name] * rate

@@ -57,6 +57,7 @@ class IterationPlan:
     Attributes:
         phase: Everything that the training step branches on.
         progress: Fraction of the run done.
+        means_progress: By branch, fraction done of the decay of its positions' learning rate.
         network_progress: By network, fraction done of the iterations in which it is trained.
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
@@ -69,6 +70,7 @@ class IterationPlan:
 
     phase: Phase
     progress: float
+    means_progress: dict[str, float]
     network_progress: dict[str, float]
     warmup_factors: dict[str, float]
     depth_weight: float
@@ -104,7 +106,7 @@ class Protocol:
         self.num_iterations = self.stage2.end
         # Iterations of stage I from which the networks are in use; in stage II they always are.
         starts = {"deformation": schedule.deform_from, "appearance": schedule.appearance_from}
-        self._network_starts = {name: min(start, stage1) for name, start in starts.items()}
+        self._network_starts = {name: stage1 if k is None else min(k, stage1) for name, k in starts.items()}
         self._reseed_from = self._network_starts["deformation"] + schedule.warmup
 
     def stage_at(self, iteration: int) -> Stage:
@@ -120,7 +122,9 @@ class Protocol:
             use_deformation=in_stage1 >= self._network_starts["deformation"],
             use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
-            with_depth=self.has_depth and config.dap and config.loss.depth > 0.0,
+            with_depth=self.has_depth
+            and config.loss.depth > 0.0
+            and (stage != "stage2" or config.loss.branches_in_stage2),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
         )
 
@@ -137,6 +141,7 @@ class Protocol:
         return IterationPlan(
             phase=phase,
             progress=progress,
+            means_progress=self._means_progress(iteration),
             network_progress={name: self._progress_from(k, in_stage1) for name, k in self._network_starts.items()},
             warmup_factors={name: self._warmup_factor(in_stage1 - k) for name, k in self._network_starts.items()},
             depth_weight=self._depth_weight(progress) if phase.with_depth else 0.0,
@@ -149,6 +154,16 @@ class Protocol:
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
+
+    def _means_progress(self, iteration: int) -> dict[str, float]:
+        """By branch, fraction done of the iterations over which the rate of its positions decays."""
+        ends = {"static": self.num_iterations, "dynamic": self.num_iterations}
+        starts = dict.fromkeys(ends, 0)
+        if self.config.optim.means_anneal == "trained":
+            starts["dynamic"] = self.stage1.start
+            ends["static"] = self.num_iterations if self.config.static_geometry else self.stage1.end
+        spans = {branch: (starts[branch], max(1, end - starts[branch])) for branch, end in ends.items()}
+        return {branch: min(1.0, max(0.0, (iteration - start) / length)) for branch, (start, length) in spans.items()}
 
     def _progress_from(self, start: int, in_stage1: int) -> float:
         """Fraction done of the iterations from one of stage I to the end of the run."""

@@ -108,9 +108,8 @@ class Step:
 
     def __call__(self, plan: IterationPlan, sample: Sample) -> None:
         """Runs one iteration."""
-        rates = optim.learning_rates(
-            self.config.optim, self.extent, plan.progress, plan.network_progress, plan.warmup_factors
-        )
+        progress = (plan.progress, plan.means_progress, plan.network_progress)
+        rates = optim.learning_rates(self.config.optim, self.extent, *progress, plan.warmup_factors)
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
         self._inputs.send(
             time_noise=sample.time_noise,

@@ -1,10 +1,11 @@
 """A training run from start to end: run folder, training, evaluation."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from warpgs.config import TrainConfig, fitted_bands, scaled
+from warpgs.config import ModelConfig, TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.data.loaders import recognize
@@ -152,6 +153,19 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     trainer = Trainer(config, capture, new_folder(config, capture))
     Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
     return trainer
+
+
+def fitted_bands(model: ModelConfig, num_frames: int) -> int:
+    """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
+
+    See ``ModelConfig.min_period``.
+
+    Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
+    """
+    if model.min_period == 0 or model.time_bands == 0:
+        return model.time_bands
+    periods = 2.0 * (num_frames - 1) / model.min_period
+    return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))
 
 
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
