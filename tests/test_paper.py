@@ -1,0 +1,171 @@
+"""The preset paper against the paper, section by section, and docs/method.md against the presets."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from warpgs.presets import PRESETS
+
+PAPER = {
+    "Visual Geometry Decomposition: Eq. 6": {
+        "model.position_bands": 10,
+        "model.time_bands": 10,
+        "model.raw_input": False,
+        "model.min_period": 0.0,
+    },
+    "Visual Geometry Decomposition: Eq. 8 and 9, static component": {
+        "model.sh_degree": 3,
+        "model.appearance_degree": 3,
+        "model.appearance_opacity": True,
+        "static_geometry": False,
+        "static_appearance": False,
+        "loss.static": 1.0,
+        "loss.ssim": 0.2,
+    },
+    "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {
+        "model.deformation": "mlp",
+        "loss.dynamic": 1.0,
+        "loss.dynamic_background": "black",
+        "loss.mask_margin": 0.0,
+        "assume": "masks",
+    },
+    "Visibility-Driven Pruning": {"vdp": True},
+    "Depth-Aware Pretraining: Eq. 14": {
+        "depth": True,
+        "dap": True,
+        "loss.depth_dynamic": 0.0,
+        "loss.depth_gate": False,
+        "loss.depth_tolerance": 0.0,
+        "loss.depth_smooth": False,
+    },
+    "Training Protocol: Eq. 15": {
+        "stage2": True,
+        "app": True,
+        "schedule.appearance_from": None,
+        "schedule.joint_from": None,
+        "loss.branches_in_stage2": True,
+    },
+    "Experimental Setup": {
+        "schedule.stage1": 30_000,
+        "schedule.stage2": 40_000,
+        "optim.networks": 8e-4,
+        "optim.networks_end": 1.6e-6,
+        "schedule.warmup": 0,
+        "model.appearance_depth": None,
+        "model.appearance_width": None,
+    },
+    "Deformable-3DGS: network": {"model.depth": 8, "model.width": 256, "model.skip": 5},
+    "Deformable-3DGS: optimization": {
+        "optim.means": 1.6e-4,
+        "optim.means_scale": 5.0,
+        "optim.means_anneal": "trained",
+        "optim.quats": 1e-3,
+        "optim.scales": 5e-3,
+        "optim.opacities": 0.05,
+        "optim.sh_dc": 2.5e-3,
+        "optim.sh_rest": 2.5e-3 / 20,
+        "schedule.deform_from": 3_000,
+        "schedule.noise_until": 20_000,
+        "schedule.sh_degree_every": 1_000,
+    },
+    # It densifies after iterations that are multiples of 100, more than 500 and less than 15,000.
+    "3DGS: adaptive density control": {
+        "densify.every": 100,
+        "densify.gradient": 2e-4,
+        "densify.dense_fraction": 0.01,
+        "densify.min_opacity": 0.005,
+        "densify.max_size": 0.1,
+        "densify.min_pixels": 0,
+        "schedule.densify_from": 600,
+        "schedule.densify_until": 14_900,
+        "schedule.reset_every": 3_000,
+    },
+    "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
+    "code of the authors": {"model.dynamic_points": 100_000, "model.dynamic_start": "uniform"},
+    "no such thing in the paper": {
+        "optim.poses": 0.0,
+        "exposure": False,
+        "antialias": False,
+        "densify.weakest": 0.0,
+        "densify.reseed": 0.0,
+    },
+    "decided here, where neither the paper nor the code that it builds upon says anything": {
+        "loss.joint": 1.0,
+        "densify.visibility": 3e-4,
+        "densify.max_gaussians": 3_000_000,
+        "schedule.pretrain": 2_000,
+        "schedule.realign_at": 1_000,
+        "schedule.prune_every": 5_000,
+        "model.max_static_points": 100_000,
+        "model.half": True,
+    },
+}
+"""Every option of the method, by the section of the paper, or of the code that it builds upon, that sets it."""
+
+RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
+RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
+"""Options of a run, which are no part of the method."""
+
+METHOD = Path(__file__).parents[1] / "docs" / "method.md"
+
+
+def flat(config, prefix=""):
+    values = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        nested = dataclasses.is_dataclass(value)
+        values |= flat(value, f"{prefix}{field.name}.") if nested else {prefix + field.name: value}
+    return values
+
+
+@pytest.mark.parametrize("section", PAPER)
+def test_the_preset_paper_has_the_values_of_the_paper(section):
+    values = flat(PRESETS["paper"])
+    assert {name: values[name] for name in PAPER[section]} == pytest.approx(PAPER[section])
+
+
+def test_every_option_of_the_method_is_compared_with_the_paper_once():
+    compared = [name for options in PAPER.values() for name in options]
+    assert len(compared) == len(set(compared))
+    assert set(compared) | RUN == set(flat(PRESETS["paper"]))
+    assert not set(compared) & RUN
+
+
+def table():
+    """Switch → (value in ``paper``, value in ``best``), from the rows of the tables of docs/method.md."""
+    rows = {}
+    for line in METHOD.read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        for switch in re.findall(r"`([\w.]+)`", cells[2]) if line.startswith("|") and len(cells) == 6 else []:
+            assert switch not in rows, f"{switch} has two rows"
+            rows[switch] = (cells[3].strip("`"), cells[4].strip("`"))
+    return rows
+
+
+def written(value):
+    """A value as the documentation writes it."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+@pytest.mark.parametrize(("column", "preset"), [(0, "paper"), (1, "best")])
+def test_the_documentation_has_the_values_of_the_presets(column, preset):
+    values = flat(PRESETS[preset])
+    documented = {name: cells[column] for name, cells in table().items()}
+    assert documented == {name: written(values[name]) for name in documented}
+
+
+def test_the_documentation_has_every_option_in_which_best_differs_from_the_paper():
+    paper, best = flat(PRESETS["paper"]), flat(PRESETS["best"])
+    assert {name for name in paper if paper[name] != best[name]} - RUN <= set(table())
+
+
+def test_the_documentation_names_files_that_exist():
+    root = METHOD.parents[1]
+    cells = [line.split("|") for line in METHOD.read_text().splitlines() if line.startswith("| ")]
+    named = {path for row in cells if len(row) == 8 for path in re.findall(r"`([\w/]+\.py)`", row[2])}
+    assert len(named) > 8
+    assert not [path for path in named if not (root / path).is_file()]
