@@ -13,7 +13,7 @@ from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import make_optimizer
-from warpgs.training.prune import blend_weights, prune_invisible, prune_weakest, visibility
+from warpgs.training.prune import Pruned, blend_weights, prune_invisible, prune_weakest, visibility
 from warpgs.training.schedule import Phase
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
@@ -135,27 +135,42 @@ def test_pruning_keeps_gaussians_at_or_above_the_threshold_in_order():
     kept = scores > middle
     before = {name: getattr(static, name).detach().clone() for name in PARAMETERS}
     scene, optimizer = make_scene_and_optimizer(static)
-    assert prune_invisible(scene, optimizer, CAMERAS, 3, middle) == int((~kept).sum())
+    assert sum(prune_invisible(scene, optimizer, CAMERAS, 3, middle)) == int((~kept).sum())
     for name in PARAMETERS:
         assert torch.equal(getattr(scene.static, name), before[name][kept])
 
 
+def test_what_is_removed_is_counted_by_kind():
+    """One camera of four sees the Gaussians in front; 0.25 · (1 − α) is below 0.2 if α exceeds 0.2."""
+    static = in_front([-2.0, 2.0, 2.5, 3.0, 3.5], [0.1] * 5, [0.5, 0.95, 0.92, 0.4, 0.1])
+    static.means.data[1:] += (
+        torch.tensor([[-0.9, 0, 0], [-0.3, 0, 0], [0.3, 0, 0], [0.9, 0, 0]]) @ AHEAD.viewmat[:3, :3]
+    )
+    scene, optimizer = make_scene_and_optimizer(static)
+    removed = prune_invisible(scene, optimizer, [AHEAD] + [shifted(AHEAD, 100.0, 0.0)] * 3, 3, 0.2)
+    assert removed == Pruned(unseen=1, opaque=2, faint=1)
+    assert error(scene.static.opacities, torch.tensor([0.1])) < 1e-6
+    assert str(removed) == (
+        "4 static Gaussians pruned by visibility: 1 that no frame shows, 2 opaque and 1 other that few show"
+    )
+
+
 def test_a_score_equal_to_the_threshold_is_kept():
     scene, optimizer = make_scene_and_optimizer(in_front([2.0], [0.2], [0.5]))
-    assert prune_invisible(scene, optimizer, [AHEAD], 3, threshold=0.5) == 0
+    assert sum(prune_invisible(scene, optimizer, [AHEAD], 3, threshold=0.5)) == 0
     assert len(scene.static) == 1
 
 
 def test_a_threshold_of_zero_removes_nothing():
     scene, optimizer = make_scene_and_optimizer(random_gaussians())
-    assert prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=0.0) == 0
+    assert sum(prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=0.0)) == 0
     assert len(scene.static) == 60
 
 
 def test_dynamic_gaussians_are_never_pruned():
     scene, optimizer = make_scene_and_optimizer(random_gaussians(), random_gaussians())
     before = scene.dynamic.means.detach().clone()
-    assert prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=2.0) == 60
+    assert sum(prune_invisible(scene, optimizer, [turned_around(AHEAD)], 3, threshold=2.0)) == 60
     assert len(scene.static) == 0
     assert torch.equal(scene.dynamic.means, before)
 
@@ -167,7 +182,7 @@ def test_kept_gaussians_keep_their_optimizer_state():
     scene.static.logit_opacities.grad = torch.tensor([1.0, 2.0, 3.0])
     optimizer.step()
     before = optimizer.state[scene.static.logit_opacities]["exp_avg"].clone()
-    assert prune_invisible(scene, optimizer, [AHEAD], 3, threshold=1e-3) == 1
+    assert sum(prune_invisible(scene, optimizer, [AHEAD], 3, threshold=1e-3)) == 1
     assert before.unique().numel() == 3
     assert torch.equal(optimizer.state[scene.static.logit_opacities]["exp_avg"], before[[0, 2]])
 
@@ -175,7 +190,7 @@ def test_kept_gaussians_keep_their_optimizer_state():
 def test_a_scene_without_static_gaussians_has_nothing_to_prune():
     scene, optimizer = make_scene_and_optimizer(Gaussians.empty(0), random_gaussians())
     assert visibility(scene, CAMERAS, 3).shape == (0,)
-    assert prune_invisible(scene, optimizer, CAMERAS, 3, threshold=0.1) == 0
+    assert sum(prune_invisible(scene, optimizer, CAMERAS, 3, threshold=0.1)) == 0
 
 
 def test_blend_weights_are_summed_over_the_joint_images_of_all_views(tmp_path):

@@ -1,6 +1,7 @@
 """Pruning: of static Gaussians by visibility (paper Eq. 15), and of both branches by their share of the images."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -20,6 +21,30 @@ MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
 
 
+OPAQUE = 0.9
+"""Minimum opacity of the Gaussians that are counted as opaque."""
+
+
+class Pruned(NamedTuple):
+    """Numbers of Gaussians that were removed, by kind.
+
+    V̄ = (fraction of the frames that show it) · (1 − α) is low if either factor is.
+
+    Attributes:
+        unseen: Those that no frame shows.
+        opaque: Those that few frames show and that have an opacity of at least ``OPAQUE``.
+        faint: The others that few frames show.
+    """
+
+    unseen: int
+    opaque: int
+    faint: int
+
+    def __str__(self) -> str:
+        kinds = f"{self.unseen:,} that no frame shows, {self.opaque:,} opaque and {self.faint:,} other that few show"
+        return f"{sum(self):,} static Gaussians pruned by visibility: {kinds}"
+
+
 @torch.no_grad()
 def visibility(
     scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, antialias: bool = False
@@ -35,6 +60,14 @@ def visibility(
         sh_degree: Maximum degree of spherical harmonics in use.
         antialias: As in ``RenderSettings``.
     """
+    opacities = scene.static.opacities.clamp(max=MAX_ALPHA)
+    return _fraction_rendered(scene, cameras, sh_degree, antialias) * (1.0 - opacities)
+
+
+def _fraction_rendered(
+    scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, antialias: bool
+) -> Float[Tensor, " N"]:
+    """Fraction of the cameras that show each static Gaussian."""
     static = scene.static
     splats = scene.static_splats(sh_degree)
     num_rendered = torch.zeros(len(static), device=static.means.device)
@@ -44,7 +77,7 @@ def visibility(
         assert rendering.contributed is not None
         num_rendered += rendering.contributed
         num += 1
-    return num_rendered / max(num, 1) * (1.0 - static.opacities.clamp(max=MAX_ALPHA))
+    return num_rendered / max(num, 1)
 
 
 @torch.no_grad()
@@ -55,10 +88,13 @@ def prune_invisible(
     sh_degree: int,
     threshold: float,
     antialias: bool = False,
-) -> int:
-    """Removes the static Gaussians with V̄ < ``threshold``; returns their number. Arguments as for ``visibility``."""
-    kept = (visibility(scene, cameras, sh_degree, antialias) >= threshold).nonzero()[:, 0]
-    removed = len(scene.static) - len(kept)
+) -> Pruned:
+    """Removes the static Gaussians with V̄ < ``threshold``; returns their numbers. Arguments as for ``visibility``."""
+    shown, opacities = _fraction_rendered(scene, cameras, sh_degree, antialias), scene.static.opacities
+    pruned = shown * (1.0 - opacities.clamp(max=MAX_ALPHA)) < threshold
+    unseen, opaque = pruned & (shown == 0), pruned & (shown > 0) & (opacities >= OPAQUE)
+    removed = Pruned(*(int(kind.sum()) for kind in (unseen, opaque, pruned & ~unseen & ~opaque)))
+    kept = (~pruned).nonzero()[:, 0]
     optim.gather(optimizer, scene.static, kept, num_kept=len(kept))
     return removed
 

@@ -135,13 +135,13 @@ class Trainer:
             removed = prune_invisible(
                 scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
             )
-            logger.log(f"iteration {self.iteration + 1}: {removed:,} static Gaussians pruned by visibility")
+            logger.log(f"iteration {self.iteration + 1}: {removed}")
         if plan.reseed:
             self._reseed(plan.phase, logger)
         if plan.prune_weakest:
             weights = blend_weights(scene, self.views, plan.phase, self.config.antialias)
-            removed = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
-            logger.log(f"iteration {self.iteration + 1}: {removed:,} Gaussians pruned that contribute least")
+            number = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
+            logger.log(f"iteration {self.iteration + 1}: {number:,} Gaussians pruned that contribute least")
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
