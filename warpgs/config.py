@@ -12,6 +12,10 @@ MAX_VALUE = 10**15
 """Maximum of every number that has no smaller one."""
 
 
+NetName = Literal["vgg", "alex", "squeeze"]
+"""Networks of LPIPS."""
+
+
 @dataclass(frozen=True)
 class Bounds:
     """Range of a number in a config, as metadata of its type: ``depth: Annotated[int, Bounds(min=1)]``.
@@ -326,6 +330,8 @@ class TrainConfig:
     """Maximum memory for training views on the device [bytes]; larger captures are read from disk on demand."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS, for the evaluation at the end."""
+    lpips_net: NetName = "vgg"
+    """Network of LPIPS: vgg (3DGS), alex (DyCheck's mLPIPS) or squeeze."""
 
 
 def validate(config: TrainConfig) -> None:

@@ -143,7 +143,16 @@ def test_values_outside_0_and_1_count_as_0_and_1():
 
 def test_what_a_capture_does_not_have_is_not_measured():
     view = evaluated(capture(masks=False), noisy(capture())).views[0]
-    for name in ("psnr_static", "psnr_dynamic", "ssim_static", "ssim_dynamic", "masked_psnr", "masked_ssim", "lpips"):
+    regions = (
+        "psnr_static",
+        "psnr_dynamic",
+        "ssim_static",
+        "ssim_dynamic",
+        "masked_psnr",
+        "masked_ssim",
+        "masked_lpips",
+    )
+    for name in (*regions, "masked_lpips", "lpips", "ms_ssim"):
         assert getattr(view, name) is None
 
 
@@ -176,12 +185,17 @@ def test_lpips_is_measured_with_the_network_that_is_given():
         def forward(self, image, truth):
             return (image - truth).abs().mean() / 2
 
-    here = capture()
+        def masked(self, image, truth, region):
+            return (image - truth).abs()[region].mean() / 2
+
+    here = capture(covisible=True)
     images = noisy(here)
     result = evaluated(here, images, lpips=Half("squeeze"))
     truth = here.frame("b").image.float() / 255
     assert result.lpips_net == "squeeze"
-    assert result.views[1].lpips == pytest.approx(((images[0.5].clamp(0, 1) - truth).abs().mean() / 2).item())
+    error = (images[0.5].clamp(0, 1) - truth).abs()
+    assert result.views[1].lpips == pytest.approx((error.mean() / 2).item())
+    assert result.views[1].masked_lpips == pytest.approx((error[:, :5].mean() / 2).item())
 
 
 # Flicker ------------------------------------------------------------------------------------------------------------

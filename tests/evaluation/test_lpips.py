@@ -54,7 +54,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def real():
-    return lpips.find(Path(WEIGHTS))
+    return next(lpips.find(Path(WEIGHTS), net) for net in NETS if None not in lpips._files(Path(WEIGHTS), net))
 
 
 # The networks -------------------------------------------------------------------------------------------------------
@@ -139,13 +139,48 @@ def test_no_gradient_is_kept(pair):
     assert not network("squeeze")(*pair).requires_grad
 
 
+# mLPIPS -------------------------------------------------------------------------------------------------------------
+
+
+def bilinear(values, size):
+    """A map enlarged to a size, pixel centres aligned, one pixel after the other."""
+    result = torch.zeros(size, dtype=torch.float64)
+    for i in range(size[0]):
+        for j in range(size[1]):
+            y = min(max((i + 0.5) * values.shape[0] / size[0] - 0.5, 0.0), values.shape[0] - 1.0)
+            x = min(max((j + 0.5) * values.shape[1] / size[1] - 0.5, 0.0), values.shape[1] - 1.0)
+            top, left = int(y), int(x)
+            bottom, right = min(top + 1, values.shape[0] - 1), min(left + 1, values.shape[1] - 1)
+            above = values[top, left] * (1 - x + left) + values[top, right] * (x - left)
+            below = values[bottom, left] * (1 - x + left) + values[bottom, right] * (x - left)
+            result[i, j] = above * (1 - y + top) + below * (y - top)
+    return result
+
+
+def test_masked_lpips_is_the_mean_of_the_enlarged_distances_of_masked_images(pair):
+    distance, region = network("alex"), torch.zeros(40, 44, dtype=torch.bool)
+    region[5:30, 8:40] = True
+    black = [image * region[..., None] for image in pair]
+    maps = [bilinear(layer.double(), (40, 44)) for layer in distance._layers(*black)]
+    assert len(maps) == 5
+    assert distance.masked(*pair, region).item() == pytest.approx(sum(maps)[region].mean().item(), rel=1e-5)
+
+
+def test_masked_lpips_does_not_see_the_rest(pair):
+    distance, region = network("squeeze"), torch.zeros(40, 44, dtype=torch.bool)
+    region[5:30, 8:40] = True
+    other = torch.where(region[..., None], pair[0], torch.rand(40, 44, 3))
+    assert distance.masked(other, pair[1], region).item() == distance.masked(*pair, region).item()
+    assert distance.masked(pair[0], pair[0], region).item() == 0.0
+
+
 # Their files --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("net", NETS)
 def test_written_weights_are_found_and_measure_the_same(net, pair, tmp_path):
     distance = network(net)
-    found = lpips.find(write(tmp_path, distance))
+    found = lpips.find(write(tmp_path, distance), net)
     assert found.net == net
     assert found(*pair).item() == distance(*pair).item()
 
@@ -154,42 +189,53 @@ def test_the_linear_layers_may_be_named_as_their_authors_do(tmp_path, pair):
     distance = network("squeeze")
     write(tmp_path, distance)
     (tmp_path / "lpips_v0.1_squeeze_lin.pth").rename(tmp_path / "squeeze.pth")
-    assert lpips.find(tmp_path)(*pair).item() == distance(*pair).item()
+    assert lpips.find(tmp_path, "squeeze")(*pair).item() == distance(*pair).item()
 
 
 def test_the_folder_may_be_named_in_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPGS_LPIPS", str(write(tmp_path, network("squeeze"))))
-    assert lpips.find(None).net == "squeeze"
+    assert lpips.find(None, "squeeze").net == "squeeze"
 
 
 def test_a_folder_that_is_given_goes_before_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPGS_LPIPS", str(tmp_path / "nothing"))
-    assert lpips.find(write(tmp_path, network("alex"))).net == "alex"
+    assert lpips.find(write(tmp_path, network("alex")), "alex").net == "alex"
 
 
 def test_without_a_folder_there_is_no_lpips():
-    assert lpips.find(None) is None
-    assert lpips.locate(None) is None
+    assert lpips.find(None, "vgg") is None
+    assert lpips.locate(None, "vgg") is None
 
 
 def test_weights_are_located_without_being_read(tmp_path):
     for name in (FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"):
         (tmp_path / name).write_bytes(b"not weights")
-    assert lpips.locate(tmp_path) == (tmp_path, "squeeze")
+    assert lpips.locate(tmp_path, "squeeze") == tmp_path
 
 
 @pytest.mark.parametrize("missing", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
 def test_a_folder_that_lacks_a_file_says_what_is_wanted(tmp_path, missing):
     (write(tmp_path, network("squeeze")) / missing).unlink()
-    with pytest.raises(
-        ValueError, match=r"holds no weights of LPIPS: one of squeezenet1_1.*lpips_v0\.1_<net>_lin\.pth"
-    ):
-        lpips.find(tmp_path)
+    wanted = r"LPIPS with --lpips-net squeeze \(squeezenet1_1\*\.pth and lpips_v0\.1_squeeze_lin\.pth\)$"
+    with pytest.raises(ValueError, match=wanted):
+        lpips.find(tmp_path, "squeeze")
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_no_other_network_takes_the_place_of_the_one_that_is_asked_for(tmp_path, net):
+    others = [other for other in NETS if other != net]
+    for other in others:
+        for name in (FILES[other], f"lpips_v0.1_{other}_lin.pth"):
+            (tmp_path / name).touch()
+    with pytest.raises(ValueError, match=f"--lpips-net {net} .*; it has those of ") as caught:
+        lpips.find(tmp_path, net)
+    assert all(f"--lpips-net {other}" in str(caught.value) for other in others)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_folder_that_does_not_exist_is_named(tmp_path):
-    with pytest.raises(ValueError, match=f"{tmp_path}/nothing holds no weights of LPIPS"):
-        lpips.locate(tmp_path / "nothing")
+    with pytest.raises(ValueError, match=f"{tmp_path}/nothing does not hold the weights of LPIPS"):
+        lpips.locate(tmp_path / "nothing", "vgg")
 
 
 @pytest.mark.parametrize("missing", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
@@ -204,7 +250,7 @@ def test_a_damaged_file_is_named(tmp_path, name):
     path = write(tmp_path, network("squeeze")) / name
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ValueError, match=f"{path} cannot be read as weights"):
-        lpips.find(tmp_path)
+        lpips.find(tmp_path, "squeeze")
 
 
 def test_weights_of_another_network_are_refused_in_one_line(tmp_path):
@@ -230,7 +276,7 @@ def test_a_file_of_something_else_is_refused_in_words(tmp_path, content):
     path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
     torch.save(content, path)
     with pytest.raises(ValueError, match=str(path)):
-        lpips.find(tmp_path)
+        lpips.find(tmp_path, "squeeze")
 
 
 @pytest.mark.parametrize("name", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])
@@ -238,7 +284,7 @@ def test_a_fifo_is_refused(tmp_path, name):
     path = write(tmp_path, network("squeeze")) / name
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(ValueError, match=rf"({path} is not a file|holds no weights|is missing)"):
+    with pytest.raises(ValueError, match=rf"({path} is not a file|is missing)"):
         lpips.load(tmp_path, "squeeze")
 
 
@@ -259,7 +305,7 @@ def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
     path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
     torch.save({"features.0.weight": Bomb()}, path)
     with pytest.raises(ValueError, match="cannot be read as weights"):
-        lpips.find(tmp_path)
+        lpips.find(tmp_path, "squeeze")
     assert not (tmp_path / "executed").exists()
 
 
@@ -298,7 +344,7 @@ def test_real_weights_call_blur_farther_than_a_change_of_brightness_of_the_same_
 
 def test_training_with_a_wrong_folder_is_refused_before_any_work(tmp_path):
     config = dataclasses.replace(TrainConfig(), data=tmp_path / "capture", out=tmp_path / "run", lpips=tmp_path)
-    with pytest.raises(ValueError, match="holds no weights of LPIPS"):
+    with pytest.raises(ValueError, match="does not hold the weights of LPIPS"):
         script.make_trainer(config)
     assert not (tmp_path / "run").exists()
 
@@ -306,7 +352,8 @@ def test_training_with_a_wrong_folder_is_refused_before_any_work(tmp_path):
 def test_resuming_with_a_folder_that_is_gone_is_refused_before_any_work(tmp_path):
     weights = write(tmp_path / "weights", network("squeeze"))
     data = tiny.write(tmp_path / "cache")
-    run = script.make_trainer(dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights)).run
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", lpips=weights, lpips_net="squeeze")
+    run = script.make_trainer(config).run
     shutil.rmtree(weights)
-    with pytest.raises(ValueError, match=f"{weights} holds no weights of LPIPS"):
+    with pytest.raises(ValueError, match=f"{weights} does not hold the weights of LPIPS"):
         script.make_trainer(command.parse(["--resume", str(run)]))

@@ -2,8 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tests.reference.ssim import ssim_map as reference_ssim
 from warpgs.evaluation import metrics
@@ -85,10 +87,118 @@ def test_ssim_takes_images_that_are_not_contiguous(pair):
     assert metrics.ssim(*turned) == pytest.approx(metrics.ssim(*pair), abs=1e-5)
 
 
-def test_masked_ssim_is_that_of_images_that_are_black_outside(pair, region):
-    image, truth = (torch.where(region[..., None], x, 0.0).double() for x in pair)
-    expected = reference_ssim(image, truth)[3:11, 5:20].mean().item()
-    assert metrics.masked_ssim(*pair, region) == pytest.approx(expected, abs=1e-5)
+def gaussian_window():
+    weights = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
+    return weights / weights.sum()
+
+
+def partial_convolution(values, mask):
+    """Along the first axis, one window after the other (Liu et al. 2018, section 3.1)."""
+    length = len(values) - 10
+    result, known = np.zeros((length, values.shape[1])), np.zeros((length, values.shape[1]))
+    for i in range(length):
+        for j in range(values.shape[1]):
+            inside = mask[i : i + 11, j]
+            if inside.sum() > 0:
+                result[i, j] = (gaussian_window() * values[i : i + 11, j] * inside).sum() * 11 / inside.sum()
+                known[i, j] = 1.0
+    return result, known
+
+
+def masked_mean(values, mask):
+    along_rows, known = partial_convolution(values.T, mask.T)
+    return partial_convolution(along_rows.T, known.T)[0]
+
+
+def naive_masked_ssim(image, truth, region):
+    """DyCheck's definition, with loops over windows in NumPy."""
+    similarities = []
+    mask = region.numpy().astype(float)
+    for channel in range(3):
+        a, b = (x[..., channel].double().numpy() for x in (image, truth))
+        mean_a, mean_b = masked_mean(a, mask), masked_mean(b, mask)
+        variance_a = np.maximum(0.0, masked_mean(a * a, mask) - mean_a**2)
+        variance_b = np.maximum(0.0, masked_mean(b * b, mask) - mean_b**2)
+        covariance = masked_mean(a * b, mask) - mean_a * mean_b
+        covariance = np.sign(covariance) * np.minimum(np.sqrt(variance_a * variance_b), np.abs(covariance))
+        above = (2 * mean_a * mean_b + 1e-4) * (2 * covariance + 9e-4)
+        similarities.append(above / ((mean_a**2 + mean_b**2 + 1e-4) * (variance_a + variance_b + 9e-4)))
+    return np.mean(similarities)
+
+
+def scattered():
+    return torch.rand(H, W) < 0.1
+
+
+def block():
+    region = torch.zeros(H, W, dtype=torch.bool)
+    region[3:11, 5:20] = True
+    return region
+
+
+@pytest.mark.parametrize("make_region", [block, scattered, lambda: torch.ones(H, W, dtype=torch.bool)])
+def test_masked_ssim_is_that_of_dycheck(pair, make_region):
+    region = make_region()
+    assert metrics.masked_ssim(*pair, region) == pytest.approx(naive_masked_ssim(*pair, region), abs=1e-9)
+
+
+def test_windows_without_any_pixel_of_the_region_count_as_one_in_masked_ssim(pair):
+    """So a small region scores high: DyCheck takes the mean over all windows."""
+    corner = torch.zeros(H, W, dtype=torch.bool)
+    corner[:2, :2] = True
+    assert 0.9 < metrics.masked_ssim(*pair, corner) < 1.0
+
+
+def test_masked_ssim_of_equal_images_is_one(pair, region):
+    assert metrics.masked_ssim(pair[1], pair[1], region) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("size", [(10, 23), (18, 10)])
+def test_masked_ssim_of_images_smaller_than_its_window_has_no_value(size):
+    image = torch.rand(*size, 3)
+    assert math.isnan(metrics.masked_ssim(image, image, torch.ones(size, dtype=torch.bool)))
+
+
+def windowed_mean(values):
+    window = np.outer(gaussian_window(), gaussian_window())
+    return np.einsum("ijckl,kl->ijc", sliding_window_view(values, (11, 11), (0, 1)), window)
+
+
+def naive_ms_ssim(image, truth):
+    """Wang et al. 2003 as in TensorFlow, in NumPy with two-dimensional windows."""
+    result = np.ones(3)
+    a, b = (x.double().numpy() for x in (image, truth))
+    for weight in (0.0448, 0.2856, 0.3001, 0.2363, 0.1333):
+        mean_a, mean_b = windowed_mean(a), windowed_mean(b)
+        covariance = windowed_mean(a * b) - mean_a * mean_b
+        variances = windowed_mean(a * a) - mean_a**2 + windowed_mean(b * b) - mean_b**2
+        contrast = (2 * covariance + 9e-4) / (variances + 9e-4)
+        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
+        factor = (contrast * luminance if weight == 0.1333 else contrast).mean((0, 1))
+        result = result * np.maximum(factor, 0.0) ** weight
+        a, b = (np.pad(x, ((0, x.shape[0] % 2), (0, x.shape[1] % 2), (0, 0)), "symmetric") for x in (a, b))
+        a, b = (0.25 * (x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]) for x in (a, b))
+    return result.mean()
+
+
+@pytest.mark.parametrize("size", [(161, 163), (165, 176)])
+def test_multi_scale_ssim_is_that_of_the_reference(size):
+    truth = torch.rand(*size, 3)
+    image = (truth + 0.2 * torch.randn(*size, 3)).clamp(0, 1)
+    assert metrics.ms_ssim(image, truth) == pytest.approx(naive_ms_ssim(image, truth), abs=1e-9)
+    assert metrics.ms_ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_multi_scale_ssim_of_opposite_images_is_a_number():
+    """Their covariance is negative, of which there are no fractional powers."""
+    image = torch.rand(161, 161, 3)
+    assert metrics.ms_ssim(image, 1.0 - image) == 0.0
+
+
+@pytest.mark.parametrize("size", [(160, 200), (200, 160)])
+def test_multi_scale_ssim_of_small_images_has_no_value(size):
+    image = torch.rand(*size, 3)
+    assert math.isnan(metrics.ms_ssim(image, image))
 
 
 def test_masked_ssim_does_not_see_the_rest(pair, region):

@@ -18,6 +18,8 @@ class Eval:
     """Run folder."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
+    lpips_net: Literal["vgg", "alex", "squeeze"] | None = None
+    """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; by default CUDA if there is a GPU."""
     quiet: bool = False
@@ -27,4 +29,4 @@ class Eval:
         """Evaluates and prints a summary; raises as ``evaluate_run``."""
         from .evaluate_run import evaluate_run
 
-        print(evaluate_run(self.run_folder, lpips=self.lpips, device=self.device, quiet=self.quiet))
+        print(evaluate_run(self.run_folder, lpips=(self.lpips, self.lpips_net), device=self.device, quiet=self.quiet))

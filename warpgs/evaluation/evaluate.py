@@ -39,6 +39,9 @@ class Renderer(Protocol):
         """The joint image, as fast as possible."""
 
 
+OnView = Callable[[int, Frame, Tensor, Rendering], None]
+"""Receives the index, frame, [H, W, 3] ground truth in [0, 1] and rendering of a view."""
+
 STATIC_ALPHA = 0.05
 """A pixel counts as static for the flicker score where the dynamic image's alpha is lower than this in both frames."""
 
@@ -53,13 +56,15 @@ class ViewMetrics:
     """Metrics of one view; None where they could not be measured.
 
     Images are clamped to [0, 1] and not rounded to 8 bits. ``_static`` and ``_dynamic`` are over the pixels of that
-    region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures.
+    region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures, as in DyCheck. MS-SSIM needs
+    images of at least 161 pixels a side.
     """
 
     name: str
     time: float
     psnr: float
     ssim: float
+    ms_ssim: float | None
     lpips: float | None
     psnr_static: float | None
     psnr_dynamic: float | None
@@ -67,6 +72,7 @@ class ViewMetrics:
     ssim_dynamic: float | None
     masked_psnr: float | None
     masked_ssim: float | None
+    masked_lpips: float | None
 
 
 @dataclass(frozen=True)
@@ -109,7 +115,7 @@ def evaluate(
     scene: Renderer,
     capture: Capture,
     lpips: Lpips | None = None,
-    on_view: Callable[[int, Frame, Float[Tensor, "H W 3"], Rendering], None] | None = None,
+    on_view: OnView | None = None,
     align: Callable[[Frame], Camera] | None = None,
     quiet: bool = False,
 ) -> Evaluation:
@@ -122,7 +128,7 @@ def evaluate(
         scene: The scene to render.
         capture: Where the frames come from.
         lpips: On the scene's device; LPIPS is not measured if None.
-        on_view: Called with the index, frame, ground truth in [0, 1] and rendering of each view.
+        on_view: Called with each view.
         align: The camera to render a frame through, on the scene's device; the frame's own if None.
         quiet: Whether to hide the progress bar.
     """
@@ -143,10 +149,10 @@ def evaluate(
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
-    def within(metric: Callable[..., float], region: Bool[Tensor, "H W"] | None) -> float | None:
+    def within(metric: Callable[..., float | Tensor], region: Bool[Tensor, "H W"] | None) -> float | None:
         if region is None or not bool(region.any()):
             return None
-        return metric(image, truth, region.to(image.device))
+        return _known(float(metric(image, truth, region.to(image.device))))
 
     static, covisible = frame.static_mask, frame.covisible
     dynamic = None if static is None else ~static
@@ -155,6 +161,7 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
         time=frame.camera.time,
         psnr=metrics.psnr(image, truth),
         ssim=metrics.ssim(image, truth),
+        ms_ssim=_known(metrics.ms_ssim(image, truth)),
         lpips=None if lpips is None else float(lpips(image, truth)),
         psnr_static=within(metrics.psnr, static),
         psnr_dynamic=within(metrics.psnr, dynamic),
@@ -162,7 +169,12 @@ def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) ->
         ssim_dynamic=within(metrics.ssim, dynamic),
         masked_psnr=within(metrics.psnr, covisible),
         masked_ssim=within(metrics.masked_ssim, covisible),
+        masked_lpips=None if lpips is None else within(lpips.masked, covisible),
     )
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _at_times(camera: Camera, cameras: Sequence[Camera], max_count: int) -> list[Camera]:

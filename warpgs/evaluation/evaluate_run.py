@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from warpgs import visualize
+from warpgs.config import NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.files import write_json, write_png
 from warpgs.progress import progress
@@ -17,7 +18,7 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.video.writer import Video
 
-from .evaluate import evaluate, write_views
+from .evaluate import OnView, evaluate, write_views
 from .lpips import find
 from .motion import jitter
 from .poses import alignment
@@ -32,7 +33,7 @@ VIDEO_FRAMES = 120
 def evaluate_run(
     folder: Path,
     capture: Capture | None = None,
-    lpips: Path | None = None,
+    lpips: tuple[Path | None, NetName | None] = (None, None),
     device: Device | None = None,
     quiet: bool = False,
 ) -> str:
@@ -41,7 +42,7 @@ def evaluate_run(
     Args:
         folder: Run folder.
         capture: Its capture, if it is open already.
-        lpips: Folder with the weights of LPIPS; the one of the config if None.
+        lpips: Folder with the weights of LPIPS, and its network; those of the config where None.
         device: Device to render on; CUDA if None and there is a GPU.
         quiet: Whether to hide progress bars.
 
@@ -53,22 +54,28 @@ def evaluate_run(
         OSError: If a file cannot be written.
     """
     run = Run.open(folder, device)
-    network = find(lpips or run.config.lpips)  # first, because opening a capture can take a minute
+    # First, because opening a capture can take a minute.
+    network = find(lpips[0] or run.config.lpips, lpips[1] or run.config.lpips_net)
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
-    chosen = set(evenly_spaced_indices(len(capture.val), NUM_IMAGES))
-
-    def save_image(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
-        if index in chosen:
-            write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
-
-    align = alignment(scene, capture.extent)
+    save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)
+
+
+def _image_writer(folder: Path, num_views: int) -> OnView:
+    """A function that saves some of the views as images."""
+    chosen = set(evenly_spaced_indices(num_views, NUM_IMAGES))
+
+    def save(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
+        if index in chosen:
+            write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
+
+    return save
 
 
 def _of_run(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
@@ -112,15 +119,17 @@ def _summary(values: dict[str, Any]) -> str:
     lpips = f"LPIPS ({values['lpips_net']}) {show('lpips', 4)}"
     if values["lpips_net"] is None:
         lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
+    similarity = f"SSIM {show('ssim', 4)}, MS-SSIM {show('ms_ssim', 4)}"
     lines = [
-        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, SSIM {show('ssim', 4)}, {lpips}",
+        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, {similarity}, {lpips}",
         f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, {motion}",
         last_line,
     ]
     if values["poses_aligned"]:
         lines.append("camera poses were corrected in training, so held-out cameras were aligned to the scene")
     if values["masked_psnr"] is not None:
-        lines.insert(1, f"co-visible: mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}")
+        masked = f"mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}"
+        lines.insert(1, f"co-visible: {masked}, mLPIPS {show('masked_lpips', 4)}")
     return "\n".join(lines)
 
 

@@ -12,6 +12,7 @@ from .evaluated_run import EvaluatedRun
 HIGHER = {
     "psnr",
     "ssim",
+    "ms_ssim",
     "psnr_static",
     "psnr_dynamic",
     "ssim_static",
@@ -20,19 +21,21 @@ HIGHER = {
     "masked_ssim",
     "fps",
 }
-LOWER = {"lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
+LOWER = {"lpips", "masked_lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
 """Metrics of which higher, or lower, values are better."""
 
 TITLES = {
     "psnr": "PSNR [dB]",
     "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
     "lpips": "LPIPS",
     "psnr_static": "PSNR, static region [dB]",
     "psnr_dynamic": "PSNR, dynamic region [dB]",
     "ssim_static": "SSIM, static region",
     "ssim_dynamic": "SSIM, dynamic region",
-    "masked_psnr": "PSNR, co-visible [dB]",
-    "masked_ssim": "SSIM, co-visible",
+    "masked_psnr": "mPSNR, co-visible [dB]",
+    "masked_ssim": "mSSIM, co-visible",
+    "masked_lpips": "mLPIPS, co-visible",
     "fps": "FPS",
     "lpips_net": "LPIPS network",
     "num_views": "views",
@@ -43,7 +46,7 @@ TITLES = {
 }
 """Titles of metrics; others keep their names in metrics.json."""
 
-UNRELATED = {"out", "resume", "preset", "lpips"}
+UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net"}
 """Settings that do not affect training."""
 
 Row = tuple[str, list[Any], list[str]]

@@ -32,6 +32,8 @@ class Sweep:
     """Downscaling factor of the images; the dataset's default if omitted."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS."""
+    lpips_net: Literal["vgg", "alex", "squeeze"] | None = None
+    """Network of LPIPS; vgg by default."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to train on; CUDA by default if there is a GPU."""
     per_gpu: int = 1

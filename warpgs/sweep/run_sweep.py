@@ -76,7 +76,7 @@ def _spec(options: Sweep) -> SweepSpec:
 
 def _overrides(options: Sweep) -> dict[str, Any]:
     lpips = None if options.lpips is None else str(options.lpips.resolve())
-    given = {"iterations": options.iterations, "factor": options.factor, "lpips": lpips}
+    given = {"iterations": options.iterations, "factor": options.factor, "lpips": lpips, "lpips_net": options.lpips_net}
     return {name: value for name, value in given.items() if value is not None}
 
 

@@ -28,11 +28,13 @@ class Metric(NamedTuple):
 METRICS = (
     Metric("psnr", "PSNR [dB]", "higher", 2),
     Metric("ssim", "SSIM", "higher", 4),
+    Metric("ms_ssim", "MS-SSIM", "higher", 4),
     Metric("lpips", "LPIPS", "lower", 4),
     Metric("psnr_static", "static [dB]", "higher", 2),
     Metric("psnr_dynamic", "dynamic [dB]", "higher", 2),
     Metric("masked_psnr", "mPSNR [dB]", "higher", 2),
     Metric("masked_ssim", "mSSIM", "higher", 4),
+    Metric("masked_lpips", "mLPIPS", "lower", 4),
     Metric("train_seconds", "time [min]", "lower", 1, 60.0),
     Metric("peak_bytes", "memory [GB]", "lower", 2, 1e9),
     Metric("num_gaussians", "Gaussians", "", 0),

@@ -138,13 +138,13 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     if config.resume is not None:
         saved = read_config(config.resume)
         run = Run(config.resume, dataclasses.replace(saved, device=choose_device(config.device or saved.device)))
-        locate(run.config.lpips)
+        locate(run.config.lpips, run.config.lpips_net)
         capture = check_capture(run.open_capture(quiet), run.config, log)
         trainer = Trainer(run.config, capture, run.folder)
         trainer.restore_newest(log)
         return trainer
     config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
-    locate(config.lpips)  # reports a wrong folder now, not after training
+    locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
     bands = fitted_bands(config.model, len(capture.train))
     if bands < config.model.time_bands:
