@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 MAX_VALUE = 10**15
 """Maximum of every number that has no smaller one."""
 
-
 NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
@@ -280,6 +279,8 @@ class TrainConfig:
     megasam; recognized from its files if omitted."""
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
+    vrig_factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
+    """The same for HyperNeRF's captures of two cameras (vrig) alone; Deformable-3DGS reads them at 4."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None

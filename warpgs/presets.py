@@ -6,6 +6,7 @@ from .config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedul
 
 PAPER = TrainConfig(
     preset="paper",
+    vrig_factor=4,
     model=ModelConfig(
         raw_input=False,
         skip=5,

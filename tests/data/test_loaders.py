@@ -1,5 +1,6 @@
 """Loaders read captures as the real datasets have them."""
 
+import dataclasses
 import json
 import shutil
 import tarfile
@@ -17,6 +18,8 @@ from warpgs.config import MaskPerturbation
 from warpgs.data import loaders
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import LOADERS, load_capture, recognize
+from warpgs.presets import PRESETS
+from warpgs.runs.run import open_capture
 
 DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
 
@@ -135,6 +138,35 @@ def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
     assert torch.equal(distorted.camera.K[:2, 2], pinhole.camera.K[:2, 2])
     assert distorted.static_mask.dtype == torch.bool
     assert not torch.equal(distorted.static_mask, pinhole.static_mask)
+
+
+def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
+    assert load_capture(iphone).metric_depth
+    assert not load_capture(write_capture(tmp_path / "other")).metric_depth
+    shutil.copy(iphone / "depth/2x/0_00000.npy", tmp_path / "kept.npy")
+    (iphone / "depth/2x/0_00000.npy").unlink()
+    captures.write_png(iphone / "depth/2x/0_00000.png", np.full((12, 20), 100, np.uint8))
+    assert not load_capture(iphone).metric_depth
+
+
+def test_captures_of_two_cameras_can_have_a_factor_of_their_own(hypernerf):
+    for path in (hypernerf / "rgb/2x").iterdir():
+        captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
+    sizes = {vrig: load_capture(hypernerf, vrig_factor=vrig).cameras["left_000000"].width for vrig in (None, 4)}
+    assert sizes == {None: SIZE[0] // 2, 4: SIZE[0] // 4}
+    assert load_capture(hypernerf, factor=2, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
+
+
+def test_captures_of_one_camera_keep_the_factor_of_the_dataset(hypernerf):
+    edit_json(hypernerf / "dataset.json", val_ids=[])
+    assert load_capture(hypernerf, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
+
+
+def test_the_preset_paper_reads_captures_of_two_cameras_at_a_quarter(hypernerf):
+    for path in (hypernerf / "rgb/2x").iterdir():
+        captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
+    config = dataclasses.replace(PRESETS["paper"], data=hypernerf)
+    assert open_capture(config).cameras["left_000000"].width == SIZE[0] // 4
 
 
 def test_iphone_depth_is_unknown_where_the_sensor_has_no_value_or_a_clamped_one(iphone):

@@ -258,6 +258,24 @@ def test_dynamic_gaussians_start_in_the_dynamic_region_at_the_aligned_depth():
     assert error(depth, torch.full_like(depth, DEPTH)) < 5e-3  # depth is stored in half precision
 
 
+def test_metric_depth_is_not_aligned():
+    points = points_around_the_block(torch.full((8,), 3.0)).repeat(3, 1)
+    capture = make_capture(points, inverse_depth=torch.full((HEIGHT, WIDTH), 0.25))
+    for metric, expected in ((False, [torch.nan, torch.nan]), (True, [1.0, 0.0])):  # one value: nothing to fit
+        capture.metric_depth = metric
+        found = initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30), smooth=True)
+        assert torch.equal(found.alignments.isnan(), torch.tensor([expected] * 3).isnan())
+        assert metric == torch.equal(found.alignments, torch.tensor([expected] * 3))
+    assert found.errors[:, 0].tolist() == pytest.approx([0.25] * 3)  # 3 m are 1 / 0.25 = 4 m in the files
+
+
+def test_metric_depth_that_is_unknown_is_not_used():
+    capture = make_capture(random_points(9), inverse_depth=torch.full((HEIGHT, WIDTH), torch.nan))
+    capture.metric_depth = True
+    found = initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30))
+    assert found.alignments.isnan().all()
+
+
 def test_dynamic_gaussians_have_the_colour_of_the_dynamic_region():
     gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT)
     colors = 0.5 + 0.28209479 * gaussians.sh_dc[:, 0]

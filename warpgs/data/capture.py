@@ -53,6 +53,7 @@ class Capture:
         point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
         cache_frames: Number of frames to keep in memory.
+        metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
         has_depth: Whether frames have the depth of the files; see ``without_depth``.
@@ -72,6 +73,7 @@ class Capture:
     read: Callable[[str], Frame]
     cache_frames: int = 256
     unmasked: Assumption = "masks"
+    metric_depth: bool = False
     assumption: Assumption = field(init=False)
     has_depth: bool = field(init=False, default=True)
     extent: float = field(init=False)

@@ -49,7 +49,8 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         root = builtin_folder(config.data, quiet)
     else:
         root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    return load_capture(root, config.dataset, factor=config.factor, perturbation=config.masks)
+    factor, vrig_factor = config.factor, config.vrig_factor
+    return load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
 
 
 def new_folder(config: TrainConfig, capture: Capture) -> Path:

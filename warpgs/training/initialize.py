@@ -16,7 +16,7 @@ from warpgs.rendering import render
 
 from .dynamic_points import max_scale, unproject_pixels
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
-from .views import Views
+from .views import View, Views
 
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views from which points without colours are coloured."""
@@ -110,7 +110,7 @@ class DepthAlignment(NamedTuple):
 
 @torch.no_grad()
 def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> DepthAlignment:
-    """Aligns each view's inverse depth to the sparse points.
+    """Aligns each view's inverse depth to the sparse points; metric depth stays as it is.
 
     Args:
         capture: The capture, with the points.
@@ -118,13 +118,14 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
         smooth: Whether to change the views' depth by a smooth factor as well, where that brings it nearer to points
             that were left out.
     """
+    smooth = smooth and not capture.metric_depth
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
     errors = torch.full((len(views), 2), torch.inf, device=views.device)
     points = capture.points.to(views.device)
     for index in range(len(views)):
         view = views[index]
         sources = (view.inverse_depth, view.static_mask, view.camera, points)
-        alignments[index] = depth_alignment.align_to_points(*sources)
+        alignments[index] = _alignment(view, capture)
         errors[index] = depth_alignment.relative_errors(*sources, alignments[index])
         if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
             factor, error = depth_alignment.smooth_factor(*sources, alignments[index])
@@ -132,6 +133,14 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
                 views.set_depth_factor(index, alignments[index], factor)
                 errors[index, 0] = error
     return DepthAlignment(alignments, errors)
+
+
+def _alignment(view: View, capture: Capture) -> Float[Tensor, "2"]:
+    """Scale and offset of a view's inverse depth; NaN where they cannot be determined."""
+    depth = view.inverse_depth
+    if capture.metric_depth:
+        return depth.new_tensor([1.0, 0.0] if bool(depth.isfinite().any()) else [torch.nan, torch.nan])
+    return depth_alignment.align_to_points(depth, view.static_mask, view.camera, capture.points.to(depth.device))
 
 
 @torch.no_grad()

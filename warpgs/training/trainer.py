@@ -122,7 +122,7 @@ class Trainer:
     def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Changes the alignment of depth and the sets of Gaussians as planned."""
         scene, sh_degree = self.scene, plan.phase.sh_degree
-        if plan.realign:
+        if plan.realign and not self.capture.metric_depth:
             # In place, because CUDA graphs read them.
             aligned = initialize.align_to_rendering(
                 self.alignments, self.views, scene, sh_degree, self.config.antialias

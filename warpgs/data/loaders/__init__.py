@@ -60,6 +60,7 @@ def load_capture(
     dataset: str | None = None,
     *,
     factor: int | None = None,
+    vrig_factor: int | None = None,
     perturbation: MaskPerturbation | None = None,
     cache_frames: int = 256,
 ) -> Capture:
@@ -69,6 +70,7 @@ def load_capture(
         root: Folder of the capture, or a built-in one (``data/builtin.py``).
         dataset: Key of ``LOADERS``; recognized from the files if None.
         factor: Downscaling factor of the images; the dataset's default if None.
+        vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.
         perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
         cache_frames: Number of frames to keep in memory.
 
@@ -83,6 +85,8 @@ def load_capture(
     check_perturbation(perturbation)
     root = builtin_folder(root) if is_builtin(root) else Path(root)
     loader = LOADERS[dataset or recognize(root)]
+    if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
+        factor = vrig_factor
     return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
 
 

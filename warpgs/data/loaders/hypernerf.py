@@ -3,13 +3,22 @@
 from pathlib import Path
 from typing import Any
 
-from .nerfies import NerfiesLoader, Split, read_ids
+from warpgs.files import read_json
+
+from .nerfies import LAYOUT, NerfiesLoader, Split, read_ids
 
 
 class HyperNerfLoader(NerfiesLoader):
     """Loads captures of HyperNeRF: factor 2, split by train_ids and val_ids, else by every fourth frame."""
 
     default_factor = 2
+
+    def is_vrig(self, root: Path) -> bool:
+        """Whether a capture is of two cameras, of which one trains and the other evaluates."""
+        path = root / "dataset.json"
+        dataset = read_json(path, LAYOUT)
+        train, val = read_ids(path, dataset, "train_ids"), read_ids(path, dataset, "val_ids")
+        return bool(val) and not set(train) & set(val)
 
     def recognizes(self, root: Path) -> bool:
         """Whether there are images of half the size."""
@@ -18,7 +27,7 @@ class HyperNerfLoader(NerfiesLoader):
     def split(self, root: Path, dataset: dict[str, Any], metadata: dict[str, Any]) -> Split:
         """train_ids and val_ids; of an interpolation capture every fourth frame and those halfway between them."""
         split = super().split(root, dataset, metadata)
-        if split.val and not set(split.train) & set(split.val):
+        if self.is_vrig(root):
             return split
         ids = read_ids(split.source, dataset, "ids") or split.train
         return Split(split.source, ids[::4], ids[2::4])

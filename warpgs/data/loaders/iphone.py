@@ -1,5 +1,6 @@
 """iPhone (DyCheck): one moving camera with a depth sensor, still cameras for evaluation."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,10 @@ class IPhoneLoader(NerfiesLoader):
         moving = [metadata_field(metadata, i, "camera_id") == 0 for i in ids]
         train, val = ([i for i, m in zip(ids, moving, strict=True) if m == trained] for trained in (True, False))
         return Split(split.source, train, val)
+
+    def has_metric_depth(self, paths: Iterable[Path]) -> bool:
+        """Whether all depth is that of the sensor (.npy), which has the units of the cameras."""
+        return all(path.suffix == ".npy" for path in paths)
 
     def inverse_depth(self, path: Path, size: tuple[int, int], units: SceneUnits) -> Float[np.ndarray, "H W"]:
         """Inverse of the sensor's z-depth (.npy), 0 = unknown [1 / scene units]; images hold inverse depth already."""

@@ -7,7 +7,7 @@ covisible/<factor>x/val/<id>.png.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,6 +62,10 @@ class NerfiesLoader(ABC):
         """Inverse depth of a file, resized to ``size`` (width, height); here the files hold inverse depth already."""
         return images.read_depth(path, size)
 
+    def has_metric_depth(self, paths: Iterable[Path]) -> bool:
+        """Whether the inverse depth of files has scene units and no offset."""
+        return False
+
     def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
         """Opens a capture; arguments and errors as for ``load_capture``."""
         dataset = read_json(root / "dataset.json", LAYOUT)
@@ -80,7 +84,18 @@ class NerfiesLoader(ABC):
             return self.inverse_depth(path, size, units)
 
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), perturbation, read_depth)
-        return Capture(root.resolve().name, cameras, split.train, split.val, points, colors, reader.read, cache_frames)
+        depths = [files[name].depth for name in split.train]
+        return Capture(
+            root.resolve().name,
+            cameras,
+            split.train,
+            split.val,
+            points,
+            colors,
+            reader.read,
+            cache_frames,
+            metric_depth=self.has_metric_depth(path for path in depths if path is not None),
+        )
 
 
 def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
