@@ -41,6 +41,21 @@ class Frame:
     covisible: Bool[Tensor, "H W"] | None = None
 
 
+@dataclass(frozen=True)
+class TakenFrame:
+    """A frame as it was taken, with the distortion of its lens.
+
+    Attributes:
+        frame: With [H, W] image and masks as they are in the files. Its camera is a pinhole that sees at least as much,
+            with the same focal length, so that its image is usually larger.
+        positions: [H, W, 2] column and row in the camera's image of what each pixel of the frame shows; centres of
+            pixels are at +0.5.
+    """
+
+    frame: Frame
+    positions: Float[Tensor, "H W 2"]
+
+
 @dataclass(eq=False)
 class Capture:
     """A capture in scene units: a position p of the files is (p − center) · scale.
@@ -54,6 +69,7 @@ class Capture:
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
         cache_frames: Number of frames to keep in memory.
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
+        read_taken: Reads a frame with the distortion of its lens; None if no lens of the capture distorts.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
         has_depth: Whether frames have the depth of the files; see ``without_depth``.
@@ -74,6 +90,7 @@ class Capture:
     cache_frames: int = 256
     unmasked: Assumption = "masks"
     metric_depth: bool = False
+    read_taken: Callable[[str], TakenFrame] | None = None
     assumption: Assumption = field(init=False)
     has_depth: bool = field(init=False, default=True)
     extent: float = field(init=False)

@@ -20,6 +20,8 @@ class Eval:
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
     lpips_net: Literal["vgg", "alex", "squeeze"] | None = None
     """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
+    as_taken: bool = False
+    """Compare frames as they were taken, with the distortion of their lens; by default they are undistorted first."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; by default CUDA if there is a GPU."""
     quiet: bool = False
@@ -29,4 +31,5 @@ class Eval:
         """Evaluates and prints a summary; raises as ``evaluate_run``."""
         from .evaluate_run import evaluate_run
 
-        print(evaluate_run(self.run_folder, lpips=(self.lpips, self.lpips_net), device=self.device, quiet=self.quiet))
+        weights = (self.lpips, self.lpips_net)
+        print(evaluate_run(self.run_folder, None, weights, self.device, self.quiet, self.as_taken))

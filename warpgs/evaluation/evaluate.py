@@ -6,21 +6,22 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Capture, Frame, TakenFrame
 from warpgs.files import write_text
 from warpgs.progress import progress
 from warpgs.rendering import Rendering
 
 from . import metrics
+from .distort import distort
 from .lpips import Lpips
 
 
@@ -41,6 +42,9 @@ class Renderer(Protocol):
 
 OnView = Callable[[int, Frame, Tensor, Rendering], None]
 """Receives the index, frame, [H, W, 3] ground truth in [0, 1] and rendering of a view."""
+
+Frames = Literal["as taken", "undistorted"]
+"""What renderings are compared with."""
 
 STATIC_ALPHA = 0.05
 """A pixel counts as static for the flicker score where the dynamic image's alpha is lower than this in both frames."""
@@ -86,12 +90,14 @@ class Evaluation:
             capture of a moving one, so changes that are real (shadows) count too.
         fps: Joint images per second, including everything that depends on time.
         lpips_net: Network of LPIPS; None when it was not measured.
+        frames: Whether frames were compared as they were taken, or undistorted, and so resampled, before.
     """
 
     views: list[ViewMetrics]
     flicker: float | None
     fps: float
     lpips_net: str | None
+    frames: Frames = "as taken"
 
     def summary(self) -> dict[str, Any]:
         """Means over the views that have a value; None where none has."""
@@ -101,6 +107,7 @@ class Evaluation:
             "flicker": self.flicker,
             "fps": self.fps,
             "lpips_net": self.lpips_net,
+            "frames": self.frames,
             "num_views": len(self.views),
         }
 
@@ -118,11 +125,11 @@ def evaluate(
     on_view: OnView | None = None,
     align: Callable[[Frame], Camera] | None = None,
     quiet: bool = False,
+    as_taken: bool = False,
 ) -> Evaluation:
     """Compares a scene with every evaluation frame of a capture.
 
-    For a capture without evaluation frames only flicker and frames per second are measured, through its training
-    cameras.
+    Without evaluation frames only flicker and frames per second are measured, through the training cameras.
 
     Args:
         scene: The scene to render.
@@ -131,21 +138,32 @@ def evaluate(
         on_view: Called with each view.
         align: The camera to render a frame through, on the scene's device; the frame's own if None.
         quiet: Whether to hide the progress bar.
+        as_taken: Whether to distort a wider rendering as the lens does instead of undistorting (resampling) frames.
     """
     device = scene.device
+    read_taken = capture.read_taken if as_taken else None
     views = []
     for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
         frame = capture.frame(name)
-        truth = frame.image.to(device).float() / 255.0
         camera = frame.camera.to(device) if align is None else align(frame)
-        rendering = scene.render(camera, branches=True)
+        if read_taken is None:
+            rendering = scene.render(camera, branches=True)
+        else:
+            frame, rendering = _as_taken(scene, read_taken(name), camera)
+        truth = frame.image.to(device).float() / 255.0
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
-    return Evaluation(
-        views, _flicker(scene, cameras, quiet), frame_rate(scene.play, cameras), lpips.net if lpips else None
-    )
+    frames: Frames = "as taken" if as_taken or capture.read_taken is None else "undistorted"
+    net, fps = lpips.net if lpips else None, frame_rate(scene.play, cameras)
+    return Evaluation(views, _flicker(scene, cameras, quiet), fps, net, frames)
+
+
+def _as_taken(scene: Renderer, taken: TakenFrame, camera: Camera) -> tuple[Frame, Rendering]:
+    """A frame as it was taken, and the scene from the pose of a camera as the frame's lens shows it."""
+    wide = replace(taken.frame.camera.to(scene.device), viewmat=camera.viewmat)
+    return taken.frame, distort(scene.render(wide, branches=True), taken.positions)
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:

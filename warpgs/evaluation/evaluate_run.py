@@ -36,6 +36,7 @@ def evaluate_run(
     lpips: tuple[Path | None, NetName | None] = (None, None),
     device: Device | None = None,
     quiet: bool = False,
+    as_taken: bool = False,
 ) -> str:
     """Evaluates the newest checkpoint of a run and writes the results into its folder.
 
@@ -45,6 +46,7 @@ def evaluate_run(
         lpips: Folder with the weights of LPIPS, and its network; those of the config where None.
         device: Device to render on; CUDA if None and there is a GPU.
         quiet: Whether to hide progress bars.
+        as_taken: Whether to compare frames with the distortion of their lens.
 
     Returns:
         A summary to print.
@@ -59,7 +61,7 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
-    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet)
+    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
     write_json(folder / "metrics.json", {**values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
@@ -127,6 +129,8 @@ def _summary(values: dict[str, Any]) -> str:
     ]
     if values["poses_aligned"]:
         lines.append("camera poses were corrected in training, so held-out cameras were aligned to the scene")
+    if values["frames"] == "undistorted":
+        lines.append("frames were undistorted, and so resampled; eval --as-taken compares them as they were taken")
     if values["masked_psnr"] is not None:
         masked = f"mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}"
         lines.insert(1, f"co-visible: {masked}, mLPIPS {show('masked_lpips', 4)}")

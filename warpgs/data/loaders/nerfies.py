@@ -20,10 +20,11 @@ from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Capture, Frame, TakenFrame
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
+from warpgs.data.taken import taken_frame, without_distortion
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import first_file, read_json
 
@@ -95,6 +96,7 @@ class NerfiesLoader(ABC):
             reader.read,
             cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
+            read_taken=None if all(lens.is_pinhole for lens in lenses.values()) else reader.read_taken,
         )
 
 
@@ -199,7 +201,13 @@ class _FrameReader:
     read_depth: Callable[[Path, tuple[int, int]], np.ndarray]
 
     def read(self, name: str) -> Frame:
-        files, lens, size = self.files[name], self.lenses[name], self.cameras[name].size
+        return self._read(name, self.lenses[name])
+
+    def read_taken(self, name: str) -> TakenFrame:
+        return taken_frame(self._read(name, without_distortion(self.lenses[name])), self.lenses[name])
+
+    def _read(self, name: str, lens: Lens) -> Frame:
+        files, size = self.files[name], self.cameras[name].size
 
         def optional(read: Callable[[Path, tuple[int, int]], np.ndarray], path: Path | None) -> np.ndarray | None:
             return None if path is None else undistort(read(path, size), lens)

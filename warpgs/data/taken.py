@@ -1,0 +1,57 @@
+"""Frames as they were taken, with the distortion of their lens, for an evaluation that resamples no ground truth."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from .capture import Frame, TakenFrame
+from .lens import MAX_ZOOM, Lens
+
+MARGIN = 2
+"""Pixels of the wide image around what the distorted image shows, for interpolation."""
+
+MAX_ERROR = 0.05
+"""Maximum distance between a pixel and the projection of its ray [px]."""
+
+
+def without_distortion(lens: Lens) -> Lens:
+    """The lens as if it did not distort, for which ``undistort`` leaves images as they are."""
+    return replace(lens, radial=(0.0, 0.0, 0.0), tangential=(0.0, 0.0))
+
+
+def taken_frame(frame: Frame, lens: Lens) -> TakenFrame:
+    """The frame with the wide camera.
+
+    Args:
+        frame: With image and masks as they are in the files.
+        lens: Of the frame.
+
+    Raises:
+        ValueError: If the distortion cannot be inverted.
+    """
+    K, (width, height), positions = _wide_pinhole(lens)
+    camera = replace(frame.camera, K=torch.tensor(K, dtype=torch.float32), width=width, height=height)
+    return TakenFrame(replace(frame, camera=camera), torch.tensor(positions, dtype=torch.float32))
+
+
+@lru_cache(maxsize=4)
+def _wide_pinhole(lens: Lens) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int], Float[np.ndarray, "H W 2"]]:
+    """K and (width, height) of the wide camera, and ``TakenFrame.positions``."""
+    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    coefficients = np.array([*lens.radial[:2], *lens.tangential, lens.radial[2]])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    pixels = np.stack([u, v], 2).reshape(-1, 1, 2)
+    positions = cv2.undistortImagePoints(pixels, K, coefficients, None, criteria).reshape(*u.shape, 2)
+    error = np.abs(lens.image((positions[..., 0] - cx) / fx, (positions[..., 1] - cy) / fy) - np.stack([u, v])).max()
+    if not error < MAX_ERROR or np.ptp(positions, (0, 1)).max() > MAX_ZOOM * max(lens.width, lens.height):
+        raise ValueError(f"the distortion cannot be inverted: {lens.radial}, {lens.tangential}")
+    corner = np.floor(positions.min((0, 1))) - MARGIN
+    width, height = (np.ceil(positions.max((0, 1))) + MARGIN - corner).astype(int).tolist()
+    K[:2, 2] -= corner
+    return K, (width, height), positions - corner
