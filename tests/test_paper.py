@@ -5,8 +5,11 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
+from tests import tiny
 from warpgs.presets import PRESETS
+from warpgs.runs import checkpoint
 
 PAPER = {
     "Visual Geometry Decomposition: Eq. 6": {
@@ -171,3 +174,24 @@ def test_the_documentation_names_files_that_exist():
     named = {path for row in cells if len(row) == 8 for path in re.findall(r"`([\w/]+\.py)`", row[2])}
     assert len(named) > 8
     assert not [path for path in named if not (root / path).is_file()]
+
+
+def test_training_with_the_preset_runs_through_all_stages(tmp_path):
+    """Small networks and few iterations; every switch of the method as in the preset."""
+    paper = PRESETS["paper"]
+    sizes = ("position_bands", "time_bands", "width", "max_static_points", "dynamic_points")
+    model = dataclasses.replace(paper.model, **{name: getattr(tiny.MODEL, name) for name in sizes})
+    schedule = dataclasses.replace(tiny.SCHEDULE, appearance_from=paper.schedule.appearance_from, warmup=0)
+    densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120, max_size=1.0)
+    small = {"device": "cpu", "model": model, "schedule": schedule, "densify": densify}
+    config = dataclasses.replace(paper, **small, checkpoint_every=22, keep_checkpoints=100)  # 22: before stage II
+    trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", config)
+    with tiny.in_haste():
+        assert tiny.train(trainer)
+    assert trainer.protocol.stage2.start == 22
+    before, after = (checkpoint.load(checkpoint.path_of(tmp_path / "run", at)).tensors for at in (22, tiny.LENGTH))
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh_dc", "sh_rest"):
+        assert torch.equal(before[f"scene.static.{name}"], after[f"scene.static.{name}"])
+        assert not torch.equal(before[f"scene.dynamic.{name}"], after[f"scene.dynamic.{name}"])
+    assert not torch.equal(before["scene.appearance.trunk.values"], after["scene.appearance.trunk.values"])
+    assert all(value.isfinite().all() for value in after.values())
