@@ -1,6 +1,7 @@
 """Points at which dynamic Gaussians start: pixels of what moves, unprojected."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -69,15 +70,14 @@ def unproject_pixels(
 ) -> DynamicPoints | None:
     """At most ``max_count`` random pixels of masks, unprojected by aligned depth.
 
-    Where depth is known at too few of them, they are put before the sparse points around them; none if no points are
-    seen there either.
+    Where it is known at too few of them, they are put before the sparse points around them, if any are seen.
 
     Args:
         capture: The capture, with the sparse points.
         views: Its training views.
         alignments: [T, 2] scale and offset of each view's inverse depth.
         mask_of: The pixels of a view.
-        max_count: Maximum number of points.
+        max_count: Most points.
         generator: CPU generator that chooses the pixels.
 
     Returns:
@@ -88,32 +88,47 @@ def unproject_pixels(
         return None
     fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num)
     points = capture.points.to(views.device)
+    known = partial(_metric_depth, alignments)
+    found = _unproject(views, mask_of, known, fraction, generator)
+    depth_known = len(found[0]) >= MIN_KNOWN_FRACTION * fraction * num
+    if not depth_known:
+        estimated = partial(_depth_before_points, points, mask_of, generator)
+        found = _unproject(views, mask_of, estimated, fraction, generator)
+    chosen = subsample(found[0], max_count, generator)
+    positions, colors, indices = (values[chosen] for values in found)
+    return DynamicPoints(positions, colors, indices, depth_known)
 
-    def unprojected(depth_known: bool) -> DynamicPoints:
-        parts = []
-        for index in range(len(views)):
-            view = views[index]
-            mask = mask_of(view)
-            if depth_known:
-                depth = depth_alignment.metric_depth(view.inverse_depth, alignments[index])
-            else:
-                depth = _depth_before_points(view, mask, points, generator)
-            if fraction < 1.0:
-                mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
-            positions, colors = unproject(depth, mask, view.image, view.camera)
-            parts.append((positions.cpu(), colors.cpu(), torch.full((len(positions),), index)))
-        positions, colors, indices = (torch.cat(values) for values in zip(*parts, strict=True))
-        return DynamicPoints(positions, colors, indices, depth_known)
 
-    found = unprojected(depth_known=True)
-    if len(found.positions) < MIN_KNOWN_FRACTION * fraction * num:
-        found = unprojected(depth_known=False)
-    chosen = subsample(found.positions, max_count, generator)
-    return DynamicPoints(found.positions[chosen], found.colors[chosen], found.views[chosen], found.depth_known)
+def _unproject(
+    views: Views,
+    mask_of: Callable[[View], Tensor],
+    depth_of: Callable[[int, View], Tensor],
+    fraction: float,
+    generator: torch.Generator,
+) -> tuple[Tensor, ...]:
+    """Positions, colours and views of a random fraction of the masks' pixels, on the CPU."""
+    parts = []
+    for index in range(len(views)):
+        view = views[index]
+        depth, mask = depth_of(index, view), mask_of(view)
+        if fraction < 1.0:
+            mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
+        positions, colors = unproject(depth, mask, view.image, view.camera)
+        parts.append((positions.cpu(), colors.cpu(), torch.full((len(positions),), index)))
+    return tuple(torch.cat(values) for values in zip(*parts, strict=True))
+
+
+def _metric_depth(alignments: Float[Tensor, "T 2"], index: int, view: View) -> Float[Tensor, "H W"]:
+    """Aligned depth of a view; NaN where unknown."""
+    return depth_alignment.metric_depth(view.inverse_depth, alignments[index])
 
 
 def _depth_before_points(
-    view: View, mask: Bool[Tensor, "H W"], points: Float[Tensor, "P 3"], generator: torch.Generator
+    points: Float[Tensor, "P 3"],
+    mask_of: Callable[[View], Tensor],
+    generator: torch.Generator,
+    index: int,
+    view: View,
 ) -> Float[Tensor, "H W"]:
     """Depth of each pixel of a mask just before the nearest of the points around it; NaN elsewhere.
 
@@ -124,7 +139,7 @@ def _depth_before_points(
     row, column, z, inside = view.camera.project(points)
     visible = inside.nonzero()[:, 0]
     visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]
-    pixels = mask.nonzero()
+    pixels = mask_of(view).nonzero()
     if len(visible) == 0:
         return depth
     positions = torch.stack([row[visible], column[visible]], 1).float()
