@@ -17,8 +17,9 @@ for the conic (A, B, C). Through t, with v_t: v_mean = Wᵀ v_t, and for the cam
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
 and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
 
-A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, touches
-the image and has a finite, invertible 2D covariance. Every test is phrased so that NaN fails it.
+A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, has an
+opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is
+phrased so that NaN fails it.
 """
 
 import math
@@ -119,7 +120,7 @@ def project_fwd(
 
     rotation = camera_rotation(viewmat)
     t = rotation * means[i] + camera_translation(viewmat)
-    if not (t[2] > near and wp.length_sq(quats[i]) > 0.0):
+    if not (t[2] > near and wp.isfinite(t[2]) and wp.length_sq(quats[i]) > 0.0):
         return
     fx = K[0, 0]
     fy = K[1, 1]
@@ -142,7 +143,7 @@ def project_fwd(
     opacity = opacities[i]
     if compensate != 0:
         opacity = opacity * wp.sqrt(det_sharp / det)
-    if not (opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and det > 0.0):
+    if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0 and det > 0.0):
         return
     reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
     radius_x = wp.ceil(reach * wp.sqrt(a))

@@ -3,8 +3,8 @@
     [x, y, a, b], [c, log2 opacity, 0, 0], [feature 0..3], [feature 4..7] …
 
 with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so that
-log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, or with a value that is not
-finite) has log2 opacity CULLED_LOG2_OPACITY.
+log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, with a value that is not finite,
+or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY, and its radii become 0.
 
 ``unpack`` is the backward pass: for each Gaussian, the backward pass of compositing leaves the gradients of its
 features and the moments of s = alpha v_alpha over its pixels, and
@@ -59,6 +59,13 @@ def gradient_stride(num_channels: int) -> int:
     return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
 
 
+@wp.func
+def length(x: float, y: float) -> float:
+    """As ``wp.length`` of (x, y), but finite where the squares would overflow; scaling by a power of two is exact."""
+    scale = wp.where(wp.max(wp.abs(x), wp.abs(y)) > 1.0e18, wp.static(1.0 / 2.0**64), 1.0)
+    return wp.length(wp.vec2(x * scale, y * scale)) / scale
+
+
 @wp.kernel(enable_backward=False)
 def pack(
     first: int,
@@ -74,7 +81,8 @@ def pack(
 ):
     """Writes the geometry part of the rows, one thread for each splat.
 
-    It also writes the input of the depth sort, a key and the splat's own index, and sets ``norms`` to zero.
+    It also writes the input of the depth sort, a key and the splat's own index, and sets ``norms`` to zero and the
+    radii of splats that are skipped.
     """
     i = first + wp.tid()
     mean = means2d[i]
@@ -89,7 +97,10 @@ def pack(
     key = CULLED_DEPTH
     row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
     row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
-    if visible and wp.isfinite(total):
+    if not (visible and wp.isfinite(total)):
+        if radius[0] != 0 or radius[1] != 0:
+            radii[i] = wp.vec2i(0, 0)
+    else:
         key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
         row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
         row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
@@ -104,7 +115,7 @@ def pack(
 def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
     """Kernel that writes the features of the rows, one thread for each splat; depth is an optional last channel.
 
-    A splat with a feature that is not finite is marked as culled.
+    A splat with a feature that is not finite is marked as culled, and its radii are set to 0.
     """
     num_channels = num_features + int(with_depth)
 
@@ -114,6 +125,7 @@ def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
         features: wp.array2d[float],
         depths: wp.array[float],
         rows: wp.array2d[wp.vec4],
+        radii: wp.array[wp.vec2i],
     ):
         i = first + wp.tid()
         total = float(0.0)
@@ -128,6 +140,7 @@ def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
         if not wp.isfinite(total):
             row_store(rows, i, 1, wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0))
+            radii[i] = wp.vec2i(0, 0)
 
     return pack_features
 
@@ -188,8 +201,8 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
             v_conics[i] = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
             v_opacities[i] = s[0] / opacities[i]
             norms[i] = wp.vec2(
-                wp.length(wp.vec2(v_mean[0] * half_width, v_mean[1] * half_height)),
-                wp.length(wp.vec2(s[6] * half_width, s[7] * half_height)),
+                length(v_mean[0] * half_width, v_mean[1] * half_height),
+                length(s[6] * half_width, s[7] * half_height),
             )
 
     return unpack

@@ -23,9 +23,9 @@ def changed(name, value) -> Splats:
     return dataclasses.replace(make_splats(), **{name: value})
 
 
-def odd(**values) -> Splats:
-    """The random scene with odd values in every fourth Gaussian."""
-    splats = make_splats()
+def odd(splats: Splats | None = None, **values) -> Splats:
+    """The random scene, or a given one, with odd values in every fourth Gaussian."""
+    splats = splats or make_splats()
     for name, value in values.items():
         tensor = getattr(splats, name).clone()
         tensor[ODD] = torch.as_tensor(value, dtype=tensor.dtype)
@@ -197,6 +197,38 @@ def test_a_colour_that_is_not_finite_leaves_the_image_unchanged(channel, value):
 )
 def test_an_invalid_gaussian_leaves_the_image_unchanged(values):
     assert torch.equal(render_image(odd(**values)), render_image(select(make_splats(), ~ODD)))
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"colors": float("nan")},
+        {"colors": [0.1, float("inf"), 0.2]},
+        {"colors": 3e38},
+        {"opacities": 1.5},
+        {"opacities": 1.0001, "scales": 0.02},
+        {"means": float("nan")},
+    ],
+    ids=str,
+)
+def test_radii_of_gaussians_that_are_skipped_are_zero(values, antialias):
+    settings = RenderSettings(antialias=antialias, statistics=True)
+    splats = odd(make_splats(channels=3), **values)
+    radii = render(splats, CAMERA, settings=settings).radii
+    expected = render(select(splats, ~ODD), CAMERA, settings=settings)
+    assert not radii[ODD].any()
+    assert torch.equal(radii[~ODD], expected.radii)
+
+
+@pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings(absgrad=True, branches=True, depth=True)])
+def test_gradient_norms_are_finite_at_very_large_colours(settings):
+    splats = as_leaves(odd(make_splats(channels=3), colors=1e19))
+    rendering = render(splats, CAMERA, settings=settings)
+    rendering.joint.image.sum().backward()
+    assert gradients(splats)["means"].abs().max() > 1e19
+    assert rendering.gradient_norms.isfinite().all()
+    assert rendering.gradient_norms.max() > 1e19
 
 
 def test_a_gaussian_exactly_at_the_camera_is_culled():

@@ -263,6 +263,13 @@ def test_invalid_splats_are_skipped(invalid):
     assert torch.equal(ours(bad).images[0], ours(without).images[0])
 
 
+def test_the_given_splats_are_left_unchanged():
+    means2d, conics, opacities, features, _, depths = make_inputs()
+    splats = Projection(means2d, conics, depths, opacities, torch.ones(40, 2, dtype=torch.int32))
+    composite(splats, torch.full_like(features, torch.nan), SIZE)
+    assert splats.radii.all()
+
+
 def test_the_default_background_is_black():
     inputs = make_inputs()
     plain = [*inputs[:4], None, inputs[5]]

@@ -96,14 +96,15 @@ def test_gradients_of_the_camera_equal_the_reference(antialias):
         assert relative_error(actual.grad, expected.grad) < 1e-5
 
 
-def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
+def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05, antialias=False):
     """The projection of a round Gaussian to a 64 × 64 image of a camera at the origin."""
     K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]])
     means, quats = torch.tensor([[x, 0.0, depth]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     geometry = Geometry(means, quats, torch.full((1, 3), scale), torch.tensor([opacity]))
-    return project(geometry, View(torch.eye(4), K, 64, 64))
+    return project(geometry, View(torch.eye(4), K, 64, 64), antialias=antialias)
 
 
+@pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize(
     "culled",
     [
@@ -120,9 +121,17 @@ def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05):
         {"scale": float("nan")},
     ],
 )
-def test_culled_gaussians_have_radius_zero_and_zero_values(culled):
-    assert one().radii.min() > 0
-    for value in one(**culled):
+def test_culled_gaussians_have_radius_zero_and_zero_values(culled, antialias):
+    assert one(antialias=antialias).radii.min() > 0
+    for value in one(**culled, antialias=antialias):
+        assert not value.any()
+
+
+def test_a_depth_that_overflows_is_culled():
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3e38
+    geometry = [torch.tensor([[0.0, 0.0, 3e38]]), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1)]
+    for value in project(Geometry(*geometry), View(viewmat, CAMERA.K, *CAMERA.size)):
         assert not value.any()
 
 

@@ -63,7 +63,18 @@ def test_a_splat_with_a_feature_that_is_not_finite_is_marked_as_culled(value):
     _, rows = pack(splats, features)
     culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
     assert culled[::3].all()
-    assert torch.equal(culled[1::3], splats.radii[1::3, 0] == 0)
+    assert torch.equal(culled[1::3], projected().radii[1::3, 0] == 0)
+    assert torch.equal(culled, splats.radii[:, 0] == 0)
+    assert torch.equal(culled, splats.radii[:, 1] == 0)
+
+
+def test_radii_of_splats_with_a_singular_conic_become_zero():
+    splats = projected()
+    splats.conics[::3] = 1.0
+    _, rows = pack(splats, random_features())
+    culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
+    assert culled[::3].all()
+    assert torch.equal(culled, splats.radii[:, 0] == 0)
 
 
 def random_gradient_rows(splats: Projection, pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int):
@@ -107,6 +118,17 @@ def test_gradients_are_summed_over_shards():
     shards = torch.rand(3, NUM, gradient_stride(5), generator=generator())
     ctx.backward([rows.packed], [shards])
     assert error(ctx.gradient(features), shards[:, :, :5].sum(0)) < 1e-6
+
+
+@pytest.mark.parametrize("exponent", [0, 60, 70, 100])
+def test_gradient_norms_do_not_overflow(exponent):
+    splats, features = projected(), random_features()
+    gradient_rows = torch.randn(1, NUM, gradient_stride(5), generator=generator())
+    expected, actual = pack(splats, features), pack(splats, features)
+    for (ctx, rows), scale in ((expected, 1.0), (actual, 2.0**exponent)):
+        ctx.backward([rows.packed], [gradient_rows * scale])
+    assert actual[1].gradient_norms.isfinite().all()
+    assert torch.equal(actual[1].gradient_norms, expected[1].gradient_norms * 2.0**exponent)
 
 
 @pytest.mark.parametrize("num", [0, 1])

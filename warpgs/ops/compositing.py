@@ -233,7 +233,7 @@ def composite(
 
     def op(ctx: OpContext, *tensors: Any) -> tuple[Tensor, ...]:
         means2d, conics, depths, opacities, features, background = tensors
-        projection = Projection(means2d, conics, depths, opacities, splats.radii)
+        projection = Projection(means2d, conics, depths, opacities, splats.radii.clone())  # packing writes to radii
         rows = Rows(ctx, projection, features.shape[1], False, size)
         tiles = record_tiles(ctx, rows, size, branch)
         rows.add_features(ctx, features)

@@ -15,7 +15,7 @@ class Rows:
 
     Args:
         ctx: Of the op that this is a part of.
-        splats: N projected Gaussians.
+        splats: N projected Gaussians. Radii of those that are skipped are set to 0.
         num_features: Number of features that will be added.
         with_depth: Whether depth is one more channel after the features.
         size: (width, height) of the image [px].
@@ -58,7 +58,7 @@ class Rows:
         """Packs [N, num_features] features, and depth if it is a channel, beside the geometry."""
         kernel = kernels.make_pack_features(self.num_features, self.with_depth)
         depths = self._splats.depths if self.with_depth else None
-        ctx.launch(kernel, len(features), features, depths, self.packed)
+        ctx.launch(kernel, len(features), features, depths, self.packed, self._splats.radii)
         ctx.outputs_written_in_backward.append(self.gradient_norms)
         ctx.on_backward(lambda ctx: self._backward(ctx, features))
 
