@@ -25,6 +25,10 @@ LN_2 = wp.constant(math.log(2.0))
 LOW_PASS = wp.constant(0.3)
 """Variance added to every projected covariance [px²], the footprint of a pixel; EWA splatting as in 3DGS."""
 
+FAR = wp.constant(1.0e10)
+"""Far plane: Gaussians at this depth or further are culled [scene units], as gsplat does by default. Products of depths
+stay finite."""
+
 FIELD_OF_VIEW_MARGIN = wp.constant(0.3)
 """The projection's Jacobian is evaluated at most this fraction of half the field of view outside the image. 3DGS uses
 1.3 times the half field of view; gsplat does the same relative to the principal point."""

@@ -17,8 +17,8 @@ for the conic (A, B, C). Through t, with v_t: v_mean = Wᵀ v_t, and for the cam
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
 and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
 
-A Gaussian is culled (radius 0, everything else 0) unless it is in front of the near plane, reaches ALPHA_MIN, has an
-opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is
+A Gaussian is culled (radius 0, everything else 0) unless it is between the near plane and FAR, reaches ALPHA_MIN, has
+an opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is
 phrased so that NaN fails it.
 """
 
@@ -26,7 +26,7 @@ import math
 
 import warp as wp
 
-from .constants import ALPHA_MIN, FIELD_OF_VIEW_MARGIN, LOW_PASS
+from .constants import ALPHA_MIN, FAR, FIELD_OF_VIEW_MARGIN, LOW_PASS
 from .covariance import scaled_rotation
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
 
@@ -120,7 +120,7 @@ def project_fwd(
 
     rotation = camera_rotation(viewmat)
     t = rotation * means[i] + camera_translation(viewmat)
-    if not (t[2] > near and wp.isfinite(t[2]) and wp.length_sq(quats[i]) > 0.0):
+    if not (t[2] > near and t[2] < FAR and wp.length_sq(quats[i]) > 0.0):
         return
     fx = K[0, 0]
     fy = K[1, 1]

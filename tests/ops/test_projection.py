@@ -135,6 +135,11 @@ def test_a_depth_that_overflows_is_culled():
         assert not value.any()
 
 
+def test_the_far_plane_is_at_1e10():
+    assert one(depth=9.99e9).radii.min() > 0
+    assert not one(depth=1e10).radii.any()
+
+
 def test_just_visible_opacity_and_depth_are_kept():
     assert one(opacity=1.0001 / 255).radii.min() > 0
     assert one(depth=0.0101, scale=1e-4).radii.min() > 0

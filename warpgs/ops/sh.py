@@ -58,9 +58,9 @@ def record_sh(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii:
 
 def _add_viewmat_gradient(ctx: OpContext, viewmat: Tensor, v_viewpoint: Float[Tensor, "3"]) -> None:
     """Adds what the viewpoint -Wᵀ translation passes on to the viewing matrix [W, translation]."""
-    v_viewmat = torch.zeros_like(viewmat)
-    v_viewmat[:3, :3] = -torch.outer(viewmat[:3, 3], v_viewpoint)
-    v_viewmat[:3, 3] = -viewmat[:3, :3] @ v_viewpoint
+    v_viewmat, finite = torch.zeros_like(viewmat), viewmat.nan_to_num(0.0, 0.0, 0.0)  # otherwise all are culled, v = 0
+    v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
+    v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
     ctx.add_gradient(viewmat, v_viewmat)
 
 
