@@ -26,8 +26,8 @@ LOW_PASS = wp.constant(0.3)
 """Variance added to every projected covariance [px²], the footprint of a pixel; EWA splatting as in 3DGS."""
 
 FAR = wp.constant(1.0e10)
-"""Far plane: Gaussians at this depth or further are culled [scene units], as gsplat does by default. Products of depths
-stay finite."""
+"""Gaussians at this distance from the camera or further are culled [scene units], so that products with positions stay
+finite; the far plane of gsplat."""
 
 FIELD_OF_VIEW_MARGIN = wp.constant(0.3)
 """The projection's Jacobian is evaluated at most this fraction of half the field of view outside the image. 3DGS uses

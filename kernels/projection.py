@@ -17,9 +17,9 @@ for the conic (A, B, C). Through t, with v_t: v_mean = Wᵀ v_t, and for the cam
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
 and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
 
-A Gaussian is culled (radius 0, everything else 0) unless it is between the near plane and FAR, reaches ALPHA_MIN, has
-an opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is
-phrased so that NaN fails it.
+A Gaussian is culled (radius 0, everything else 0) unless it is beyond the near plane, closer than FAR, reaches
+ALPHA_MIN, has an opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D
+covariance. Every test is phrased so that NaN fails it.
 """
 
 import math
@@ -120,7 +120,7 @@ def project_fwd(
 
     rotation = camera_rotation(viewmat)
     t = rotation * means[i] + camera_translation(viewmat)
-    if not (t[2] > near and t[2] < FAR and wp.length_sq(quats[i]) > 0.0):
+    if not (t[2] > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
         return
     fx = K[0, 0]
     fy = K[1, 1]

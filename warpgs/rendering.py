@@ -79,9 +79,9 @@ def render(
 ) -> Rendering:
     """Renders splats through a camera; differentiable, once, in the splats, the camera and the background.
 
-    Gaussians that are behind the near plane, 1e10 or more away, outside the image, fainter than 1/255 or that have an
-    opacity above 1, a parameter that is not finite or a zero quaternion are culled: they leave the image unchanged and
-    get zero gradients.
+    Gaussians that are behind the near plane, 1e10 or more from the camera, outside the image, fainter than 1/255 or
+    that have an opacity above 1, a parameter that is not finite or a zero quaternion are culled: they leave the image
+    unchanged and get zero gradients.
 
     Args:
         splats: N Gaussians; N may be 0.

@@ -135,9 +135,11 @@ def test_a_depth_that_overflows_is_culled():
         assert not value.any()
 
 
-def test_the_far_plane_is_at_1e10():
+def test_gaussians_are_culled_from_a_distance_of_1e10_on():
     assert one(depth=9.99e9).radii.min() > 0
     assert not one(depth=1e10).radii.any()
+    assert one(depth=7e9, x=-6.1e9, scale=1e9).radii.min() > 0
+    assert not one(depth=8e9, x=-7e9, scale=1e9).radii.any()
 
 
 def test_just_visible_opacity_and_depth_are_kept():

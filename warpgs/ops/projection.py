@@ -121,8 +121,8 @@ def project(
         antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
 
     Returns:
-        A ``Projection``. Gaussians that are behind the near plane, 1e10 or more away, outside the image, fainter than
-        1/255 or that have an opacity above 1 or a value that is not finite are culled.
+        A ``Projection``. Gaussians that are behind the near plane, 1e10 or more from the camera, outside the image,
+        fainter than 1/255 or that have an opacity above 1 or a value that is not finite are culled.
 
     Raises:
         ValueError: On a wrong shape, dtype, device or size.
