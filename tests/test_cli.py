@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from warpgs.cli import COMMANDS, TRAIN_OPTIONS, main
+from warpgs.cli import COMMANDS, TRAIN_OPTIONS, Command, main
 from warpgs.command_line import described, flags
 from warpgs.config import TrainConfig
 
@@ -126,3 +126,14 @@ def test_annotations_are_restored_after_help():
     with described(TrainConfig, ("data",)):
         assert TrainConfig.__annotations__ != before
     assert TrainConfig.__annotations__ == before
+
+
+@pytest.mark.parametrize("arguments", [["check", "capture"], ["train", "--data", "capture"], ["--version"]])
+def test_ctrl_c_during_imports_is_one_line_and_exit_code_130(arguments, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Command, "load", interrupted)
+    monkeypatch.setattr("importlib.import_module", interrupted)
+    assert main(arguments) == 130
+    assert capsys.readouterr().err == "warpgs: stopped\n"

@@ -3,13 +3,12 @@
 import contextlib
 import difflib
 import importlib
-import importlib.metadata
 import sys
 import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from .errors import FAILED, run_command, visible
+from .errors import FAILED, run_command, stoppable, visible
 
 
 class Command(NamedTuple):
@@ -52,6 +51,7 @@ TRAIN_OPTIONS = (
 """Options of ``train`` that --help shows; --help-all shows all."""
 
 
+@stoppable
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -60,7 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     if name == "--version" or rest == ["--version"]:
-        print(f"warpgs {importlib.metadata.version('warpgs')}")
+        from . import __version__
+
+        print(f"warpgs {__version__}")
         return 0
     if name.startswith("--tyro"):
         return _print_completion(arguments)
@@ -77,6 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(options.run)
 
 
+@stoppable
 def train(arguments: Sequence[str], prog: str) -> int:
     """``warpgs train`` and ``train.py``: trains, then evaluates; returns the exit code."""
     if "--version" in arguments:

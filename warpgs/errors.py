@@ -1,7 +1,11 @@
 """Errors of commands: one line on stderr and an exit code."""
 
+import functools
 import sys
 from collections.abc import Callable
+from typing import ParamSpec
+
+P = ParamSpec("P")
 
 FAILED = 2
 """Exit code after wrong options or input, or without enough memory."""
@@ -38,6 +42,20 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
         sys.stderr.write(f"{prog}: {out_of_memory(error)}; {advice}\n")
         return FAILED
     return code if type(code) is int else 0
+
+
+def stoppable(main: Callable[P, int]) -> Callable[P, int]:
+    """Ends a program's main function with one line after Ctrl-C also while it imports and reads its options."""
+
+    @functools.wraps(main)
+    def run(*args: P.args, **kwargs: P.kwargs) -> int:
+        try:
+            return main(*args, **kwargs)
+        except KeyboardInterrupt:
+            sys.stderr.write("warpgs: stopped\n")
+            return INTERRUPTED
+
+    return run
 
 
 def one_line(error: BaseException) -> str:
