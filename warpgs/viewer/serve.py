@@ -1,5 +1,7 @@
 """``warpgs view``: serves a run to browsers."""
 
+import atexit
+import gc
 import importlib.util
 import os
 import threading
@@ -43,7 +45,8 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
         host = f"[{options.host}]" if ":" in options.host else options.host
         report(f"{options.run_folder}: http://{host}:{viewer.port} (press Ctrl-C to stop)")
         _wait()
-        report("\nstopping")  # open connections take seconds to close
+        report("\nstopping")
+        atexit.register(gc.freeze)  # otherwise Python visits all objects at exit: with torch that takes a second
 
 
 def training_cameras(source: Source, warn: Callable[[str], None]) -> TrainingCameras | None:

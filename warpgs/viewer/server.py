@@ -4,6 +4,7 @@ import contextlib
 import io
 import socket
 import threading
+import time
 
 import viser
 
@@ -15,6 +16,9 @@ from .training_cameras import TrainingCameras
 
 LABEL = "warpgs"
 MAX_PORT = 65535
+STOP_SECONDS = 0.5
+"""Maximum time that the server may take to end [s]; what is left then are daemon threads."""
+
 CUDA_WIDTH, CPU_WIDTH = 1280, 640
 """Initial width of the images [px], by device."""
 
@@ -86,12 +90,16 @@ class Viewer:
         self.stop()
 
     def stop(self) -> None:
-        """Ends all sessions and the server."""
-        for session in self._remove_all():
+        """Ends all sessions and the server; waits ``STOP_SECONDS`` at most for images and for slow browsers."""
+        end = time.monotonic() + STOP_SECONDS
+        sessions = self._remove_all()
+        for session in sessions:
             session.stop()
-            session.join()
+        stop = threading.Thread(target=self._server.stop, daemon=True)  # waits seconds for connections to be closed
         with contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+            stop.start()
+            for join in (*(session.join for session in sessions), stop.join):
+                join(max(end - time.monotonic(), 0.0))
 
     def _remove_all(self) -> list[Session]:
         with self._lock:

@@ -98,8 +98,9 @@ class Session:
         self._stopped.set()
         self._wake.set()
 
-    def join(self) -> None:
-        self._thread.join()
+    def join(self, timeout: float | None = None) -> None:
+        """Waits for the thread, at most ``timeout`` seconds."""
+        self._thread.join(timeout)
 
     # Handlers of the controls -----------------------------------------------------------------------------------------
 
