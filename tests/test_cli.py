@@ -128,7 +128,7 @@ def test_annotations_are_restored_after_help():
     assert TrainConfig.__annotations__ == before
 
 
-@pytest.mark.parametrize("arguments", [["check", "capture"], ["train", "--data", "capture"], ["--version"]])
+@pytest.mark.parametrize("arguments", [["check", "capture"], ["train", "--data", "capture"]])
 def test_ctrl_c_during_imports_is_one_line_and_exit_code_130(arguments, capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt

@@ -60,9 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     if name == "--version" or rest == ["--version"]:
-        from . import __version__
+        from importlib.metadata import version  # slow to import
 
-        print(f"warpgs {__version__}")
+        print(f"warpgs {version('warpgs')}")
         return 0
     if name.startswith("--tyro"):
         return _print_completion(arguments)
