@@ -11,7 +11,7 @@ from warpgs.ops.covariance import covariance
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    "errors config presets files progress command_line",
+    "errors config presets files posix progress command_line",
     "kernels",
     "runtime",
     "ops",

@@ -166,7 +166,7 @@ def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_pa
 
 def test_the_command_prints_the_address(run, capsys, monkeypatch):
     monkeypatch.setattr(serve, "_wait", lambda: None)
-    monkeypatch.setattr(serve.os, "nice", lambda _: pytest.fail("lowered the priority without training"))
+    monkeypatch.setattr(serve, "lower_priority", lambda _: pytest.fail("lowered the priority without training"))
     assert main(["view", str(run), "--port", "0", "--device", "cpu"]) == 0
     assert f"{run}: http://127.0.0.1:" in capsys.readouterr().out
 
@@ -174,7 +174,7 @@ def test_the_command_prints_the_address(run, capsys, monkeypatch):
 def test_a_viewer_of_a_run_in_training_has_a_low_priority(run, monkeypatch):
     given = []
     monkeypatch.setattr(serve, "_wait", lambda: None)
-    monkeypatch.setattr(serve.os, "nice", given.append)
+    monkeypatch.setattr(serve, "lower_priority", given.append)
     View(run, port=0, while_training=True, device="cpu").run()
     assert given == [serve.NICENESS]
 

@@ -1,13 +1,9 @@
 """``warpgs train`` as a child of a Ray worker: ends with the worker, and stops on SIGINT."""
 
-import ctypes
-import os
-import signal
 import sys
 from collections.abc import Sequence
 
-PR_SET_PDEATHSIG = 1
-"""From <linux/prctl.h>: the signal that a process gets when its parent dies."""
+from warpgs.posix import end_with_parent, unblock_interrupts
 
 
 def main(arguments: Sequence[str], parent: int) -> int:
@@ -19,10 +15,9 @@ def main(arguments: Sequence[str], parent: int) -> int:
         arguments: Those of ``warpgs train``.
         parent: Process id of the worker.
     """
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before the line above
+    if not end_with_parent(parent):
         return 1
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray's workers block it, and children inherit that
+    unblock_interrupts()  # Ray's workers block them
     from warpgs.training.command import main as train
 
     return train(arguments, "warpgs train")

@@ -3,13 +3,13 @@
 import atexit
 import gc
 import importlib.util
-import os
 import threading
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 
 from warpgs.errors import one_line
+from warpgs.posix import lower_priority
 
 from .command import View
 from .source import Source, open_source
@@ -39,8 +39,8 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
     check_address(options.host, options.port)
     source = open_source(options.run_folder, options.device, options.while_training)
-    if options.while_training and source.device.type == "cpu" and hasattr(os, "nice"):
-        os.nice(NICENESS)
+    if options.while_training and source.device.type == "cpu":
+        lower_priority(NICENESS)
     with Viewer(source, training_cameras(source, warn), options.host, options.port) as viewer:
         host = f"[{options.host}]" if ":" in options.host else options.host
         report(f"{options.run_folder}: http://{host}:{viewer.port} (press Ctrl-C to stop)")

@@ -1,0 +1,49 @@
+"""Nothing outside of one module is of one operating system or of a newer Python than the oldest."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from warpgs import posix
+
+
+def findings(code: str, path: str) -> str:
+    """What the linter finds in a file of the package."""
+    command = [sys.executable, "-m", "ruff", "check", "--select", "TID251", "--stdin-filename", path, "-"]
+    return subprocess.run(command, input=code, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import fcntl\n",
+        "import os\n\nos.fork()\n",
+        "from os import nice\n\nnice(1)\n",
+        "import signal\n\nsignal.alarm(1)\n",
+        "import resource\n",
+    ],
+)
+def test_the_linter_refuses_calls_of_some_systems_outside_of_one_module(code):
+    assert "TID251" in findings(code, "warpgs/runs/new.py")
+    assert "TID251" not in findings(code, "warpgs/posix.py")
+
+
+@pytest.mark.parametrize(
+    "code", ["type X = int\n", "def f[T](x: T) -> T:\n    return x\n", "try:\n    pass\nexcept* OSError:\n    pass\n"]
+)
+def test_the_linter_refuses_syntax_that_python_3_10_does_not_have(code):
+    assert "Python 3.10" in findings(code, "warpgs/runs/new.py")
+
+
+def test_what_a_system_does_not_have_is_not_done(monkeypatch):
+    monkeypatch.delattr(os, "nice")
+    monkeypatch.delattr(signal, "pthread_sigmask")
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(posix.ctypes, "CDLL")
+    posix.lower_priority(10)
+    posix.unblock_interrupts()
+    assert posix.end_with_parent(os.getppid())
+    assert not posix.end_with_parent(-1)

@@ -1,0 +1,38 @@
+"""What only some operating systems can do, in one place; elsewhere these functions do nothing.
+
+The linter refuses such calls in all other modules.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+
+PR_SET_PDEATHSIG = 1
+"""From <linux/prctl.h>: the signal that a process gets when its parent dies."""
+
+
+def lower_priority(niceness: int) -> None:
+    """Lets other processes have the processor first; not on Windows."""
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+
+
+def end_with_parent(parent: int) -> bool:
+    """Lets this process be killed when its parent dies, on Linux.
+
+    Args:
+        parent: Process id of the parent.
+
+    Returns:
+        Whether the parent was still alive.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    return os.getppid() == parent
+
+
+def unblock_interrupts() -> None:
+    """Lets SIGINT arrive, which a child inherits blocked from a parent that blocks it; not on Windows."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
