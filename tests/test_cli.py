@@ -86,6 +86,8 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["export", "--\x1b[2J"], "warpgs export: there is no option --\\x1b[2J; "),
         (["export"], "warpgs export: missing: RUN Run folder. (required)"),
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
+        (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
+        (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
         (["train", "--preset", "x"], "warpgs train: argument --preset: invalid choice: 'x' (choose from "),
         (
             ["render", "r", "--layers", "x"],

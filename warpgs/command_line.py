@@ -28,6 +28,8 @@ Options = TypeVar("Options")
 METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH"}
 
 REWORDED = (
+    (r"invalid literal for int\(\) with base 10: (.*)", r"expected INT, got \1"),
+    (r"could not convert string to float: (.*)", r"expected FLOAT, got \1"),
     (r"^Missing from [^:]*: ", "missing: "),
     (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
 )
