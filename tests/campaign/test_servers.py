@@ -55,7 +55,8 @@ def request(k: int, port: int) -> bytes:
         template = template.replace(name, value)
     data = bytearray(template)
     for _ in range(0 if k < len(REQUESTS) else r.choice((1, 3))):
-        r.choice(CHANGES)(data, r)
+        if data:
+            r.choice(CHANGES)(data, r)
     return bytes(data)
 
 
