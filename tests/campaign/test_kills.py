@@ -1,58 +1,62 @@
 """A training that is killed at any time, again and again, ends in the same bits as one that is left alone."""
 
-import os
+import multiprocessing
 import random
 import signal
-import subprocess
 import sys
 import time
-from pathlib import Path
+from collections import Counter
 
 import pytest
 
 from tests import tiny
+from tests.campaign.training import train
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.runs import checkpoint
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-RUN_EVERY = 1000
-"""Inputs of the other campaigns per run that is killed again and again."""
+PER_KILL = 25
+"""Inputs of the other campaigns per kill, which takes longer."""
 
-TRAIN = """
-import sys
-from pathlib import Path
-from tests import tiny
-with tiny.in_haste():
-    trainer = tiny.trainer(Path(sys.argv[1]), Path(sys.argv[2]))
-    trainer.restore_newest(print)
-    print("ready", flush=True)
-    tiny.train(trainer)
-print("finished", flush=True)
-"""
+MIN_KILLS = 40
+"""Fewer do not reach all stages."""
+
+PART = 0.3
+"""A training lives for at most this part of its duration."""
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_training_killed_again_and_again_is_bit_identical(tmp_path, count):
-    if count < RUN_EVERY:
-        pytest.skip(f"takes minutes: --campaign {RUN_EVERY} kills one run, a multiple several")
+def test_trainings_that_are_killed_again_and_again_are_bit_identical(tmp_path, count):
+    if count < MIN_KILLS * PER_KILL:
+        pytest.skip(f"takes minutes: --campaign {MIN_KILLS * PER_KILL} kills {MIN_KILLS} times, more in proportion")
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["tests.campaign.training"])
     data = tiny.write(tmp_path / "cache")
-    tiny.train(tiny.trainer(data, tmp_path / "whole"))
-    killed = 0
-    for seed in range(count // RUN_EVERY):
-        r, finished = random.Random(seed), False
-        run = tmp_path / f"run{seed}"
-        command = [sys.executable, "-c", TRAIN, str(data), str(run)]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
-        while not finished:
-            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-                assert process.stdout is not None
-                ready = any(line == "ready\n" for line in iter(process.stdout.readline, ""))
-                assert ready
-                time.sleep(r.uniform(0.0, 1.5))
-                process.kill()
-                finished = "finished\n" in process.stdout.read()
-            killed += process.returncode == -signal.SIGKILL
-        assert tiny.differences(tiny.state(run), tiny.state(tmp_path / "whole")) == []
-        assert not list((run / checkpoint.FOLDER).glob("*.partial"))
-    assert killed > 0
+
+    def lives(run, seconds=None):
+        """Whether a training ends by itself within a time."""
+        process = processes.Process(target=train, args=(data, run))
+        process.start()
+        process.join(seconds)
+        process.kill()
+        process.join()
+        assert process.exitcode in (0, -signal.SIGKILL)
+        return process.exitcode == 0
+
+    assert lives(tmp_path / "first")  # starts the server and loads the kernels
+    start = time.monotonic()
+    assert lives(tmp_path / "whole")
+    duration = time.monotonic() - start
+    r, kills, stages, run = random.Random(count), 0, Counter[int](), 0
+    while kills < count // PER_KILL:
+        folder = tmp_path / f"run{run}"
+        while not lives(folder, r.uniform(0.0, PART * duration)):
+            kills += 1
+            saved = checkpoint.list_checkpoints(folder)
+            stages[checkpoint.load(saved[-1]).metadata.iteration if saved else -1] += 1
+        assert tiny.differences(tiny.state(folder), tiny.state(tmp_path / "whole")) == []
+        assert not list((folder / checkpoint.FOLDER).glob("*.partial"))
+        run += 1
+    sys.stdout.write(f"{kills} kills in {run} trainings; newest checkpoints then: {sorted(stages.items())}\n")
+    assert len(stages) > 3
