@@ -22,8 +22,8 @@ PER_KILL = 25
 MIN_KILLS = 40
 """Fewer do not reach all stages."""
 
-PART = 0.3
-"""A training lives for at most this part of its duration."""
+PART, LONGER = 0.3, 1.1
+"""A training lives for at most this part of its duration, and this factor longer after each kill: it always ends."""
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
@@ -50,9 +50,9 @@ def test_trainings_that_are_killed_again_and_again_are_bit_identical(tmp_path, c
     duration = time.monotonic() - start
     r, kills, stages, run = random.Random(count), 0, Counter[int](), 0
     while kills < count // PER_KILL:
-        folder = tmp_path / f"run{run}"
-        while not lives(folder, r.uniform(0.0, PART * duration)):
-            kills += 1
+        folder, limit = tmp_path / f"run{run}", PART * duration
+        while not lives(folder, r.uniform(0.0, limit)):
+            kills, limit = kills + 1, LONGER * limit
             saved = checkpoint.list_checkpoints(folder)
             stages[checkpoint.load(saved[-1]).metadata.iteration if saved else -1] += 1
         assert tiny.differences(tiny.state(folder), tiny.state(tmp_path / "whole")) == []
