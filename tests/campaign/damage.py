@@ -89,7 +89,7 @@ def bounded(what: str) -> Iterator[None]:
 
     start, memory = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(int(5 * MAX_SECONDS))  # real time, on a machine that may have other work
+    signal.alarm(int(10 * MAX_SECONDS))  # real time, on a machine that may have other work
     try:
         yield
     finally:

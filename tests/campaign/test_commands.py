@@ -17,6 +17,7 @@ from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs import cli
 from warpgs.command_line import flags
 from warpgs.errors import FAILED
+from warpgs.evaluation import evaluate_run
 from warpgs.export.writers import WRITERS
 from warpgs.runs import checkpoint
 from warpgs.viewer import serve
@@ -124,6 +125,7 @@ def end(arguments: list[str], capsys) -> tuple[int, str]:
 
 def test_commands_on_damaged_files_and_with_malformed_options(tmp_path, original, count, capsys, monkeypatch):
     monkeypatch.setattr(serve, "_wait", lambda: None)
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 4)  # launches are slow where annotations are checked
     codes = Counter[int]()
     for seed in range(count // PER_INPUT):
         r, damaged = random.Random(seed), None
