@@ -6,7 +6,9 @@ import math
 import os
 import re
 import reprlib
+import shutil
 import stat
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -66,6 +68,35 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink()
+
+
+@contextmanager
+def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Path]:
+    """A temporary folder to write to: renamed to ``folder`` on success, removed after any error or Ctrl-C.
+
+    Args:
+        folder: The folder, which does not exist or is empty.
+        keep_existing: Whether another process may make the same folder meanwhile, which is kept then.
+
+    Raises:
+        OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        beside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
+    except OSError as error:
+        raise OSError(f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
+    partial = beside / folder.name  # only its owner may open ``beside``
+    try:
+        partial.mkdir()
+        yield partial
+        try:
+            partial.rename(folder)
+        except OSError:
+            if not (keep_existing and folder.is_dir()):
+                raise
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def write_bytes(path: Path, parts: Iterable[bytes]) -> int:

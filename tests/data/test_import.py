@@ -76,8 +76,27 @@ def test_dnerf_says_that_everything_is_dynamic(tmp_path, capsys):
 
 @pytest.mark.parametrize("holdout", [-1, 1, 24])
 def test_an_impossible_holdout_is_refused(tmp_path, holdout):
-    with pytest.raises(ValueError, match="--holdout must be"):
+    with pytest.raises(ValueError, match=r"--holdout (must be|24 keeps none of 12)"):
         import_capture(layouts.write_megasam(tmp_path / "source"), tmp_path / "copy", holdout=holdout)
+
+
+def test_a_folder_of_the_user_beside_the_target_stays(tmp_path):
+    (tmp_path / "copy.partial").mkdir()
+    (tmp_path / "copy.partial/mine").write_text("mine")
+    import_capture(layouts.write_colmap(tmp_path / "source"), tmp_path / "copy")
+    assert {path.name for path in tmp_path.iterdir()} == {"source", "copy", "copy.partial"}
+    assert (tmp_path / "copy.partial/mine").read_text() == "mine"
+
+
+def test_a_target_that_fills_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+    def write(folder, *_):
+        (tmp_path / "copy").mkdir()
+        (tmp_path / "copy/mine").write_text("mine")
+
+    monkeypatch.setattr("warpgs.data.import_capture._write_index", write)
+    with pytest.raises(OSError, match="copy"):
+        import_capture(layouts.write_colmap(tmp_path / "source"), tmp_path / "copy")
+    assert [path.name for path in (tmp_path / "copy").iterdir()] == ["mine"]
 
 
 def test_a_source_with_a_damaged_frame_leaves_nothing_behind(tmp_path):

@@ -1,19 +1,18 @@
 """Copies a capture of any layout into the own one, undistorted and in scene units."""
 
-import shutil
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
+from warpgs.files import complete_or_absent
 from warpgs.progress import progress
 
 from . import writer
 from .capture import Capture, Frame
 from .lens import Lens
 from .loaders import load_capture, recognize
-from .units import SceneUnits
+from .units import SceneUnits, depth_range
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks that are written."""
@@ -52,8 +51,8 @@ def import_capture(
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture = load_capture(source, dataset, factor=factor, cache_frames=2)
     names = sorted((*capture.train, *capture.val), key=lambda name: (capture.cameras[name].time, name))
-    val = list(capture.val) if holdout is None else _held_out(names, holdout)
-    with _complete_or_absent(target) as folder:
+    val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
+    with complete_or_absent(target) as folder:
         counts = _write_frames(folder, capture, progress(names, "importing", log is None))
         _write_index(folder, capture, names, val)
     if log is not None:
@@ -64,12 +63,6 @@ def import_capture(
         if capture.assumption == "dynamic":
             log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
         log(f"{target} is finished: next run warpgs check {target}")
-
-
-def _held_out(names: list[str], holdout: int) -> list[str]:
-    if holdout < 0 or holdout == 1 or holdout // 2 >= len(names):
-        raise ValueError(f"--holdout must be 0 (none) or at least 2 for {len(names)} frames, got {holdout}")
-    return names[holdout // 2 :: holdout] if holdout else []
 
 
 def _write_frames(folder: Path, capture: Capture, names: Iterable[str]) -> tuple[int, int]:
@@ -100,7 +93,7 @@ def _write_view(folder: Path, frame: Frame) -> None:
 def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str]) -> None:
     points = capture.points.double().numpy()
     colors = None if capture.point_colors is None else capture.point_colors.numpy()
-    near, far = _depth_range(capture)
+    near, far = depth_range(_depths(capture))
     writer.write_scene(folder, SceneUnits(np.zeros(3), 1.0), points, near, far, colors)
     times = [capture.cameras[name].time for name in names]
     steps = dict(zip(names, time_steps(times), strict=True))
@@ -109,15 +102,10 @@ def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str
     writer.write_index(folder, steps, val, other_camera)
 
 
-def _depth_range(capture: Capture) -> tuple[float, float]:
-    """Near and far that contain nearly all points with a margin [scene units]."""
+def _depths(capture: Capture) -> np.ndarray:
+    """Depths of the points in at most 40 training cameras [scene units]."""
     cameras = [capture.cameras[name] for name in capture.train[:: max(1, len(capture.train) // 20)]]
-    depths = np.concatenate([camera.project(capture.points)[2].numpy() for camera in cameras])
-    depths = depths[depths > 0]
-    if len(depths) == 0:
-        return 0.01, 10.0
-    near, far = np.quantile(depths, [0.001, 0.999]).tolist()
-    return 0.5 * near, 2.0 * far
+    return np.concatenate([camera.project(capture.points)[2].numpy() for camera in cameras])
 
 
 def time_steps(times: list[float]) -> list[int]:
@@ -131,18 +119,3 @@ def time_steps(times: list[float]) -> list[int]:
     fewest = round(1.0 / smallest) if smallest > 1.0 / MAX_STEPS else MAX_STEPS
     exact = np.abs(relative * fewest - (relative * fewest).round()).max() < 0.01
     return (relative * (fewest if exact else MAX_STEPS)).round().astype(int).tolist()
-
-
-@contextmanager
-def _complete_or_absent(target: Path) -> Iterator[Path]:
-    """A folder beside the target, renamed to it on success and removed after any error or Ctrl-C."""
-    partial = target.with_name(f"{target.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        if target.exists():
-            target.rmdir()
-        partial.rename(target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

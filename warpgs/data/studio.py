@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.files import complete_or_absent
 from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 
@@ -30,7 +31,7 @@ from .bodies import Body, as_tensors, euler, even_samples
 from .degraded_depth import DegradedDepth
 from .images import decode
 from .lens import Lens
-from .synthetic import complete_or_absent, content_folder
+from .synthetic import content_folder
 from .units import SceneUnits
 
 Depth = Literal["exact", "network", "none"]
@@ -226,13 +227,13 @@ def studio_capture(
     root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
     exact = root / "studio"
     if not exact.is_dir():
-        with complete_or_absent(exact) as partial:
+        with complete_or_absent(exact, keep_existing=True) as partial:
             write_studio(partial, size, quiet)
     if depth == "exact":
         return exact
     folder = root / f"studio-depth-{depth}"
     if not folder.is_dir():
-        with complete_or_absent(folder) as partial:
+        with complete_or_absent(folder, keep_existing=True) as partial:
             shutil.copytree(exact, partial, ignore=shutil.ignore_patterns("depth"), dirs_exist_ok=True)
             if depth == "network":
                 _write_degraded(exact, partial)

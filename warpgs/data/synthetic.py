@@ -11,8 +11,6 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.files import complete_or_absent
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 
@@ -211,7 +210,7 @@ def builtin_capture(
     scene = scene or BuiltinScene()
     folder = content_folder(cache_dir, [VERSION, asdict(scene)]) / "builtin"
     if not folder.is_dir():
-        with complete_or_absent(folder) as partial:
+        with complete_or_absent(folder, keep_existing=True) as partial:
             write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet)
     return folder
 
@@ -242,22 +241,3 @@ def cache_folder() -> Path:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     sys.stderr.write(f"warpgs: no cache for the built-in scene ({reason}): it is made anew; set XDG_CACHE_HOME\n")
     return folder
-
-
-@contextmanager
-def complete_or_absent(folder: Path) -> Iterator[Path]:
-    """A temporary folder, renamed to ``folder`` on success and removed after any error."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(dir=folder.parent, prefix="partial-"))
-    except OSError as error:
-        raise OSError(f"the built-in scene cannot be kept in {folder.parent}: {error.strerror}") from error
-    try:
-        yield partial
-        try:
-            partial.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # another process may have created the same folder in the meantime
-                raise
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -40,6 +40,9 @@ class SceneUnits:
         return scene
 
 
+DEFAULT_RANGE = (0.01, 10.0)
+"""Near and far of a capture without points [scene units]."""
+
 OUTLIER_FRACTION = 0.02
 """Fraction of the points at each end of each axis that does not count for the extent of the scene."""
 
@@ -54,6 +57,19 @@ def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 
     low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
     return SceneUnits((low + high) / 2.0, float(2.0 / max((high - low).max(), MIN_SIZE)))
+
+
+def depth_range(depths: Float[np.ndarray, " D"]) -> tuple[float, float]:
+    """Near and far for scene.json, which contain nearly all depths with a margin.
+
+    Args:
+        depths: [D] depths of points along the cameras' axes [scene units]; those behind a camera do not count.
+    """
+    depths = depths[depths > 0]
+    if len(depths) == 0:
+        return DEFAULT_RANGE
+    near, far = np.quantile(depths, [0.001, 0.999]).tolist()
+    return 0.5 * near, 2.0 * far
 
 
 def read_units(path: Path) -> SceneUnits:

@@ -136,6 +136,32 @@ def write_points(root: Path, points: Float[np.ndarray, "P 3"], colors: UInt8[np.
         write_array(root / "point_colors.npy", colors)
 
 
+def held_out(names: Sequence[str], holdout: int) -> list[str]:
+    """The frames kept for evaluation: every N-th, from the middle of the first N on.
+
+    Args:
+        names: All frames, in temporal order.
+        holdout: N, or 0 for none.
+
+    Raises:
+        ValueError: If N is negative or 1, or keeps none of the frames.
+    """
+    check_holdout(holdout)
+    if holdout // 2 >= len(names):
+        raise ValueError(f"--holdout {holdout} keeps none of {len(names)} frames for evaluation")
+    return list(names[holdout // 2 :: holdout]) if holdout else []
+
+
+def check_holdout(holdout: int) -> None:
+    """Checks that every N-th frame can be kept for evaluation.
+
+    Raises:
+        ValueError: If N is negative or 1.
+    """
+    if holdout < 0 or holdout == 1:
+        raise ValueError(f"--holdout must be 0 (none) or at least 2, got {holdout}")
+
+
 def write_index(
     root: Path, time_ids: Mapping[str, int], val: Collection[str] = (), camera_ids: Mapping[str, int] | None = None
 ) -> None:

@@ -3,11 +3,12 @@
 import math
 from pathlib import Path
 
+from warpgs.data.writer import check_holdout, held_out
+
 from .depth import DEPTHS
 from .frames import check_selection
 from .masks import MASKERS
 from .options import Options
-from .scene import held_out
 from .weights import find_weights
 
 MIN_FOR_MOTION = 10
@@ -24,8 +25,7 @@ def check_options(source: Path, root: Path, options: Options) -> None:
     check_selection(options.selection)
     if options.focal is not None and not 0.0 < options.focal < math.inf:
         raise ValueError(f"--focal must be positive, got {options.focal}")
-    if options.holdout < 0 or options.holdout == 1:
-        raise ValueError(f"--holdout must be 0 (none) or at least 2, got {options.holdout}")
+    check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
         raise ValueError(f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder")
     if options.depth not in DEPTHS:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, UInt8
 
 from warpgs.data import writer
 from warpgs.data.lens import undistort
-from warpgs.data.units import scene_units
+from warpgs.data.units import depth_range, scene_units
 from warpgs.files import write_png
 from warpgs.progress import progress
 
@@ -58,7 +58,7 @@ def write_capture(
     """
     dynamic = masks.read_dynamic(cameras)
     cameras = _with_static_points(cameras, dynamic)
-    held_out(cameras.names, holdout)  # fails before anything is written
+    writer.held_out(cameras.names, holdout)  # fails before anything is written
     omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
     if omitted:
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
@@ -70,17 +70,6 @@ def write_capture(
     painted = [overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)]
     write_png(root / "masks.png", contact_sheet(painted, [cameras.names[k] for k in shown]))
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
-
-
-def held_out(names: Sequence[str], holdout: int) -> list[str]:
-    """The frames kept for evaluation: every N-th.
-
-    Raises:
-        ValueError: If there are none, although ``holdout`` is not 0.
-    """
-    if holdout // 2 >= len(names):
-        raise ValueError(f"--holdout {holdout} keeps none of {len(names)} frames for evaluation")
-    return list(names[holdout // 2 :: holdout]) if holdout else []
 
 
 def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
@@ -166,8 +155,7 @@ def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: in
     """
     units, poses = scene_units(cameras.points, cameras.centers), cameras.poses
     depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
-    near, far = np.quantile(depths[depths > 0], [0.001, 0.999]) * units.scale
-    writer.write_scene(root, units, cameras.points, 0.5 * near, 2.0 * far)
+    writer.write_scene(root, units, cameras.points, *depth_range(depths * units.scale))
     first = times[cameras.names[0]]
     time_ids = {name: times[name] - first for name in cameras.names}
-    writer.write_index(root, time_ids, held_out(cameras.names, holdout))
+    writer.write_index(root, time_ids, writer.held_out(cameras.names, holdout))
