@@ -30,6 +30,7 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
+    "sample": Command(".prepare.command:Sample", "write a short video to try prepare on"),
     "prepare": Command(".prepare.command:Prepare", "make a capture from a video or a folder of frames"),
     "import": Command(".data.command:Import", "copy a capture of any layout into the layout of prepare"),
     "check": Command(".data.command:Check", "check whether a capture is fit to train on"),

@@ -1,4 +1,4 @@
-"""The command ``warpgs prepare``."""
+"""The commands ``warpgs prepare`` and ``warpgs sample``."""
 
 import signal
 from collections.abc import Iterator
@@ -88,6 +88,23 @@ class Prepare:
                 raise ValueError(
                     f"--{field.name.replace('_', '-')} cannot be used with --add, which keeps the frames and cameras"
                 )
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Writes a short ray-traced video, as a hand-held camera records it, to try ``warpgs prepare`` on."""
+
+    video: Annotated[Path, tyro.conf.arg(metavar="VIDEO"), tyro.conf.Positional]
+    """File to write, such as sample.mp4."""
+    quiet: bool = False
+    """Print errors only."""
+
+    def run(self) -> None:
+        from .sample import write_sample  # imports torch and Warp
+
+        write_sample(self.video, quiet=self.quiet)
+        if not self.quiet:
+            print(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")
 
 
 @contextmanager
