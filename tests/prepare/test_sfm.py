@@ -109,6 +109,15 @@ def test_frames_that_see_the_same_points_much_later_are_matched():
     assert all(abs(min(a, 49 - a) - min(b, 49 - b)) <= 10 for a, b in pairs)
 
 
+def test_frames_that_see_too_few_points_lose_their_camera():
+    seen = {1: (True, 30), 2: (True, 29), 3: (False, 0), 4: (True, 500)}
+    images = {k: SimpleNamespace(frame_id=10 + k, has_pose=p, num_points3D=n) for k, (p, n) in seen.items()}
+    removed: list[int] = []
+    model = SimpleNamespace(images=images, deregister_frame=removed.append)
+    assert colmap._supported(model) is model
+    assert removed == [12]
+
+
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
     """A camera that pans over a picture."""
