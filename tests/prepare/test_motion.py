@@ -1,5 +1,6 @@
 """Optical flow, triangulation, masks and depth of a video with known cameras."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,8 +12,10 @@ from warpgs.prepare.flow import Flows
 from warpgs.prepare.flow_depth import static_depth
 from warpgs.prepare.images import brighten
 from warpgs.prepare.methods import DepthMethod
-from warpgs.prepare.motion_masks import clean, find_dynamic, outline, vote
+from warpgs.prepare.motion_masks import clean, find_dynamic, gather, outline, vote
 from warpgs.prepare.posed_frames import PosedFrames
+from warpgs.prepare.revisits import Evidence
+from warpgs.prepare.segments import Graph, Segments
 from warpgs.prepare.triangulation import Observation, fill_unknown, triangulate
 
 
@@ -143,6 +146,38 @@ def test_the_moving_board_is_masked(video, frames):
     overlaps = [(a & b).sum() / (a | b).sum() for a, b in zip(found, truth, strict=True)]
     assert np.mean(overlaps) > 0.7
     assert np.mean([(found[k] & ~truth[k]).mean() for k in range(24)]) < 0.03
+
+
+def test_a_dynamic_colour_does_not_outvote_proof_that_a_surface_is_static():
+    """Red moves; red that far frames confirm is static, as is grey; red of which nothing is known moves, too."""
+    red, grey, size = [200.0, 200.0, 128.0], [100.0, 128.0, 128.0], np.full(63, 2000.0)
+    segments = Segments(
+        labels=np.arange(63)[None, :].repeat(4, 0),
+        sizes=size,
+        colors=np.array([*[red] * 6, red, grey, red] * 7),
+        log_inverse_depth=np.arange(63.0),  # so no neighbour counts
+        static=size * np.array([*[0.0] * 6, 0.1, 0.5, 0.0] * 7),
+        dynamic=size * np.array([*[0.9] * 6, 0.0, 0.0, 0.0] * 7),
+    )
+    (probability,) = Graph([segments], []).dynamic_probabilities()
+    *moving, confirmed, other, unknown = probability[0].reshape(7, 9).T
+    assert np.min(moving) > 0.85
+    assert confirmed.max() < 0.4
+    assert other.max() < 0.1
+    assert unknown.min() > 0.6
+
+
+def test_where_no_far_frame_looks_the_neighbours_prove_a_surface_static(video):
+    lab = cv2.cvtColor(video[0][0], cv2.COLOR_RGB2LAB)
+    shape = lab.shape[:2]
+    residual = np.full(shape, 0.1, np.float32)
+    residual[:, 128:] = 3.0
+    nothing = np.zeros(shape, np.float32)
+    found = gather(lab, Evidence(residual, nothing, np.zeros(shape, np.uint8), np.ones(shape, np.float32)))
+    static = (found.static / found.sizes)[found.labels]
+    assert static[:, :110].mean() > 0.2
+    assert static[:, 160:].max() == pytest.approx(0.0, abs=1e-6)
+    assert not found.dynamic.any()
 
 
 def test_nothing_is_masked_where_nothing_moves():

@@ -44,6 +44,9 @@ PRIOR = 0.02
 COLOR_TRUST = 0.05
 """Evidence of colour per pixel and unit of log odds."""
 
+MIN_EVIDENCE = 0.05
+"""Evidence per pixel that a superpixel is static, at which a dynamic colour counts half."""
+
 MAX_LOG_ODDS = 2.5
 
 NUM_COLOR_ROUNDS = 2
@@ -172,9 +175,12 @@ class Graph:
         """[H, W] probability in [0, 1] that each frame's pixels are dynamic."""
         x = self._solve(np.zeros_like(self._sizes), np.zeros_like(self._sizes))
         cells = self._cells()
+        # Agreement with far frames proves that a surface is static; its absence has other causes than motion, too. So
+        # colour may outvote evidence of motion, but not evidence that a superpixel is static.
+        unproven = MIN_EVIDENCE * self._sizes / (self._static + MIN_EVIDENCE * self._sizes)
         for _ in range(NUM_COLOR_ROUNDS):
-            odds = self._log_odds(cells, x)
-            x = self._solve(*(COLOR_TRUST * self._sizes * np.maximum(o, 0.0) for o in (-odds, odds)))
+            odds = COLOR_TRUST * self._sizes * self._log_odds(cells, x)
+            x = self._solve(np.maximum(-odds, 0.0), np.maximum(odds, 0.0) * unproven)
         return [x[start + frame.labels] for start, frame in zip(self.starts, self.frames, strict=False)]
 
     def _solve(self, more_static: np.ndarray, more_dynamic: np.ndarray) -> np.ndarray:
