@@ -8,7 +8,6 @@ from pathlib import Path
 
 import warpgs
 from warpgs.files import write_png
-from warpgs.runs.run import open_capture
 from warpgs.visualize import to_bytes
 
 
@@ -21,8 +20,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("time.png"), help="file to write (default: time.png)")
     options = parser.parse_args()
     scene = warpgs.open_run(options.run)
-    capture = open_capture(scene.config)
-    camera = capture.cameras[capture.train[options.view]].to(scene.device)
+    capture = scene.open_capture()
+    camera = capture.cameras[capture.train[options.view]]
     rendering = scene.render(camera, options.time, branches=True)  # .joint, .static and .dynamic
     write_png(options.out, to_bytes(rendering.joint.image))
     print(f"{options.out}: time {options.time}, {camera.width}×{camera.height}")

@@ -4,7 +4,7 @@
 
     scene = warpgs.open_run("runs/builtin-quick")       # a trained scene
     capture = warpgs.load_capture("nerfds/as")          # cameras, images, masks, depth
-    camera = capture.cameras[capture.train[0]].to(scene.device)
+    camera = capture.cameras[capture.train[0]]
     image = scene.render(camera, time=0.5).joint.image  # [H, W, 3]
 
 Nothing heavy is imported before a name is first used.
@@ -26,14 +26,26 @@ if TYPE_CHECKING:
     from .model.splats import Splats
     from .rendering import render
     from .runs.run import open_run
+    from .training.callbacks import Progress
     from .training.train import train
 
     __version__: str
 
-__all__ = ["Camera", "RenderSettings", "Splats", "__version__", "load_capture", "open_run", "render", "train"]
+__all__ = [
+    "Camera",
+    "Progress",
+    "RenderSettings",
+    "Splats",
+    "__version__",
+    "load_capture",
+    "open_run",
+    "render",
+    "train",
+]
 
 _HOMES = {
     "Camera": "cameras",
+    "Progress": "training.callbacks",
     "RenderSettings": "config",
     "Splats": "model.splats",
     "load_capture": "data.loaders",

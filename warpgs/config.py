@@ -284,7 +284,7 @@ class TrainConfig:
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
-    """Run folder to continue from its newest checkpoint."""
+    """Run folder to continue from its newest checkpoint; a larger --iterations extends it."""
     preset: Literal["paper", "best", "fast", "patient", "quick"] = "paper"
     """Defaults of everything below: best (one GPU, minutes), paper (as published, 72k iterations; docs/method.md),
     fast (one GPU, a minute), patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). On the command line

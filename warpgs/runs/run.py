@@ -11,13 +11,11 @@ import torch
 from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
-from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
-from warpgs.data.loaders import load_capture
-from warpgs.data.synthetic import builtin_capture
 from warpgs.files import partial_path
 
 from . import checkpoint
+from .captures import open_capture
 from .config_file import NAME, read_config, write_config
 from .trained import TrainedScene
 
@@ -36,21 +34,6 @@ def choose_device(asked: Device | None = None) -> Device:
     if asked == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
     return asked or ("cuda" if torch.cuda.is_available() else "cpu")
-
-
-def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
-    """The capture of a config; without one the built-in scene, which is rendered on the first call.
-
-    Raises:
-        ValueError: If a file of the capture is missing or damaged; the message names it.
-        OSError: If the built-in scene cannot be written.
-    """
-    if config.data is not None and is_builtin(config.data):
-        root = builtin_folder(config.data, quiet)
-    else:
-        root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    factor, vrig_factor = config.factor, config.vrig_factor
-    return load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
 
 
 def new_folder(config: TrainConfig, capture: Capture) -> Path:

@@ -9,11 +9,13 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.data.capture import Capture
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
 
+from .captures import open_capture
 from .checkpoint import Metadata
 
 MAX_GRAPHS = 4
@@ -35,6 +37,9 @@ class TrainedScene:
         scene: Gaussians and networks, on the device to render on.
         config: Config of the run.
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
+
+    Attributes:
+        scene, config, metadata: As given.
     """
 
     def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:
@@ -55,6 +60,17 @@ class TrainedScene:
         """Whether frames of this (width, height) replay already; until then a frame takes longer."""
         return self._graphs.is_captured(size)
 
+    def open_capture(self, quiet: bool = False) -> Capture:
+        """The capture that the scene was trained on.
+
+        Args:
+            quiet: Whether to hide progress bars.
+
+        Raises:
+            ValueError: If a file of the capture is missing or damaged; the message names it.
+        """
+        return open_capture(self.config, quiet)
+
     @torch.no_grad()
     def splats(self, time: float, residual: bool = True) -> Splats:
         """The Gaussians at a time in [0, 1], static ones first.
@@ -67,15 +83,15 @@ class TrainedScene:
         return self.scene.splats(torch.tensor([time], device=self.device), *flags, self.metadata.sh_degree)
 
     def render(self, camera: Camera, time: float | None = None, branches: bool = False) -> Rendering:
-        """Renders the scene through a camera on its device.
+        """Renders the scene through a camera.
 
         Args:
-            camera: The camera.
+            camera: The camera, on any device.
             time: Time in [0, 1]; ``camera.time`` if None.
             branches: Whether to render the static and the dynamic image as well.
         """
         time = camera.time if time is None else time
-        return self._render(camera, torch.tensor([time], device=camera.viewmat.device), branches)
+        return self._render(camera.to(self.device), torch.tensor([time], device=self.device), branches)
 
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The joint image at the camera's time, as fast as possible.

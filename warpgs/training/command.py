@@ -14,6 +14,9 @@ ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
 )
 
+RESUMING = {"--resume", "--device", "--iterations", "--help"}
+"""Options that can be given with ``--resume``."""
+
 UNFIT = 1
 """Exit code if training on the capture would be useless."""
 
@@ -27,8 +30,10 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
         ValueError: If a run is resumed with other options.
     """
     options = {argument.split("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")}
-    if "--resume" in options and (others := sorted(options - {"--resume", "--device", "--help"})):
-        raise ValueError(f"--resume takes everything but --device from the run's config.json: omit {others[0]}")
+    if "--resume" in options and (others := sorted(options - RESUMING)):
+        raise ValueError(
+            f"--resume takes everything but --device and --iterations from the run's config.json: omit {others[0]}"
+        )
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", choices=list(PRESETS))
     first.add_argument("--data")

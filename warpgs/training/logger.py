@@ -6,6 +6,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard.writer import SummaryWriter
@@ -100,6 +102,19 @@ class TrainingLogger:
                 remaining = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
             self.log(f"{status.iteration}/{self._total} {status.stage}  {text}{remaining}")
         self._write(status, rate)
+
+    def add_scalar(self, name: str, value: float, iteration: int) -> None:
+        """Adds a number to the events."""
+        self._events.add_scalar(name, value, iteration)
+
+    def add_image(self, name: str, image: UInt8[np.ndarray, "H W 3"], iteration: int) -> None:
+        """Adds an 8-bit RGB image to the events."""
+        self._events.add_image(name, image, iteration, dataformats="HWC")
+
+    def skip(self, seconds: float) -> None:
+        """Leaves out time in which nothing was trained [s]."""
+        iteration, at = self._last
+        self._last = (iteration, at + seconds)
 
     def _write(self, status: Status, rate: float) -> None:
         values = {

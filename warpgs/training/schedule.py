@@ -1,6 +1,6 @@
 """What every iteration does: the stages of the paper's protocol and everything that depends on the iteration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from warpgs.config import TrainConfig
@@ -82,6 +82,29 @@ class IterationPlan:
     reseed: bool
     realign: bool
     remove_large: bool
+
+
+def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
+    """The config of a run whose last stage is longer, so that the run takes ``iterations`` in total.
+
+    Learning rates that decay over the run decay over the longer one: they rise where the run is continued.
+
+    Args:
+        config: Config of the run, whose schedule is rescaled already.
+        iterations: Total iterations; the config stays as it is if None.
+
+    Raises:
+        ValueError: If that is less than the run has.
+    """
+    schedule = config.schedule
+    total = schedule.pretrain + schedule.stage1 + schedule.stage2
+    if iterations is None:
+        return config
+    if iterations < total:
+        raise ValueError(f"--resume with --iterations extends a run: expected at least its {total}, got {iterations}")
+    last = "stage2" if schedule.stage2 else "stage1"
+    longer = replace(schedule, **{last: getattr(schedule, last) + iterations - total})
+    return replace(config, schedule=longer)
 
 
 class Protocol:

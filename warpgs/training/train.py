@@ -12,11 +12,14 @@ from warpgs.data.loaders import recognize
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.model.poses import PoseCorrections
-from warpgs.runs.config_file import read_config
+from warpgs.runs import preview
+from warpgs.runs.config_file import read_config, write_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_capture
 
+from .callbacks import Callback, HeldOut, Previewer
 from .interrupt import Interrupt
 from .logger import TrainingLogger
+from .schedule import extended
 from .trainer import Trainer
 
 Log = Callable[[str], None]
@@ -50,7 +53,7 @@ class TrainingInterrupted(KeyboardInterrupt):
         self.folder, self.iteration, self.num_iterations = folder, iteration, num_iterations
 
 
-def train(config: TrainConfig, log: Log | None = None) -> Run:
+def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callback] = ()) -> Run:
     """Trains and evaluates a run.
 
     ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
@@ -59,8 +62,11 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
     The first Ctrl-C lets the current iteration finish and saves a checkpoint, the second one stops at once.
 
     Args:
-        config: The config; ``PRESETS`` has complete ones. ``resume`` continues a run with its own config.
+        config: The config; ``PRESETS`` has complete ones. ``resume`` continues a run with its own config, for
+            ``iterations`` in total if that is given.
         log: Receives lines for the user; if None, nothing is printed.
+        callbacks: Each is called with a ``Progress`` every 50 iterations and before checkpoints; if one returns true,
+            training ends there, with a checkpoint. Their time does not count as training time.
 
     Returns:
         The finished run; its folder holds checkpoints, metrics.json, views.csv, images/ and time.mp4.
@@ -75,21 +81,31 @@ def train(config: TrainConfig, log: Log | None = None) -> Run:
     trainer = make_trainer(config, log)
     run = Run(trainer.run, trainer.config)
     _describe(trainer, log)
+    is_extended = config.resume is not None and config.iterations is not None
+    _train(trainer, run, is_extended, callbacks, quiet)
+    if trainer.views.poses is not None:
+        _describe_corrections(trainer.views.poses, log)
+    capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
+    log(evaluate_run(run.folder, capture, device=trainer.config.device, quiet=quiet))
+    log(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
+    return run
+
+
+def _train(trainer: Trainer, run: Run, is_extended: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
+    """Trains in the locked run folder; raises TrainingInterrupted after Ctrl-C."""
     num_iterations = trainer.protocol.num_iterations
     with (
         run.lock(),
         Interrupt() as interrupt,
         TrainingLogger(run.folder / "events", num_iterations, trainer.iteration, quiet) as logger,
     ):
+        if is_extended:
+            write_config(run.folder, run.config)
+        trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
         finished = trainer.train(logger, interrupt)
-    if trainer.views.poses is not None:
-        _describe_corrections(trainer.views.poses, log)
-    if not finished:
+        preview.remove(run.folder)
+    if not finished and interrupt.requested:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
-    capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
-    log(evaluate_run(run.folder, capture, device=trainer.config.device, quiet=quiet))
-    log(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
-    return run
 
 
 def _describe(trainer: Trainer, log: Log) -> None:
@@ -136,7 +152,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     """
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
-        saved = read_config(config.resume)
+        saved = extended(read_config(config.resume), config.iterations)
         run = Run(config.resume, dataclasses.replace(saved, device=choose_device(config.device or saved.device)))
         locate(run.config.lpips, run.config.lpips_net)
         capture = check_capture(run.open_capture(quiet), run.config, log)

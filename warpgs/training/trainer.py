@@ -3,7 +3,7 @@
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -14,9 +14,11 @@ from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
+from warpgs.runs.trained import TrainedScene
 
 from . import initialize
 from . import optimizer as optim
+from .callbacks import Callback, Progress
 from .densify import DensifyLimits, densify, reset_opacities
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
@@ -54,6 +56,7 @@ class Trainer:
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
         depth_trust: [T] factor of each view's depth errors, in [0, 1]; 0 = the depth is not used.
         seconds: Training time of earlier sessions of this run [s].
+        callbacks: Called after regular checks and before checkpoints, off the clock.
 
     Raises:
         ValueError: If a training frame has no mask or is damaged, or an option has an unknown value.
@@ -73,6 +76,7 @@ class Trainer:
         self.iteration = 0
         self.rollbacks = 0
         self.seconds, self._started = 0.0, time.monotonic()
+        self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
         found = initialize.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
@@ -93,7 +97,7 @@ class Trainer:
         """Trains from the current iteration to the end of the protocol and saves a checkpoint where it stops.
 
         Returns:
-            Whether the end was reached; false after an interrupt.
+            Whether the end was reached; false after an interrupt, or if a callback returned true.
 
         Raises:
             ValueError: If the loss is repeatedly not finite.
@@ -111,7 +115,9 @@ class Trainer:
             at_checkpoint |= self.iteration == self.protocol.num_iterations
             stop = interrupt is not None and interrupt.requested
             if at_checkpoint or stop or self.iteration % CHECK_EVERY == 0:
-                if not self._check(plan.phase, logger):
+                status = self._check(plan.phase, logger)
+                stop |= status is not None and self._call_back(status, logger)
+                if status is None:
                     self._roll_back(logger)
                 elif at_checkpoint or stop:
                     self.save()
@@ -216,8 +222,8 @@ class Trainer:
 
     # Checks and checkpoints -------------------------------------------------------------------------------------------
 
-    def _check(self, phase: Phase, logger: TrainingLogger) -> bool:
-        """Reports the means since the last check; false if the loss or a parameter is not finite.
+    def _check(self, phase: Phase, logger: TrainingLogger) -> Status | None:
+        """Reports the means since the last check; None if the loss or a parameter is not finite.
 
         Gaussians that are not finite are culled, so the loss alone does not reveal them.
         """
@@ -225,10 +231,24 @@ class Trainer:
         loss = sum(means.terms.values())
         finite = torch.stack([parameter.isfinite().all() for parameter in self.step.parameters().values()]).all()
         if not math.isfinite(loss) or not bool(finite):
-            return False
+            return None
         counts = len(self.scene.static), len(self.scene.dynamic)
-        logger.report(Status(self.iteration, phase.stage, loss, means.psnr, means.terms, *counts))
-        return True
+        status = Status(self.iteration, phase.stage, loss, means.psnr, means.terms, *counts)
+        logger.report(status)
+        return status
+
+    def _call_back(self, status: Status, logger: TrainingLogger) -> bool:
+        """Calls the callbacks; whether one of them asks to stop. Their time is not training time."""
+        if not self.callbacks:
+            return False
+        start = time.monotonic()
+        scene = TrainedScene(self.scene, self.config, self._metadata())
+        progress = Progress(status, self.protocol.num_iterations, scene, self.capture)
+        stop = [callback(progress) is True for callback in self.callbacks]
+        seconds = time.monotonic() - start
+        self._started += seconds
+        logger.skip(seconds)
+        return any(stop)
 
     def _roll_back(self, logger: TrainingLogger) -> None:
         """Returns to the newest checkpoint; from there, random numbers are different ones."""
@@ -256,8 +276,13 @@ class Trainer:
                 tensors[f"adam.{part}.{name}"] = value
         tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
         tensors["alignments"] = self.alignments
+        checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
+        checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
+
+    def _metadata(self) -> checkpoint.Metadata:
+        """The plain values of a checkpoint of the current iteration."""
         phase = self.protocol.phase_at(max(0, self.iteration - 1))
-        metadata = checkpoint.Metadata(
+        return checkpoint.Metadata(
             iteration=self.iteration,
             use_deformation=phase.use_deformation,
             use_appearance=phase.use_appearance,
@@ -267,8 +292,6 @@ class Trainer:
             rollbacks=self.rollbacks,
             views=tuple(self.capture.train),
         )
-        checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, metadata)
-        checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
 
     def _peak_bytes(self) -> int | None:
         """Peak memory of tensors on the GPU in all sessions [bytes]; None on CPU."""

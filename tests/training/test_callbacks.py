@@ -1,0 +1,167 @@
+"""Callbacks of ``train``, held-out views in TensorBoard, previews for the viewer, and longer runs."""
+
+import dataclasses
+import json
+import time
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import warpgs
+from tests import tiny
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.config import TrainConfig
+from warpgs.runs import checkpoint, preview
+from warpgs.runs.config_file import read_config
+from warpgs.training import callbacks, command, trainer
+from warpgs.training import train as script
+from warpgs.training.logger import Status
+from warpgs.training.schedule import Protocol, extended
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+
+CHECK_EVERY = 4
+CALLED_AT = sorted({*range(4, 33, CHECK_EVERY), *range(7, 33, 7)})
+"""Iterations of regular checks and of checkpoints."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return tiny.write(tmp_path_factory.mktemp("cache"))
+
+
+class Watched:
+    """A run with a callback that renders, takes long, and asks for a preview after iteration 12."""
+
+    def __init__(self, config: TrainConfig, clock: list[float]) -> None:
+        self.folder, self.clock = config.out, clock
+        self.means, self.states = {}, []
+        self.run = warpgs.train(config, callbacks=[self.watch])
+
+    def watch(self, progress: warpgs.Progress) -> None:
+        camera = progress.capture.cameras[progress.capture.train[0]]
+        iteration = progress.status.iteration
+        self.means[iteration] = progress.scene.render(camera, 0.5).joint.image.mean().item()
+        self.states.append(preview.read_state(self.folder))
+        self.clock[0] += 1000.0
+        if iteration == 12:
+            preview.request(self.folder)
+
+
+@pytest.fixture(scope="module")
+def watched(data, tmp_path_factory):
+    config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path_factory.mktemp("watched") / "run")
+    clock, monotonic = [0.0], time.monotonic
+    with pytest.MonkeyPatch.context() as patch, tiny.in_haste():
+        patch.setattr(trainer, "CHECK_EVERY", CHECK_EVERY)
+        patch.setattr(time, "monotonic", lambda: monotonic() + clock[0])
+        return Watched(config, clock)
+
+
+@pytest.fixture
+def config(data, tmp_path, monkeypatch):
+    """Of a run that is not evaluated at its end."""
+    monkeypatch.setattr(trainer, "CHECK_EVERY", CHECK_EVERY)
+    monkeypatch.setattr(script, "evaluate_run", lambda *_, **__: "")
+    return dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")
+
+
+def test_callbacks_see_every_check_and_can_render_the_scene(watched):
+    assert list(watched.means) == CALLED_AT
+    assert len(set(watched.means.values())) == len(CALLED_AT)  # the scene is the one of that iteration
+    capture = watched.run.open_capture()
+    last = watched.run.trained_scene().render(capture.cameras[capture.train[0]], 0.5).joint.image.mean().item()
+    assert watched.means[tiny.LENGTH] == last
+
+
+def test_callbacks_change_nothing_and_take_no_training_time(watched, data, tmp_path):
+    tiny.train(tiny.trainer(data, tmp_path, watched.run.config))
+    assert tiny.differences(tiny.state(watched.folder), tiny.state(tmp_path)) == []
+    assert watched.run.trained_scene().metadata.train_seconds < 500.0
+
+
+def test_tensorboard_has_psnr_and_images_of_held_out_views(watched):
+    events = EventAccumulator(str(watched.folder / "events"), size_guidance={"images": 0})
+    events.Reload()
+    val = watched.run.open_capture().val
+    steps = [event.step for event in events.Scalars("psnr/held-out")]
+    assert steps[-1] == tiny.LENGTH
+    assert {f"held-out/{name}" for name in val} <= set(events.Tags()["images"])
+    assert len(events.Images(f"held-out/{val[0]}")) == len(steps)
+    assert len(events.Images(f"held-out/{val[0]}, truth")) == 1
+    metrics = json.loads((watched.folder / "metrics.json").read_text())
+    assert len(val) == callbacks.HELD_OUT_VIEWS
+    assert events.Scalars("psnr/held-out")[-1].value == pytest.approx(metrics["psnr"], abs=1e-3)
+
+
+def test_the_scene_is_written_for_a_viewer_only_while_one_asks(watched):
+    assert not any(watched.states[: CALLED_AT.index(12) + 1])
+    state = watched.states[CALLED_AT.index(12) + 1]
+    assert (state.iteration, state.num_iterations) == (12, tiny.LENGTH)
+    assert not (watched.folder / preview.SCENE).exists()  # removed at the end: the last checkpoint is newer
+
+
+def test_a_callback_that_returns_true_ends_training_with_a_checkpoint(config):
+    run = warpgs.train(config, callbacks=[lambda progress: progress.status.iteration >= 12])
+    assert run.trained_scene().metadata.iteration == 12
+
+
+def test_held_out_views_are_rendered_at_most_a_few_times_per_run(finished_run, monkeypatch):
+    capture = warpgs.open_run(finished_run).open_capture()
+    image = SimpleNamespace(joint=SimpleNamespace(image=torch.zeros(tiny.SCENE.height, tiny.SCENE.width, 3)))
+    scene, written = SimpleNamespace(render=lambda camera: image), []
+
+    class Logger:
+        def add_image(self, *_: object) -> None:
+            pass
+
+        def add_scalar(self, name: str, value: float, iteration: int) -> None:
+            written.append(iteration)
+
+    held_out = callbacks.HeldOut(Logger())
+    for iteration in range(50, 30_001, 50):
+        held_out(callbacks.Progress(Status(iteration, "stage1", 0.1, 30.0, {}, 1, 1), 30_000, scene, capture))
+    assert len(written) <= callbacks.HELD_OUT_TIMES + 1
+    assert written[-1] == 30_000
+
+
+def test_a_preview_is_the_scene_of_its_iteration(finished_run, tmp_path):
+    scene = warpgs.open_run(finished_run)
+    preview.write(tmp_path, scene, preview.State(7, 9, 21.5, None))
+    loaded = checkpoint.load(tmp_path / preview.SCENE)
+    read = checkpoint.load_scene(loaded, scene.config.model)
+    assert torch.equal(read.static.means, scene.scene.static.means)
+    assert preview.read_state(tmp_path) == preview.State(7, 9, 21.5, None)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"iteration": "x", "num_iterations": 1, "psnr": 1, "rate": 1}'])
+def test_a_damaged_state_is_none(tmp_path, text):
+    (tmp_path / preview.STATE).write_text(text)
+    assert preview.read_state(tmp_path) is None
+
+
+# Longer runs ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_is_extended(config):
+    warpgs.train(config, callbacks=[lambda progress: True])
+    longer = command.parse(["--resume", str(config.out), "--iterations", "40"])
+    run = warpgs.train(longer)
+    assert run.trained_scene().metadata.iteration == 40
+    assert read_config(config.out).schedule == dataclasses.replace(tiny.SCHEDULE, stage2=18)
+    assert warpgs.train(TrainConfig(resume=config.out)).trained_scene().metadata.iteration == 40  # nothing left to do
+
+
+def test_the_last_stage_takes_the_added_iterations():
+    longer = Protocol(extended(tiny.CONFIG, 50), has_depth=True)
+    assert (longer.stage1.end, longer.stage2.end) == (22, 50)
+    only = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, stage2=0))
+    assert Protocol(extended(only, 50), has_depth=True).stage1.end == 50
+
+
+def test_a_run_is_not_shortened():
+    with pytest.raises(ValueError, match="expected at least its 32, got 31"):
+        extended(tiny.CONFIG, 31)

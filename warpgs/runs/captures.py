@@ -1,0 +1,24 @@
+"""The capture that a run is trained on."""
+
+import torch
+
+from warpgs.config import TrainConfig
+from warpgs.data.builtin import builtin_folder, is_builtin
+from warpgs.data.capture import Capture
+from warpgs.data.loaders import load_capture
+from warpgs.data.synthetic import builtin_capture
+
+
+def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
+    """The capture of a config; without one the built-in scene, which is rendered on the first call.
+
+    Raises:
+        ValueError: If a file of the capture is missing or damaged; the message names it.
+        OSError: If the built-in scene cannot be written.
+    """
+    if config.data is not None and is_builtin(config.data):
+        root = builtin_folder(config.data, quiet)
+    else:
+        root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
+    factor, vrig_factor = config.factor, config.vrig_factor
+    return load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)

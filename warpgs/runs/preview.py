@@ -1,0 +1,78 @@
+"""The scene of a run in training between its checkpoints, written only while a viewer asks for it."""
+
+import json
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from warpgs.files import read_json, write_text
+
+from . import checkpoint
+from .trained import TrainedScene
+
+REQUEST, SCENE, STATE = ".preview", "preview.safetensors", "preview.json"
+"""Files in a run folder: what a viewer touches, the scene, and the state of the training."""
+
+LAPSE_SECONDS = 10.0
+"""A request lapses after this time [s]."""
+
+MAX_BYTES = 1 << 16
+"""Maximum size of the state [bytes]."""
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of a training.
+
+    Attributes:
+        iteration, num_iterations: Iterations done, and those of the whole run.
+        psnr: PSNR of training images [dB].
+        rate: Iterations per second; None if unknown.
+    """
+
+    iteration: int
+    num_iterations: int
+    psnr: float
+    rate: float | None
+
+
+def request(folder: Path) -> None:
+    """Asks the process that trains in a run folder for its scene; in vain if the folder cannot be written."""
+    with suppress(OSError):
+        (folder / REQUEST).touch()
+
+
+def is_requested(folder: Path) -> bool:
+    """Whether a viewer has asked for the scene lately."""
+    try:
+        return time.time() - (folder / REQUEST).stat().st_mtime < LAPSE_SECONDS
+    except OSError:
+        return False
+
+
+def write(folder: Path, scene: TrainedScene, state: State) -> None:
+    """Writes the scene and the state.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    tensors = {f"scene.{name}": tensor for name, tensor in scene.scene.state_dict().items()}
+    checkpoint.save(folder / SCENE, tensors, scene.metadata)
+    write_text(folder / STATE, json.dumps(asdict(state)))
+
+
+def remove(folder: Path) -> None:
+    """Removes what ``write`` and ``request`` leave."""
+    for name in (REQUEST, SCENE, STATE):
+        (folder / name).unlink(missing_ok=True)
+
+
+def read_state(folder: Path) -> State | None:
+    """The state of the training; None if there is none, or it is damaged."""
+    try:
+        values = read_json(folder / STATE, max_bytes=MAX_BYTES)
+        iteration, total = int(values["iteration"]), int(values["num_iterations"])
+        return State(iteration, total, float(values["psnr"]), values["rate"] and float(values["rate"]))
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):
+        return None

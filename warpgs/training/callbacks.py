@@ -1,0 +1,119 @@
+"""What watches a training: callbacks of the user, held-out views for TensorBoard, and previews for the viewer."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from warpgs.data.capture import Capture
+from warpgs.errors import one_line
+from warpgs.evaluation.metrics import psnr
+from warpgs.runs import preview
+from warpgs.runs.trained import TrainedScene
+from warpgs.video.camera_paths import evenly_spaced_indices
+from warpgs.visualize import to_bytes
+
+from .logger import Status, TrainingLogger
+
+HELD_OUT_TIMES = 20
+"""How often held-out views are rendered in a run."""
+
+HELD_OUT_VIEWS = 3
+HELD_OUT_WIDTH = 320
+"""Width of their images in TensorBoard [px]."""
+
+PREVIEW_SECONDS = 2.0
+"""Minimum time between previews [s]."""
+
+PREVIEW_OVERHEAD = 10.0
+"""Minimum time between previews, relative to the time that writing one takes."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a callback of ``train`` is given.
+
+    Attributes:
+        status: Iteration, stage, loss, PSNR and numbers of Gaussians.
+        num_iterations: Total iterations of the run.
+        scene: The scene as it is trained now, to render; it changes as soon as training goes on.
+        capture: The capture that it is trained on.
+    """
+
+    status: Status
+    num_iterations: int
+    scene: TrainedScene
+    capture: Capture
+
+
+Callback = Callable[[Progress], object]
+"""Called every 50 iterations and at checkpoints, off the clock; training stops if it returns true."""
+
+
+class HeldOut:
+    """Adds PSNR and images of a few evaluation views to TensorBoard, seldom; a callback.
+
+    Cameras are not aligned to the scene as in the final evaluation, so that PSNR is lower where poses are corrected.
+    """
+
+    def __init__(self, logger: TrainingLogger) -> None:
+        self._logger, self._next = logger, 0
+        self._has_truth = False
+
+    @torch.no_grad()
+    def __call__(self, progress: Progress) -> None:
+        iteration, total = progress.status.iteration, progress.num_iterations
+        names = progress.capture.val
+        if not names or (iteration < self._next and iteration < total):
+            return
+        self._next = iteration + max(1, total // HELD_OUT_TIMES)
+        values = []
+        for index in evenly_spaced_indices(len(names), HELD_OUT_VIEWS):
+            frame = progress.capture.frame(names[index])
+            image = progress.scene.render(frame.camera).joint.image.clamp(0, 1)
+            values.append(psnr(image, frame.image.to(image.device).float() / 255.0))
+            self._logger.add_image(f"held-out/{frame.name}", _reduced(to_bytes(image)), iteration)
+            if not self._has_truth:
+                self._logger.add_image(f"held-out/{frame.name}, truth", _reduced(frame.image.numpy()), iteration)
+        self._has_truth = True
+        self._logger.add_scalar("psnr/held-out", sum(values) / len(values), iteration)
+
+
+def _reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """An image of at most ``HELD_OUT_WIDTH`` pixels in width."""
+    height, width = image.shape[:2]
+    if width <= HELD_OUT_WIDTH:
+        return image
+    size = (HELD_OUT_WIDTH, max(1, round(height * HELD_OUT_WIDTH / width)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+class Previewer:
+    """Writes the scene for a viewer of the run folder, while one asks for it; a callback."""
+
+    def __init__(self, folder: Path, logger: TrainingLogger) -> None:
+        self._folder, self._logger = folder, logger
+        self._next = 0.0
+        self._before: tuple[int, float] | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        status, now = progress.status, time.monotonic()
+        before, self._before = self._before, (status.iteration, now)
+        if now < self._next or not preview.is_requested(self._folder):
+            return
+        iterations, seconds = (status.iteration - before[0], now - before[1]) if before else (0, 0.0)
+        rate = iterations / seconds if seconds > 0 else None
+        state = preview.State(status.iteration, progress.num_iterations, status.psnr, rate)
+        try:
+            preview.write(self._folder, progress.scene, state)
+        except OSError as error:  # training goes on without
+            self._logger.log(f"warning: no previews for the viewer: {one_line(error)}")
+            self._next = math.inf
+            return
+        self._next = now + max(PREVIEW_SECONDS, PREVIEW_OVERHEAD * (time.monotonic() - now))
