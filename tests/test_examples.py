@@ -1,12 +1,15 @@
 """The example programs, on tiny sizes."""
 
+import json
 import re
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
+import torch
 
 import warpgs
 from tests import tiny
@@ -65,3 +68,39 @@ def test_render_a_time_writes_the_image_of_that_view_and_time(run, finished_run,
     camera = capture.cameras[capture.train[2]].to(scene.device)
     expected = to_bytes(scene.render(camera, 0.25).joint.image)
     assert (cv2.imread(str(out))[..., ::-1] == expected).all()
+
+
+def cells(name: str) -> list[str]:
+    """The code of a notebook, cell by cell."""
+    notebook = json.loads((EXAMPLES / f"{name}.ipynb").read_text())
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook["cells"])
+    return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def executed(name: str, **changed: tuple[str, str]) -> dict[str, Any]:
+    """The variables that a notebook leaves, with other values in some of its assignments."""
+    code = "\n".join(cells(name))
+    for before, after in changed.values():
+        assert code.count(before) == 1, before
+        code = code.replace(before, after)
+    variables: dict[str, Any] = {}
+    with tiny.in_haste():
+        exec(compile(code, f"{name}.ipynb", "exec"), variables)
+    return variables
+
+
+def test_the_notebook_about_an_image_fits_it():
+    sizes = ("WIDTH, NUM_GAUSSIANS, STEPS = 128, 2000, 300", "WIDTH, NUM_GAUSSIANS, STEPS = 48, 400, 60")
+    left = executed("fit_an_image", sizes=sizes)
+    assert left["psnr"][-1] > left["psnr"][0] + 12
+    assert left["pixels"].shape == (48, 96, 3)
+
+
+def test_the_notebook_about_a_run_renders_it(finished_run, capsys):
+    left = executed("open_a_run", run=('RUN = Path("runs/builtin-quick")', f"RUN = Path({str(finished_run)!r})"))
+    scene, camera = warpgs.open_run(finished_run), left["camera"]
+    assert torch.equal(left["layers"][0], scene.render(camera).joint.image)
+    assert left["strip"].shape == (camera.height, 5 * camera.width, 3)
+    assert left["closer"].size == camera.size
+    assert "scene units" in capsys.readouterr().out
