@@ -7,7 +7,7 @@ from pathlib import Path
 
 SDIST = (
     "README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", "constraints.txt",
-    "constraints-oldest.txt", "train.py",
+    "constraints-oldest.txt", "mkdocs.yml", "train.py",
 )  # fmt: skip
 """Files of the root that belong to the sdist, which also has the folders ``FOLDERS``."""
 

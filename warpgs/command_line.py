@@ -17,7 +17,7 @@ import types
 import typing
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
@@ -100,6 +100,38 @@ def flags(options: type, prefix: str = "") -> Iterator[str]:
             yield f"--{prefix}no-{shown}"
 
 
+class Option(NamedTuple):
+    """An option for documentation.
+
+    Attributes:
+        name: As it is typed: ``--model.depth``; of a positional argument what it is: ``RUN``.
+        metavar: What the value is; empty for a switch.
+        default: Default value; ``dataclasses.MISSING`` without one.
+        text: What it does.
+    """
+
+    name: str
+    metavar: str
+    default: Any
+    text: str
+
+
+def documented(options: type, prefix: str = "") -> Iterator[Option]:
+    """All options of a dataclass of options and of those inside it, with their defaults and docstrings."""
+    hints, texts = typing.get_type_hints(options, include_extras=True), docstrings(options)
+    for field in dataclasses.fields(options):
+        hint = hints[field.name]
+        settings, plain = _settings(hint), _plain(hint)
+        shown = (settings.name if settings and settings.name else field.name).replace("_", "-")
+        if dataclasses.is_dataclass(plain):
+            yield from documented(typing.cast(type, plain), f"{prefix}{shown}.")
+            continue
+        metavar = (settings.metavar if settings else None) or _metavar(plain) or _repeated(plain)
+        is_positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
+        name = metavar if is_positional else f"--{prefix}{shown}"
+        yield Option(name, "" if is_positional or plain is bool else metavar, field.default, texts.get(field.name, ""))
+
+
 @contextlib.contextmanager
 def described(options: type, shown: Collection[str] | None = None) -> Iterator[None]:
     """While it lasts, tyro shows rewrapped help of a dataclass of options and of those inside it.
@@ -145,6 +177,12 @@ def _metavar(plain: Any) -> str | None:
     if typing.get_origin(plain) is typing.Literal:
         return "{" + ",".join(map(str, typing.get_args(plain))) + "}"
     return METAVARS.get(plain)
+
+
+def _repeated(plain: Any) -> str:
+    """The metavar of a tuple, from that of its first part."""
+    parts = typing.get_args(plain)
+    return f"{_metavar(parts[0]) or 'VALUE'} …" if parts else "VALUE"
 
 
 def _default_hint(default: str) -> str:

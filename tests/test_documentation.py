@@ -1,0 +1,147 @@
+"""README and docs/: their Python runs, their commands have the options that they use, and the site builds strictly."""
+
+import dataclasses
+import functools
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests import tiny
+from warpgs import presets
+from warpgs.cli import COMMANDS
+from warpgs.command_line import documented, flags, parse
+from warpgs.runs.run import Run
+from warpgs.training import command as training
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+OWN_TESTS = {"extending.md", "capture-format.md"}
+"""Pages whose Python has tests of its own."""
+
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"(python train\.py|warpgs [a-z]+)( |$)")
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def snippets() -> list[tuple[str, str]]:
+    """Each page with Python, and all of its Python as one program."""
+    pages = [page for page in PAGES if page.name not in OWN_TESTS]
+    programs = [
+        (name(page), [code for kind, code in BLOCK.findall(page.read_text()) if kind == "python"]) for page in pages
+    ]
+    return [(page, "\n".join(parts)) for page, parts in programs if parts]
+
+
+@pytest.fixture
+def folder_with_a_run(finished_run, tmp_path, monkeypatch):
+    """A current folder as the pages assume it, with a run and a capture, and a short preset."""
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "builtin-quick").symlink_to(finished_run)
+    (tmp_path / "capture").symlink_to(Run.open(finished_run).config.data, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    quick = dataclasses.replace(tiny.CONFIG, data=tmp_path / "capture")
+    monkeypatch.setitem(presets.PRESETS, "quick", quick)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("page", "program"), snippets(), ids=[page for page, _ in snippets()])
+@pytest.mark.usefixtures("folder_with_a_run")
+def test_python_of_a_page_runs(page, program, capsys):
+    with tiny.in_haste():
+        exec(compile(program.replace("iterations=300", "iterations=8"), page, "exec"), {})
+
+
+def command_lines(text: str) -> list[str]:
+    """The commands in lines of text, without comments and what other programs do with them."""
+    lines = [re.split(r"\s+#|\s+&&|\s+>>?\s|;", line)[0].strip() for line in text.splitlines()]
+    return [line.replace("python train.py", "warpgs train") for line in lines if COMMAND.match(line)]
+
+
+def in_blocks(page: Path) -> list[str]:
+    """Complete command lines of a page."""
+    return [
+        line for kind, code in BLOCK.findall(page.read_text()) if kind in ("sh", "") for line in command_lines(code)
+    ]
+
+
+def in_sentences(page: Path) -> list[str]:
+    """Commands, often without all arguments, that sentences and tables of a page name."""
+    return command_lines("\n".join(re.findall(r"`([^`\n]*)`", BLOCK.sub("", page.read_text()))))
+
+
+@functools.cache
+def known(command: str) -> set[str]:
+    """All options of a command."""
+    return {*flags(COMMANDS[command].load()), "--help", "--help-all", "--version"}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_of_a_page_have_the_options_that_it_names(page):
+    for line in in_blocks(page) + in_sentences(page):
+        _, command, *rest = line.split()
+        assert command in COMMANDS, line
+        assert {part.split("=")[0] for part in rest if re.match("--[a-z]", part)} <= known(command), line
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if in_blocks(page)], ids=name)
+def test_complete_commands_of_a_page_are_accepted(page):
+    for line in in_blocks(page):
+        if "--help" in line or "--version" in line:
+            continue
+        plain = re.sub(r"\[[A-Z]+ \.\.\.\]", "", line)
+        _, command, *rest = ["3" if part == "N" else part for part in shlex.split(plain)]
+        if command == "train":
+            training.parse(rest)
+        else:
+            parse(COMMANDS[command].load(), rest, f"warpgs {command}")
+
+
+def test_there_are_commands_and_snippets():
+    assert sum(len(in_blocks(page)) for page in PAGES) > 30
+    assert sum(len(in_sentences(page)) for page in PAGES) > 30
+    assert len(snippets()) >= 6
+
+
+def test_every_option_is_on_the_page_of_options(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    text = pages.on_page_markdown((ROOT / "docs" / "options.md").read_text())
+    assert pages.MARKER not in text
+    for command in COMMANDS.values():
+        for option in documented(command.load()):
+            name, default, meaning = pages.row(option)
+            assert meaning, option.name
+            assert f"| {name} | {default} | {meaning} |" in text
+    assert "| `--no-graph` | on |" in text
+    assert "| `--densify.max-gaussians INT` | `3000000` |" in text
+    assert "| `--schedule.joint-from` | none | `0` | none | `0` | `0` |" in text
+
+
+SITE = ("mkdocs", "material", "mkdocstrings")
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(package) is None for package in SITE), reason="the extra docs is not installed"
+)
+def test_the_site_builds_without_a_warning(tmp_path):
+    """Pages, links and anchors inside of them, and every name of the API."""
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    arguments = ["build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *arguments], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    api = (tmp_path / "site" / "api" / "index.html").read_text()
+    for public in ("warpgs.open_run", "warpgs.load_capture", "warpgs.train", "warpgs.render"):
+        assert f'id="{public}"' in api
+    pages = "".join(path.read_text() for path in (tmp_path / "site").rglob("*.html"))
+    assert not re.search(r'(?:src|href)="https?://[^"]*\.(?:js|css|woff2?)"', pages)  # loads nothing from elsewhere
