@@ -93,7 +93,10 @@ def test_positional_arguments_have_names(command, metavars, capsys):
             ["render", "r", "--layers", "x"],
             "warpgs render: invalid choice 'x' for argument '--layers'. Expected one of",
         ),
-        (["train", "--resume", "r", "--seed", "1"], "warpgs train: --resume takes everything but --device from the"),
+        (
+            ["train", "--resume", "r", "--seed", "1"],
+            "warpgs train: --resume takes everything but --device and --iterations from the",
+        ),
     ],
 )
 def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):

@@ -141,11 +141,24 @@ def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W
     Raises:
         OSError: If the file cannot be written; the message names it.
     """
+    try:
+        data = encode_png(image)
+    except ValueError as error:
+        raise OSError(f"{path} could not be encoded") from error
+    write_bytes(path, [data])
+
+
+def encode_png(image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W C"]) -> bytes:
+    """A PNG file of a greyscale, RGB or RGBA image of 8 or 16 bits.
+
+    Raises:
+        ValueError: If it cannot be encoded.
+    """
     order = [2, 1, 0, 3][: image.shape[-1]]  # OpenCV's
     encoded, data = cv2.imencode(".png", image[..., order] if image.ndim == 3 else image)
     if not encoded:
-        raise OSError(f"{path} could not be encoded")
-    write_bytes(path, [data.tobytes()])
+        raise ValueError("the image could not be encoded as PNG")
+    return bytes(data.tobytes())
 
 
 def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:

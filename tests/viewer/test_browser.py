@@ -41,7 +41,7 @@ ARGUMENTS = [
 ]
 SIZE = {"width": 900, "height": 700}
 LEFT = 480
-"""Columns that the panel does not cover [px]."""
+"""Columns of the image that are compared; the panel lies beside the image [px]."""
 
 
 @pytest.fixture(scope="module")
@@ -72,15 +72,14 @@ def viewer(run):
 
 @pytest.fixture(scope="module")
 def visit(browser, viewer):
-    """The page, its session, and the addresses that it requested."""
+    """The page and the addresses that it requested."""
     page, asked = browser.new_page(viewport=SIZE), []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"http://127.0.0.1:{viewer.port}")
     page.get_by_text("Training cameras").wait_for(timeout=60_000)
     until(lambda: viewer.sessions)
-    (session,) = viewer.sessions.values()
     page.locator(".mantine-Notification-closeButton").first.click()  # "software rendering"
-    return page, session, asked
+    return page, asked
 
 
 @pytest.fixture
@@ -89,9 +88,9 @@ def page(visit):
 
 
 @pytest.fixture
-def session(visit):
+def session(visit, viewer):
     """At rest, showing the joint layer at time 0.5."""
-    session = visit[1]
+    session = next(iter(viewer.sessions.values()))
     session.panel.layer.value = "joint"
     session.panel.residual.value = True
     session.panel.time.value = 0.5
@@ -126,8 +125,8 @@ def seen(page, session):
 
 
 def test_the_page_requests_nothing_from_other_servers(visit, viewer):
-    schemes = {url.split(":")[0] for url in visit[2] if not url.startswith(f"http://127.0.0.1:{viewer.port}/")}
-    assert visit[2]
+    schemes = {url.split(":")[0] for url in visit[1] if not url.startswith(f"http://127.0.0.1:{viewer.port}/")}
+    assert visit[1]
     assert schemes <= {"blob", "data"}
 
 
@@ -136,7 +135,7 @@ def test_the_image_shows_the_scene_through_the_camera(page, session):
     request = session._shown.request
     camera = camera_of(request.pose, request.size, request.time)
     expected = render_layer(request.layer, request.scene.splats(request.time), camera)
-    expected = cv2.resize(expected, (SIZE["width"], SIZE["height"]))[:, :LEFT, ::-1]
+    expected = cv2.resize(expected, session._canvas())[:, :LEFT, ::-1]
     assert expected.std() > 10
     assert np.abs(image - expected).mean() < 4.0
 
@@ -145,7 +144,7 @@ def test_with_cuda_graphs_joint_images_at_full_resolution_are_replayed(page, ses
     """As on a GPU, except that a graph is a function that is called again."""
     before = seen(page, session)
     trained = session._shown.request.scene
-    monkeypatch.setattr(graphs, "record", lambda work, stream=None, pool=None: work)
+    monkeypatch.setattr(graphs, "capture", lambda work: work)
     monkeypatch.setattr(TrainedScene, "uses_graphs", True)
     for k in range(graphs.WARM_UPS + 1):
         session.panel.time.value = 0.9 - 0.05 * (graphs.WARM_UPS - k)
@@ -158,6 +157,41 @@ def test_with_cuda_graphs_joint_images_at_full_resolution_are_replayed(page, ses
     settle(session)
     session.panel.time.value = 0.9
     assert np.abs(seen(page, session) - moved).max() < 3
+
+
+def test_the_panel_lies_beside_the_image(page, session):
+    box = page.get_by_role("button", name="Play", exact=True).bounding_box()
+    assert session._canvas()[0] < box["x"]
+
+
+def test_truth_is_shown_left_of_the_border_until_the_camera_moves(page, session, viewer):
+    before = seen(page, session)
+    session.panel.wipe.value = 1.0
+    image = seen(page, session)
+    assert np.abs(image - before).mean() > 5
+    session.panel.wipe.value = 0.0
+    until(lambda: np.abs(seen(page, session) - before).max() < 10)
+    session.panel.wipe.value = 1.0
+    camera = session._client.camera
+    camera.position = camera.position + 0.1
+    until(lambda: session._request().truth is None)
+    session.panel.wipe.value = 0.0
+
+
+def test_camera_and_controls_survive_a_reload(page, session, viewer):
+    session.panel.layer.value = "static"
+    camera = session._client.camera
+    camera.position = camera.position + 0.05
+    settle(session)
+    pose, time_shown = session._pose(), session.panel.time.value
+    page.reload()
+    page.get_by_text("Training cameras").wait_for(timeout=60_000)
+    until(lambda: viewer.sessions and session not in viewer.sessions.values())
+    (after,) = viewer.sessions.values()
+    settle(after)
+    assert after._pose().position == pytest.approx(pose.position, abs=1e-5)
+    assert abs(np.dot(after._pose().wxyz, pose.wxyz)) == pytest.approx(1.0, abs=1e-5)
+    assert (after.panel.layer.value, after.panel.time.value) == ("static", time_shown)
 
 
 def test_a_screenshot_is_written(page, session, tmp_path_factory):
@@ -230,8 +264,8 @@ def test_dragging_orbits_the_target_of_the_training_camera(page, session, viewer
     page.mouse.move(260, 400, steps=5)
     page.mouse.up()
     until(lambda: np.linalg.norm(np.array(session._pose().position) - target) == pytest.approx(distance, rel=1e-3))
-    row, column, _, inside = session._camera().project(torch.tensor(target[None]).float())
-    middle = session._camera()
+    row, column, _, inside = session.current_camera().project(torch.tensor(target[None]).float())
+    middle = session.current_camera()
     assert bool(inside)
     assert abs(int(column) - middle.width / 2) < 3
     assert abs(int(row) - middle.height / 2) < 3
@@ -268,6 +302,14 @@ def test_training_cameras_are_shown_and_removed(page, session):
     until(lambda: np.abs(seen(page, session) - before).max() < 10)
 
 
+@pytest.fixture
+def path_folder(page):
+    """The folder of camera paths is open."""
+    if not page.get_by_role("button", name="Add keyframe").is_visible():
+        page.get_by_text("Camera path").click()
+
+
+@pytest.mark.usefixtures("path_folder")
 def test_a_camera_path_is_saved(page, session, run):
     page.get_by_role("button", name="Add keyframe").click()
     until(lambda: len(session.path.cameras) == 1)
@@ -280,17 +322,19 @@ def test_a_camera_path_is_saved(page, session, run):
     page.get_by_text("2 keyframes saved as").wait_for()
     last = json.loads((run / "paths" / "path.json").read_text())["keyframes"][1]
     assert last["width"] == session.panel.width.value
-    assert last["width"] / last["height"] == pytest.approx(SIZE["width"] / SIZE["height"], rel=0.01)
+    width, height = session._canvas()
+    assert last["width"] / last["height"] == pytest.approx(width / height, rel=0.01)
     assert last["time"] == pytest.approx(session.panel.time.value)
-    assert session._camera().viewmat.tolist() == [pytest.approx(row, abs=1e-5) for row in last["viewmat"]]
+    assert session.current_camera().viewmat.tolist() == [pytest.approx(row, abs=1e-5) for row in last["viewmat"]]
 
 
+@pytest.mark.usefixtures("path_folder")
 def test_keyframes_can_be_removed(page, session):
     page.get_by_role("button", name="Add keyframe").click()
     until(lambda: session.path.cameras)
     while session.path.cameras:
         count = len(session.path.cameras)
-        page.get_by_role("button", name="Remove last").click()
+        page.get_by_role("button", name="Remove keyframe").click()
         until(lambda count=count: len(session.path.cameras) < count)
     page.get_by_text("no keyframes").wait_for()
     page.get_by_role("button", name="Save path").click()
@@ -331,4 +375,16 @@ def pose_time(viewer, session):
 
 
 def test_the_pose_of_the_camera_is_exact(session):
-    assert pose_of(session._camera()).fov == pytest.approx(session._pose().fov)
+    assert pose_of(session.current_camera()).fov == pytest.approx(session._pose().fov)
+
+
+def test_the_screenshot_button_downloads_the_image(page, session, tmp_path):
+    """Last, because a note about the download lies over the image for a while."""
+    settle(session)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    download.value.save_as(tmp_path / "shot.png")
+    assert download.value.suggested_filename == f"run-joint-{session.panel.current_time:.3f}.png"
+    request = session._request()
+    expected = session._renderer.render(request, 1.0).image
+    assert np.array_equal(cv2.imread(str(tmp_path / "shot.png"))[..., ::-1], expected)

@@ -3,9 +3,10 @@
 import shutil
 
 import pytest
+import torch
 
 from tests.viewer import watched
-from warpgs.runs import checkpoint
+from warpgs.runs import checkpoint, preview
 from warpgs.runs.run import Run
 from warpgs.viewer import source as source_module
 from warpgs.viewer.source import open_source
@@ -63,8 +64,8 @@ def test_a_rewritten_checkpoint_is_read_again(run, without_interval):
 
 
 def test_a_followed_run_is_not_read_before_the_first_call(run, monkeypatch):
-    monkeypatch.setattr(Run, "trained_scene", lambda _: pytest.fail("read"))
-    monkeypatch.setattr(Run, "newest_checkpoint", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(Run, "trained_scene", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(Run, "newest_checkpoint", lambda *_: pytest.fail("read"))
     open_source(run, "cpu", True)
 
 
@@ -126,3 +127,25 @@ def test_without_residual_static_gaussians_keep_their_colours(run):
     num = len(trained.scene.static)
     assert watched.same(plain.sh[:num], trained.scene.static.sh)
     assert not watched.same(changed.sh[:num], trained.scene.static.sh)
+
+
+def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, without_interval):
+    source = open_source(run, "cpu", True)
+    source.current()
+    assert preview.is_requested(run)
+    scene = Run.open(run, "cpu").trained_scene()
+    with torch.no_grad():
+        scene.scene.static.means += 0.25
+    preview.write(run, scene, preview.State(40, 96, 21.27, 3.0))
+    assert watched.same(source.current().scene.static.means, scene.scene.static.means)
+    assert source.progress == "training: 40 of 96 iterations, 21.3 dB, 3.0 it/s"
+    watched.advance(run)
+    assert source.current().metadata.iteration == 33  # a newer checkpoint wins
+    preview.remove(run)
+    source.current()
+    assert source.progress == ""
+
+
+def test_a_run_that_is_not_followed_is_not_asked(run, without_interval):
+    open_source(run, "cpu", False).current()
+    assert not preview.is_requested(run)

@@ -130,13 +130,16 @@ class Run:
         saved = checkpoint.list_checkpoints(self.folder)
         return saved[-1] if saved else None
 
-    def trained_scene(self) -> TrainedScene:
-        """The scene of the newest checkpoint, on the run's device.
+    def trained_scene(self, path: Path | None = None) -> TrainedScene:
+        """The scene of a checkpoint, on the run's device.
+
+        Args:
+            path: The checkpoint; the newest one if None.
 
         Raises:
             ValueError: If there is no checkpoint, or it is damaged or does not fit the config.
         """
-        path = self.newest_checkpoint()
+        path = path or self.newest_checkpoint()
         if path is None:
             raise ValueError(f"{self.folder} has no checkpoint yet")
         loaded = checkpoint.load(path)

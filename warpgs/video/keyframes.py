@@ -89,12 +89,29 @@ def write_path(path: Path, cameras: Sequence[Camera]) -> None:
     write_json(path, {"keyframes": keyframes})
 
 
+def saved_names(run: Path) -> list[str]:
+    """Names of the paths that are saved in a run folder, in the order of their names."""
+    return sorted(path.stem for path in (run / FOLDER).glob("*.json") if NAME.fullmatch(path.stem))
+
+
 def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
     """Reads the keyframes of a file and interpolates ``frames`` cameras.
 
     Raises:
         ValueError: If the file is missing, damaged or not a valid path; the message names it.
     """
+    cameras, knots = read_keyframes(path, capture)
+    return along(cameras, knots, frames)
+
+
+def along(cameras: Sequence[Camera], knots: Sequence[float], frames: int) -> list[Camera]:
+    """``frames`` cameras along a path, at equal distances between the first and the last knot."""
+    at = [knots[0] + (knots[-1] - knots[0]) * fraction for fraction in camera_paths.evenly_spaced(frames)]
+    return camera_paths.interpolated(cameras, knots, at, smooth=True)
+
+
+def read_keyframes(path: Path, capture: Capture) -> tuple[list[Camera], list[float]]:
+    """The cameras of a file's keyframes, and the position of each on the path; raises as ``read_path``."""
     values = read_json(path, max_bytes=MAX_BYTES)
     if unknown := sorted(set(values) - {"up", "keyframes"}):
         raise ValueError(f"{path} has an unknown field {unknown[0]!r}, expected up and keyframes")
@@ -106,9 +123,7 @@ def read_path(path: Path, capture: Capture, frames: int) -> list[Camera]:
     for k, value in enumerate(keyframes):
         size = cameras[0].size if cameras else None
         cameras.append(_keyframe(f"{path}: keyframe {k}", value, capture, up, size))
-    knots = _knots(path, keyframes)
-    at = [knots[0] + (knots[-1] - knots[0]) * fraction for fraction in camera_paths.evenly_spaced(frames)]
-    return camera_paths.interpolated(cameras, knots, at, smooth=True)
+    return cameras, _knots(path, keyframes)
 
 
 def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[int, int] | None) -> Camera:

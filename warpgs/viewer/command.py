@@ -20,7 +20,7 @@ class View:
     port: int = 8080
     """Port to listen on; 0 chooses a free one."""
     while_training: bool = False
-    """Follow a run in training: show each new checkpoint. Nothing is read while no browser is connected."""
+    """Follow a run in training: show what is trained now. Nothing is read while no browser is connected."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""
 

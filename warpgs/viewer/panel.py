@@ -6,9 +6,11 @@ import numpy as np
 import viser
 
 from .layers import LAYERS
+from .path_controls import PathControls
 from .training_cameras import TrainingCameras
 
 PLAY, PAUSE = "Play", "Pause"
+BACK, FORWARD = "◀", "▶"
 HELP = "Drag: orbit · right drag: pan · wheel: zoom · W A S D Q E: fly"
 TIMES, SPEEDS, WIDTHS = (0.0, 1.0), (0.1, 4.0), (160, 1920)
 """Ranges of the sliders of time, speed and image width [px]."""
@@ -18,29 +20,39 @@ SPECIAL = "\\`*_{}[]()#+!|<>&~"
 
 
 class Panel:
-    """The controls of one browser; ``session`` and ``path_editor`` implement what they do."""
+    """The controls of one browser; ``session`` and ``path_editor`` implement what they do.
 
-    def __init__(self, gui: viser.GuiApi, training: TrainingCameras | None, width: int) -> None:
+    Args:
+        gui: Where to add them.
+        training: The training cameras, if there are any.
+        width: Initial width of the image at rest [px].
+        is_narrow: Whether the panel would cover the image: then all folders but that of the time are closed.
+
+    Attributes:
+        path: The controls of camera paths.
+    """
+
+    def __init__(
+        self, gui: viser.GuiApi, training: TrainingCameras | None, width: int, is_narrow: bool = False
+    ) -> None:
         self.status = gui.add_markdown("starting")
         with gui.add_folder("Time"):
             self.time = gui.add_slider("time", *TIMES, 0.001, 0.0)
             self.play = gui.add_button(PLAY)
+            self.step = gui.add_button_group("frame", (BACK, FORWARD), hint="To the time of the next training frame")
             self.speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: the whole scene in 5 seconds")
-        with gui.add_folder("Image"):
+        with gui.add_folder("Image", expand_by_default=not is_narrow):
             self.layer = gui.add_dropdown("layer", tuple(LAYERS), initial_value=next(iter(LAYERS)))
             hint = "Off: static Gaussians have their own colours, without the appearance network"
             self.residual = gui.add_checkbox("appearance", True, hint=hint)
             hint = "Width at rest; while something changes, as much as the machine can render in time"
             self.width = gui.add_slider("width [px]", *WIDTHS, 80, width, hint=hint)
+            self.screenshot = gui.add_button("Screenshot", hint="Downloads the image at this width as a PNG file")
         if training is not None:
-            self._add_training(gui, training)
-        with gui.add_folder("Camera path"):
-            self.path_name = gui.add_text("name", "path", hint="Saved in the run folder as paths/NAME.json")
-            self.add_keyframe = gui.add_button("Add keyframe", hint="The current camera and time")
-            self.remove_keyframe = gui.add_button("Remove last keyframe")
-            self.save_path = gui.add_button("Save path")
-            self.path_note = gui.add_markdown("no keyframes")
-        gui.add_markdown(HELP)
+            self._add_training(gui, training, is_narrow)
+        self.path = PathControls(gui)
+        with gui.add_folder("Help", expand_by_default=False):
+            gui.add_markdown(HELP)
 
     # A browser may send any value, so each is checked again here.
 
@@ -60,17 +72,24 @@ class Panel:
         return int(_clamped(self.width.value, WIDTHS))
 
     @property
+    def current_wipe(self) -> float:
+        """Part of the image of a training camera that shows the truth, in [0, 1]; 0 without training cameras."""
+        return _clamped(self.wipe.value, (0.0, 1.0)) if hasattr(self, "wipe") else 0.0
+
+    @property
     def current_layer(self) -> str:
         """Name of the layer to show, a key of ``LAYERS``."""
         name = self.layer.value
         return name if isinstance(name, str) and name in LAYERS else next(iter(LAYERS))
 
-    def _add_training(self, gui: viser.GuiApi, training: TrainingCameras) -> None:
+    def _add_training(self, gui: viser.GuiApi, training: TrainingCameras, is_narrow: bool) -> None:
         count, first = len(training.views), training.thumbnail(0)
-        with gui.add_folder("Training cameras"):
+        with gui.add_folder("Training cameras", expand_by_default=not is_narrow):
             self.show_cameras = gui.add_checkbox("show in the scene", False, hint="Click a camera to look through it")
             self.view = gui.add_slider("camera", 1, max(2, count), 1, 1, disabled=count < 2)
             self.snap = gui.add_button("Look through it")
+            hint = "Left of the border is the training image, as long as the camera stays where it was recorded"
+            self.wipe = gui.add_slider("truth", 0.0, 1.0, 0.01, 0.0, hint=hint)
             image = np.zeros((1, 1, 3), np.uint8) if first is None else first
             self.truth = gui.add_image(image, label="training image")
 

@@ -1,76 +1,225 @@
-"""The keyframes that one browser collects."""
+"""The keyframes that one browser collects: added, edited, previewed, saved, loaded and rendered."""
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import viser
 
 from warpgs.cameras import Camera
+from warpgs.data.capture import Capture
+from warpgs.errors import one_line
 from warpgs.video import keyframes
 
 from .frustums import ORANGE, add_frustum
-from .panel import Panel, escape
+from .panel import escape, set_value
+from .path_controls import NEW, PathControls
 from .pose import camera_of, pose_of
 
 MAX_KEYFRAMES = 1000
+PREVIEW_SECONDS, PREVIEW_RATE = 5.0, 24.0
+"""Duration of a preview [s], and its frames per second."""
+
+NONE = "none"
+"""Entry of the menu of keyframes without any."""
+
+
+@runtime_checkable
+class BrowserView(Protocol):
+    """What the editor needs of a browser."""
+
+    def current_camera(self) -> Camera:
+        """The camera of the browser, with the time that it shows."""
+
+    def go_to(self, camera: Camera) -> None:
+        """Moves the camera of the browser, and its time."""
 
 
 class PathEditor:
-    """Adds, removes and saves keyframes with the buttons of a panel.
+    """Does what the controls of camera paths ask for.
 
     Args:
         scene: Scene of the browser, which shows the keyframes.
-        panel: Panel of the browser.
+        controls: Controls of the browser.
         run: Run folder to save into.
-        current_camera: Returns the camera of the browser.
+        browser: The browser's camera.
         scale: Size of the keyframes in the scene [scene units].
+        capture: Capture whose views paths may name; None if it cannot be read: then paths cannot be loaded.
     """
 
     def __init__(
-        self, scene: viser.SceneApi, panel: Panel, run: Path, current_camera: Callable[[], Camera], scale: float
+        self,
+        scene: viser.SceneApi,
+        controls: PathControls,
+        run: Path,
+        browser: BrowserView,
+        scale: float,
+        capture: Capture | None,
     ) -> None:
-        self._scene, self._panel, self._run, self._scale = scene, panel, run, scale
-        self._current_camera = current_camera
-        self._lock = threading.Lock()  # each click is handled on its own thread
+        self._scene, self._controls, self._run, self._scale = scene, controls, run, scale
+        self._browser, self._capture = browser, capture
+        # Each click is handled on its own thread; a control that is set calls its handlers on this one.
+        self._lock = threading.RLock()
+        self._stopped = threading.Event()
+        self._child: subprocess.Popen[str] | None = None
         self.cameras: list[Camera] = []
-        panel.add_keyframe.on_click(lambda _: self._add())
-        panel.remove_keyframe.on_click(lambda _: self._remove())
-        panel.save_path.on_click(lambda _: self._save())
+        for button, action in (
+            (controls.add, self._add),
+            (controls.replace, self._replace),
+            (controls.remove, self._remove),
+            (controls.preview, self._preview),
+            (controls.save, self._save),
+            (controls.render, self._render),
+        ):
+            button.on_click(partial(_without_event, action))
+        controls.selected.on_update(lambda _: self._go())
+        controls.saved.on_update(lambda _: self._load())
+        self._list_saved()
+
+    def stop(self) -> None:
+        """Ends a preview and a video that is being rendered."""
+        self._stopped.set()
+        if self._child is not None:
+            self._child.terminate()
+
+    # Keyframes --------------------------------------------------------------------------------------------------------
+
+    @property
+    def selected(self) -> int:
+        """Index of the selected keyframe; -1 without keyframes."""
+        value = self._controls.selected.value
+        index = int(value) - 1 if isinstance(value, str) and value.isdecimal() and len(value) < 6 else -1
+        return min(index, len(self.cameras) - 1)
 
     def _add(self) -> None:
-        camera = self._current_camera()
-        pose = pose_of(camera)
-        even = (max(2, camera.width & ~1), max(2, camera.height & ~1))  # video codecs need even sizes
         with self._lock:
             if len(self.cameras) >= MAX_KEYFRAMES:
-                self._panel.path_note.content = f"a path has at most {MAX_KEYFRAMES} keyframes"
+                self._note(f"a path has at most {MAX_KEYFRAMES} keyframes")
                 return
-            size = self.cameras[0].size if self.cameras else even  # all frames of a video have one size
-            self.cameras.append(camera_of(pose, size, camera.time))
-            add_frustum(self._scene, self._last_name(), pose, size[0] / size[1], self._scale, ORANGE)
-            self._panel.path_note.content = self._count()
+            index = self.selected + 1
+            self.cameras.insert(index, self._current())
+            self._show(index)
+
+    def _replace(self) -> None:
+        with self._lock:
+            if self.cameras:
+                self.cameras[self.selected] = self._current()
+            self._show(self.selected)
 
     def _remove(self) -> None:
         with self._lock:
+            index = self.selected
             if self.cameras:
-                self._scene.remove_by_name(self._last_name())
-                self.cameras.pop()
-            self._panel.path_note.content = self._count()
+                del self.cameras[index]
+            self._show(min(index, len(self.cameras) - 1))
 
-    def _save(self) -> None:
-        try:
-            with self._lock:  # otherwise two clicks could choose the same file
-                path = keyframes.path_of(self._run, self._panel.path_name.value)
-                keyframes.write_path(path, self.cameras)
-        except (ValueError, OSError) as error:
-            self._panel.path_note.content = escape(str(error))
-        else:
-            self._panel.path_note.content = escape(f"{self._count()} saved as {path}")
+    def _current(self) -> Camera:
+        """The camera of the browser; all frames of a video have one size, and codecs need even ones."""
+        camera = self._browser.current_camera()
+        even = (max(2, camera.width & ~1), max(2, camera.height & ~1))
+        return camera_of(pose_of(camera), self.cameras[0].size if self.cameras else even, camera.time)
 
-    def _last_name(self) -> str:
-        return f"/keyframes/{len(self.cameras)}"
+    def _go(self) -> None:
+        with self._lock:
+            camera = self.cameras[self.selected] if self.cameras else None
+        if camera is not None:
+            self._browser.go_to(camera)
+
+    def _show(self, selected: int) -> None:
+        """Shows all keyframes in the scene, and in the menu."""
+        self._scene.remove_by_name("/keyframes")
+        for k, camera in enumerate(self.cameras):
+            name = f"/keyframes/{k + 1}"
+            add_frustum(self._scene, name, pose_of(camera), camera.width / camera.height, self._scale, ORANGE)
+        names = tuple(str(k + 1) for k in range(len(self.cameras))) or (NONE,)
+        self._controls.selected.options = names
+        set_value(self._controls.selected, names[max(0, selected)])
+        self._note(self._count())
 
     def _count(self) -> str:
         count = len(self.cameras)
         return f"{count or 'no'} keyframe{'' if count == 1 else 's'}"
+
+    def _note(self, text: str) -> None:
+        self._controls.note.content = escape(text)
+
+    # Files ------------------------------------------------------------------------------------------------------------
+
+    def _list_saved(self) -> None:
+        self._controls.saved.options = (NEW, *keyframes.saved_names(self._run))
+
+    def _save(self) -> Path | None:
+        try:
+            with self._lock:  # otherwise two clicks could choose the same file
+                path = keyframes.path_of(self._run, self._controls.name.value)
+                keyframes.write_path(path, self.cameras)
+        except (ValueError, OSError) as error:
+            self._note(str(error))
+            return None
+        self._list_saved()
+        self._note(f"{self._count()} saved as {path}")
+        return path
+
+    def _load(self) -> None:
+        name = self._controls.saved.value
+        if name not in keyframes.saved_names(self._run):  # a browser may send anything
+            return
+        if self._capture is None:
+            self._note("paths cannot be loaded without the capture")
+            return
+        try:
+            cameras, _ = keyframes.read_keyframes(self._run / keyframes.FOLDER / f"{name}.json", self._capture)
+        except (ValueError, OSError) as error:
+            self._note(str(error))
+            return
+        with self._lock:
+            self.cameras = cameras[:MAX_KEYFRAMES]
+            self._show(0)
+        set_value(self._controls.name, name)
+        self._browser.go_to(cameras[0])
+
+    def _render(self) -> None:
+        """Renders the path in a process of its own; two threads must not render at the same time."""
+        path = self._save()
+        if path is None:
+            return
+        with self._lock:
+            if self._child is not None and self._child.poll() is None:
+                self._note("another video is being rendered")
+                return
+            command = [sys.executable, "-m", "warpgs", "render", str(self._run), "--keyframes", str(path)]
+            self._child = child = subprocess.Popen(
+                [*command, "--write", "mp4", "--quiet"],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            self._note(f"rendering {path.stem} …")
+        output, errors = child.communicate()
+        lines = (errors if child.returncode else output).strip().splitlines()
+        if not self._stopped.is_set():
+            self._note(one_line(ValueError(lines[-1])) if lines else f"the video ended with {child.returncode}")
+
+    def _preview(self) -> None:
+        """Moves the browser's camera along the path."""
+        with self._lock:
+            cameras = list(self.cameras)
+        if len(cameras) < 2:
+            self._note("a preview needs two keyframes")
+            return
+        frames = keyframes.along(
+            cameras, [float(k) for k in range(len(cameras))], round(PREVIEW_SECONDS * PREVIEW_RATE)
+        )
+        for camera in frames:
+            self._browser.go_to(camera)
+            if self._stopped.wait(1.0 / PREVIEW_RATE):
+                return
+
+
+def _without_event(action: Callable[[], object], event: object) -> None:
+    action()

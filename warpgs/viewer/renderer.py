@@ -4,15 +4,12 @@ import threading
 import time
 from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import UInt8
-
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize import to_bytes
 
-from .layers import render_layer
+from .layers import Image, render_layer
 from .pose import Pose, camera_of
 
 
@@ -27,6 +24,7 @@ class RenderRequest(NamedTuple):
         layer: Key of ``LAYERS``.
         residual: Whether the appearance network changes the static Gaussians.
         time: Time in [0, 1].
+        truth: Index of the training camera whose image is shown beside, and the part of its width; None without.
     """
 
     scene: TrainedScene
@@ -36,6 +34,7 @@ class RenderRequest(NamedTuple):
     layer: str
     residual: bool
     time: float
+    truth: tuple[int, float] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,7 +58,7 @@ class Rendered(NamedTuple):
         is_warm_up: Whether it was rendered before images of its size replay a CUDA graph; later images take less time.
     """
 
-    image: UInt8[np.ndarray, "H W 3"]
+    image: Image
     seconds: float
     is_warm_up: bool
 
@@ -89,7 +88,7 @@ class Renderer:
             image = to_bytes(scene.play(camera.to(scene.device))) if replays else self._render_layer(request, camera)
             return Rendered(image, time.perf_counter() - start, is_warm_up)
 
-    def _render_layer(self, request: RenderRequest, camera: Camera) -> UInt8[np.ndarray, "H W 3"]:
+    def _render_layer(self, request: RenderRequest, camera: Camera) -> Image:
         return render_layer(request.layer, self._splats_of(request), camera, request.scene.config.antialias)
 
     def _splats_of(self, request: RenderRequest) -> Splats:

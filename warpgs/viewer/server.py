@@ -10,7 +10,7 @@ import viser
 
 from .browser_camera import set_camera, start_camera
 from .origin import refuse_foreign_pages
-from .session import Session
+from .session import Session, View
 from .source import Source
 from .training_cameras import TrainingCameras
 
@@ -69,6 +69,7 @@ class Viewer:
         self._source, self._training = source, training
         self._rendering, self._lock = threading.Lock(), threading.Lock()
         self._stopped = False
+        self._left: View | None = None  # what the last page showed; a reload is a browser that leaves and comes back
         self.sessions: dict[int, Session] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # without viser's banner
             self._server = _Server(host, port, label=LABEL, verbose=False)
@@ -76,7 +77,10 @@ class Viewer:
         if port not in (0, self.port):
             self.stop()
             raise OSError(f"cannot listen on {host}, port {port}: Address already in use; choose another --port")
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        self._server.gui.configure_theme(
+            control_width="small", show_logo=False, show_share_button=False, dark_mode=True
+        )
+        self._server.gui.main_panel.dock_right()  # beside the image, not over it
         refuse_foreign_pages(self._server, host)
         self._start = start_camera(source, training)
         self._set_initial_camera()
@@ -111,7 +115,9 @@ class Viewer:
     def _add_session(self, client: viser.ClientHandle) -> None:
         width = CUDA_WIDTH if self._source.device.type == "cuda" else CPU_WIDTH
         set_camera(client.camera, self._start)
-        session = Session(client, self._source, self._training, self._rendering, width)
+        with self._lock:
+            view, self._left = self._left, None
+        session = Session(client, self._source, self._training, self._rendering, width, view)
         with self._lock:
             is_connected = not self._stopped and client.client_id in self._server.get_clients()
             if is_connected:
@@ -122,6 +128,8 @@ class Viewer:
     def _remove_session(self, client: viser.ClientHandle) -> None:
         with self._lock:
             session = self.sessions.pop(client.client_id, None)
+            if session is not None:
+                self._left = session.view()
         if session is not None:
             session.stop()
 

@@ -1,24 +1,27 @@
 """One browser: its camera, its controls, and the thread that renders for it."""
 
+import bisect
 import threading
 import time
 from collections import deque
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
 
 from warpgs.cameras import Camera
+from warpgs.files import encode_png
 
+from . import comparison
 from .adaptive_resolution import AdaptiveResolution
-from .browser_camera import set_camera, through_training_camera
+from .browser_camera import BrowserCamera, set_camera, through_training_camera
 from .clock import Clock
 from .frustums import BLUE, add_frustum
-from .panel import PAUSE, PLAY, Panel, escape, set_value
+from .panel import FORWARD, PAUSE, PLAY, Panel, escape, set_value
 from .path_editor import PathEditor
-from .pose import Pose, camera_of
-from .renderer import Renderer, RenderRequest
+from .pose import Pose, camera_of, pose_of
+from .renderer import Image, Renderer, RenderRequest
 from .source import Source
 from .training_cameras import TrainingCameras
 
@@ -43,8 +46,35 @@ MAX_CANVAS = (4096, 2160)
 MAX_ASPECT = 4
 """Maximum height over width of a keyframe."""
 
+NARROW = 600
+"""Width of a canvas below which the panel lies over the image [px]."""
+
 KEYFRAME_SCALE = 0.1
 """Size of keyframes in a scene without training cameras [scene units]."""
+
+
+STEPS = 60
+"""Steps of the time of a scene without training cameras."""
+
+
+class View(NamedTuple):
+    """What a browser shows, which survives a reload of its page.
+
+    Attributes:
+        camera: Its camera.
+        orientation: Quaternion of the camera, with its roll.
+        controls: Values of the controls of the panel, by name.
+        training_view: Number of the training camera that the slider selects, from 1.
+    """
+
+    camera: BrowserCamera
+    orientation: np.ndarray
+    controls: dict[str, Any]
+    training_view: int | None
+
+
+KEPT = ("time", "speed", "layer", "residual", "width")
+"""Controls whose values survive a reload."""
 
 
 class Shown(NamedTuple):
@@ -63,6 +93,7 @@ class Session:
         training: The training cameras, if there are any.
         rendering: Lock of ``Renderer``.
         width: Initial width of the image at rest [px].
+        view: What the page showed before it was reloaded; None for a new one.
     """
 
     def __init__(
@@ -72,6 +103,7 @@ class Session:
         training: TrainingCameras | None,
         rendering: threading.Lock,
         width: int,
+        view: View | None = None,
     ) -> None:
         self._client, self._source, self._training = client, source, training
         self._renderer, self._resolution, self._clock = Renderer(rendering), AdaptiveResolution(), Clock()
@@ -84,11 +116,14 @@ class Session:
         self._cost = ("", 0.0)
         self._note = self._problem = ""
         self._status_at = 0.0
-        self.panel = Panel(client.gui, training, width)
+        self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
-        self.path = PathEditor(client.scene, self.panel, source.run.folder, self._camera, scale)
+        capture = None if training is None else training.capture
+        self.path = PathEditor(client.scene, self.panel.path, source.run.folder, self, scale, capture)
+        if view is not None:
+            self._restore(view)
         self._connect()
-        if training is not None:
+        if training is not None and view is None:
             set_value(self.panel.view, len(training.views) // 2 + 1)  # its handler calls _snap
         self._thread = threading.Thread(target=self._run, name=f"viewer-{client.client_id}", daemon=True)
         self._thread.start()
@@ -97,10 +132,29 @@ class Session:
         """Ends the thread after the current image."""
         self._stopped.set()
         self._wake.set()
+        self.path.stop()
 
     def join(self, timeout: float | None = None) -> None:
         """Waits for the thread, at most ``timeout`` seconds."""
         self._thread.join(timeout)
+
+    # A page that is reloaded ------------------------------------------------------------------------------------------
+
+    def view(self) -> View:
+        """What the browser shows."""
+        camera, panel = self._client.camera, self.panel
+        seen = BrowserCamera(camera.position, camera.look_at, camera.up_direction, float(camera.fov))
+        controls = {name: getattr(panel, name).value for name in KEPT}
+        return View(seen, camera.wxyz, controls, None if self._training is None else panel.view.value)
+
+    def _restore(self, view: View) -> None:
+        for name, value in view.controls.items():
+            set_value(getattr(self.panel, name), value)
+        if self._training is not None and view.training_view is not None:
+            set_value(self.panel.view, view.training_view)
+        with self._client.atomic():
+            set_camera(self._client.camera, view.camera)
+            self._client.camera.wxyz = view.orientation
 
     # Handlers of the controls -----------------------------------------------------------------------------------------
 
@@ -110,7 +164,10 @@ class Session:
         for control in (panel.time, panel.layer, panel.residual, panel.width):
             control.on_update(lambda _: self._wake.set())
         panel.play.on_click(lambda _: self._toggle())
+        panel.step.on_click(lambda _: self._step(panel.step.value == FORWARD))
+        panel.screenshot.on_click(lambda _: self._send_screenshot())
         if training is not None:
+            panel.wipe.on_update(lambda _: self._wake.set())
             panel.view.on_update(lambda _: self._snap(training))
             panel.snap.on_click(lambda _: self._snap(training))
             panel.show_cameras.on_update(lambda _: self._show_cameras(training))
@@ -120,6 +177,32 @@ class Session:
             self._clock.toggle()
             self.panel.play.label = PAUSE if self._clock.playing else PLAY
         self._wake.set()
+
+    def _step(self, forward: bool) -> None:
+        """Goes to the time of the next training frame, or of the one before, and pauses."""
+        with self._lock:
+            if self._clock.playing:
+                self._clock.toggle()
+                self.panel.play.label = PLAY
+            times = [k / STEPS for k in range(STEPS + 1)] if self._training is None else self._training.times
+            now = self.panel.current_time
+            # The slider has three digits.
+            index = bisect.bisect_right(times, now + 1e-3) if forward else bisect.bisect_left(times, now - 1e-3) - 1
+            set_value(self.panel.time, times[min(max(index, 0), len(times) - 1)])
+        self._wake.set()
+
+    def _send_screenshot(self) -> None:
+        """Sends the image at full resolution to the browser as a PNG file."""
+        request = self._request()
+        if request is None:
+            return
+        try:
+            image = self._with_truth(request, self._renderer.render(request, 1.0).image)
+        except (ValueError, RuntimeError) as error:
+            self._problem = str(error)
+            return
+        name = f"{self._source.run.folder.resolve().name}-{request.layer.replace(' ', '-')}-{request.time:.3f}.png"
+        self._client.send_file_download(name, encode_png(image), save_immediately=True)
 
     def _snap(self, training: TrainingCameras) -> None:
         """Looks through the training camera that the slider selects, at its time."""
@@ -196,14 +279,37 @@ class Session:
         if scene is None:
             return None
         controls = (panel.current_width, panel.current_layer, bool(panel.residual.value), panel.current_time)
-        return RenderRequest(scene, self._pose(), self._canvas(), *controls)
+        request = RenderRequest(scene, self._pose(), self._canvas(), *controls)
+        return request._replace(truth=self._truth_for(request))
+
+    def _truth_for(self, request: RenderRequest) -> tuple[int, float] | None:
+        """The training camera whose image is shown beside, and which part of it; only from where it was recorded."""
+        training, wipe = self._training, self.panel.current_wipe
+        if training is None or not wipe:
+            return None
+        index = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+        camera = camera_of(request.pose, request.size, request.time)
+        beside = comparison.is_beside(camera, training.camera(index), training.capture.extent)
+        return (index, wipe) if beside else None
+
+    def _with_truth(self, request: RenderRequest, image: Image) -> Image:
+        """An image with the part of the training image that its request asks for."""
+        if request.truth is None or self._training is None:
+            return image
+        index, fraction = request.truth
+        truth = self._training.image(index)
+        if truth is None:
+            return image
+        camera = camera_of(request.pose, (image.shape[1], image.shape[0]), request.time)
+        return comparison.wiped(image, comparison.turned(truth, self._training.camera(index), camera), fraction)
 
     def _render(self, request: RenderRequest, scale: float) -> None:
         """Renders an image and sends it to the browser."""
         rendered = self._renderer.render(request, scale)
         start = time.perf_counter() - rendered.seconds  # without waiting for the images of other browsers
         quality = QUALITY_AT_REST if scale == 1 else QUALITY
-        self._client.scene.set_background_image(rendered.image, format="jpeg", jpeg_quality=quality)
+        image = self._with_truth(request, rendered.image)
+        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
         now = time.perf_counter()
         width, height = request.size_at(scale)
         if not rendered.is_warm_up:
@@ -223,7 +329,16 @@ class Session:
         factor = min(1.0, MAX_CANVAS[0] / width, MAX_CANVAS[1] / height)
         return max(1, round(width * factor)), max(1, round(height * factor))
 
-    def _camera(self) -> Camera:
+    def go_to(self, camera: Camera) -> None:
+        """Moves the camera of the browser, and its time."""
+        pose, handle = pose_of(camera), self._client.camera
+        with self._client.atomic():
+            handle.wxyz, handle.position = np.array(pose.wxyz), np.array(pose.position)
+            handle.fov = pose.fov
+        set_value(self.panel.time, camera.time)
+        self._wake.set()
+
+    def current_camera(self) -> Camera:
         """The current camera for a keyframe, with the width of the slider: the size of the canvas may change."""
         width, height = self._canvas()
         across = self.panel.current_width
@@ -236,7 +351,7 @@ class Session:
         if now - self._status_at < STATUS_SECONDS:
             return
         self._status_at = now
-        lines = [escape(line) for line in (self._problem, self._note, self._source.note) if line]
+        lines = [escape(line) for line in (self._problem, self._note, self._source.note, self._source.progress) if line]
         if self._shown is not None:
             trained = self._shown.request.scene
             static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)

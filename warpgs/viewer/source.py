@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from warpgs.errors import one_line
+from warpgs.runs import preview
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
 
@@ -25,6 +26,7 @@ class Source:
     Attributes:
         run: The run.
         note: Why there is no (newer) scene; empty if there is one.
+        progress: How far the training is that is followed; empty if unknown.
 
     Raises:
         ValueError: Without ``follow``, if the run has no valid checkpoint.
@@ -32,7 +34,7 @@ class Source:
 
     def __init__(self, run: Run, follow: bool = False) -> None:
         self.run, self.follow = run, follow
-        self.note = ""
+        self.note = self.progress = ""
         self._lock = threading.Lock()
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
@@ -43,7 +45,10 @@ class Source:
         return self.run.device
 
     def current(self) -> TrainedScene | None:
-        """The newest scene; the one before it if the newest cannot be read; None before the first checkpoint."""
+        """The newest scene; the one before it if the newest cannot be read; None before the first checkpoint.
+
+        A training that is followed is asked for what it has between its checkpoints.
+        """
         with self._lock:
             if self.follow and time.monotonic() - self._checked >= POLL_SECONDS:
                 self._checked = time.monotonic()
@@ -51,19 +56,35 @@ class Source:
             return self._scene
 
     def _reload(self) -> None:
+        preview.request(self.run.folder)
         try:
-            newest = self.run.newest_checkpoint()
+            newest = self._newest()
             if newest is None:
                 self.note = "waiting for the first checkpoint"
                 return
             file = (newest, newest.stat().st_mtime_ns)
             if file != self._loaded:
-                self._scene = self.run.trained_scene()
+                self._scene = self.run.trained_scene(newest)
                 self._loaded, self.note = file, ""
         except FileNotFoundError:
             return  # the trainer has replaced it by a newer one, which the next check finds
         except (ValueError, OSError) as error:
             self.note = one_line(error)
+
+    def _newest(self) -> Path | None:
+        """The newest checkpoint, or the preview that the trainer has written since; None without any."""
+        newest, between = self.run.newest_checkpoint(), self.run.folder / preview.SCENE
+        state = preview.read_state(self.run.folder)
+        self.progress = "" if state is None else _described(state)
+        if between.is_file() and (newest is None or between.stat().st_mtime_ns > newest.stat().st_mtime_ns):
+            return between
+        return newest
+
+
+def _described(state: preview.State) -> str:
+    """The state of a training in one line."""
+    rate = "" if state.rate is None else f", {state.rate:.1f} it/s"
+    return f"training: {state.iteration:,} of {state.num_iterations:,} iterations, {state.psnr:.1f} dB{rate}"
 
 
 def open_source(folder: Path, device: Device | None, follow: bool) -> Source:

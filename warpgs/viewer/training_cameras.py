@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.video.camera_paths import evenly_spaced_indices, focus, upward
 
@@ -63,15 +64,34 @@ class TrainingCameras:
         camera = self._capture.cameras[self.views[index].name]
         return (camera.position + focus(camera, self._capture.points) * camera.viewmat[2, :3]).double().numpy()
 
+    def camera(self, index: int) -> Camera:
+        """The camera of a view."""
+        return self._capture.cameras[self.views[index].name]
+
+    @property
+    def times(self) -> list[float]:
+        """All times of the views, in order."""
+        return sorted({view.time for view in self.views})
+
+    @property
+    def capture(self) -> Capture:
+        return self._capture
+
+    def image(self, index: int) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The image of a view; None if it cannot be read."""
+        try:
+            return self._capture.frame(self.views[index].name).image.numpy()
+        except (ValueError, OSError):
+            return None
+
     def frustums(self) -> list[int]:
         """Indices of the views to show in the scene."""
         return evenly_spaced_indices(len(self.views), MAX_FRUSTUMS)
 
     def _thumbnail(self, index: int) -> UInt8[np.ndarray, "H W 3"] | None:
         """The image of a view, scaled down; None if it cannot be read."""
-        try:
-            image = self._capture.frame(self.views[index].name).image.numpy()
-        except (ValueError, OSError):
+        image = self.image(index)
+        if image is None:
             return None
         height, width = image.shape[:2]
         if width <= THUMBNAIL_WIDTH:
