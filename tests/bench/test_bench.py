@@ -92,6 +92,15 @@ def test_the_output_is_plain_text_if_it_is_not_a_terminal(capsys):
     assert output.isascii()
 
 
+def test_the_output_has_names_and_no_keys(capsys):
+    bench(dataclasses.replace(OPTIONS, branches="disc"), [TINY], "cpu")
+    output = capsys.readouterr().out
+    for name in ("CPU: ", "forward and backward [ms]", "pass [ms]: composite, backward", "SSIM, forward and backward"):
+        assert name in output
+    assert "_" not in output.replace("x86_64", "")
+    assert "fwd" not in output
+
+
 @pytest.mark.parametrize("option", [("--against", "gsplat"), ("--graph",)])
 def test_options_that_need_cuda_are_refused_on_cpu_with_one_line(capsys, option):
     assert " ".join(option) + " needs --device cuda" in error_line(capsys, "--device", "cpu", *option)

@@ -112,6 +112,15 @@ def test_playing_advances_time_and_the_slider_stops_it(browser, page):
     browser.until("!state.playing && state.time === 0.75")
 
 
+def test_a_slow_frame_skips_times_instead_of_slowing_down(browser, page):
+    shown(browser, page, "time=0.1")
+    advanced = browser.value(
+        "(() => { state.playing = true; const start = state.time; frame(before + 800); state.playing = false; "
+        "return (state.time - start) * START.seconds; })()"
+    )
+    assert advanced == pytest.approx(0.8 * float(browser.value("document.getElementById('speed').value")), abs=1e-6)
+
+
 @pytest.mark.parametrize(("static", "dynamic"), [(30, 0), (0, 12)])
 def test_a_scene_with_one_branch_and_one_key_time_is_shown(browser, tmp_path, static, dynamic):
     baked = bake(scenes.clouds(static, dynamic).at, [0.0])

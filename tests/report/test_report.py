@@ -18,7 +18,7 @@ from warpgs.cli import main
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.presets import PRESETS
-from warpgs.report.charts import HEIGHT, MAX_POINTS, WIDTH, Series, chart
+from warpgs.report.charts import HEIGHT, MAX_POINTS, MAX_VALUES, WIDTH, Series, chart
 from warpgs.report.command import Report
 from warpgs.report.evaluated_run import read_runs
 from warpgs.report.image_strips import MAX_WIDTH, data_uri, saved_views
@@ -121,11 +121,12 @@ def test_the_report_shows_the_training_time(tmp_path, run):
     assert "1:02:05" in report(tmp_path, run).words
 
 
-def test_strips_show_truth_rendered_image_and_error(tmp_path, run):
+def test_strips_show_truth_all_layers_and_error(tmp_path, run):
     page = report(tmp_path, run, views=1)
-    truth, rendered, error = page.images()[:3]
-    sizes = {decoded(uri).shape for uri in (truth, rendered, error)}
+    truth, rendered, static, dynamic, error = page.images()[:5]
+    sizes = {decoded(uri).shape for uri in (truth, rendered, static, dynamic, error)}
     assert sizes == {(24, 32, 3)}
+    assert len({truth, rendered, static, dynamic, error}) == 5
     evaluated = read_runs([run])[0]
     name = extremes([evaluated], 1)[0][0]
     frame = load_capture(evaluated.config.data).frame(name)
@@ -160,7 +161,7 @@ def test_views_of_several_runs_are_ordered_by_mean_psnr(run, other):
 def test_runs_of_one_capture_are_shown_side_by_side(tmp_path, run, other):
     page = report(tmp_path, run, other, views=1)
     assert page.text.count("Worst views") == 1
-    assert len(page.images()) == 2 * 5  # worst and best; one truth, and two images of each run
+    assert len(page.images()) == 2 * 9  # worst and best; one truth, and four images of each run
     assert {"run", "other"} <= set(page.words)
 
 
@@ -287,7 +288,7 @@ def test_texts_from_a_run_folder_are_escaped(tmp_path, run, made):
 def test_tags_of_curves_are_escaped():
     svg = chart(EVIL, EVIL, [Series(EVIL, "red", [(0.0, 1.0), (1.0, 2.0)])])
     page = Page(svg)
-    assert page.tags() == {"svg", "text", "line", "polyline", "title"}
+    assert page.tags() == {"svg", "text", "line", "polyline", "circle", "title"}
     assert EVIL in page.words
 
 
@@ -325,6 +326,26 @@ def test_a_curve_lies_inside_its_chart(points):
     for curve in points_of(chart("c", "x", [Series("s", "red", points)])):
         assert all(0 <= x <= WIDTH and 0 <= y <= HEIGHT for x, y in curve)
         assert len(curve) <= MAX_POINTS
+
+
+@pytest.mark.parametrize("dots", [False, True])
+def test_values_are_shown_under_the_pointer(dots):
+    svg = chart("psnr/train", "iteration", [Series("run", "red", [(50.0, 21.5), (100.0, 23.25)])], dots)
+    assert "<title>run, iteration 50: 21.5</title>" in svg
+    assert "<title>run, iteration 100: 23.25</title>" in svg
+
+
+def test_long_curves_show_the_values_of_some_points():
+    svg = chart("c", "x", [Series("s", "red", [(float(k), float(k)) for k in range(3000)])])
+    assert 30 < svg.count("<circle") <= MAX_VALUES
+
+
+def test_every_image_can_be_enlarged_without_a_script(tmp_path, run):
+    page = report(tmp_path, run, views=1)
+    boxes = [attrs for tag, attrs in page.elements if tag == "input" and attrs.get("type") == "checkbox"]
+    assert len(boxes) == len(page.images()) > 4
+    assert all(attrs["aria-label"].startswith("enlarge: ") for attrs in boxes)
+    assert "script" not in page.tags()
 
 
 def test_larger_values_are_plotted_higher():

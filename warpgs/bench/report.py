@@ -22,6 +22,34 @@ WIDTH = 120
 WORKLOADS = ("one_image", "three_images", "gsplat")
 """Workloads in the order of their columns."""
 
+NAMES = {
+    "gpu": "GPU",
+    "cpu": "CPU",
+    "warp": "Warp",
+    "fps": "FPS",
+    "one_image": "one image",
+    "three_images": "three images",
+    "forward_backward_ms": "forward and backward [ms]",
+    "forward_backward": "forward and backward",
+    "one_thread_forward_backward_ms": "forward and backward, one thread [ms]",
+    "one_thread_forward_backward": "forward and backward, one thread",
+    "graph_forward_backward_ms": "forward and backward, CUDA graph [ms]",
+    "graph_forward_backward": "forward and backward, CUDA graph",
+    "stages_ms": "pass [ms]:",
+    "composite_fwd": "composite, forward",
+    "composite_bwd": "composite, backward",
+    "ssim": "SSIM, forward and backward",
+    "peak_memory_bytes": "peak memory [bytes]",
+    "max_image": "of the image, largest",
+    "mean_image": "of the image, mean",
+    "visible_pixels": "of the image, visible pixels",
+    "relative_gradients": "of gradients, relative:",
+    "stage1_ms": "step of stage I [ms]",
+    "stage2_ms": "step of stage II [ms]",
+    "frames_per_second": "frames per second",
+}
+"""Names of keys in JSON; others are shown as they are, without underscores."""
+
 UNITS = {"_ms": " [ms]", "_mb": " [MB]", "_bytes": " [bytes]"}
 """Units by the suffixes of keys in JSON."""
 
@@ -53,7 +81,9 @@ def cpu_model() -> str:
 
 def print_machine(head: dict[str, Any]) -> None:
     """Prints the result of ``machine`` on one line."""
-    _console().print(", ".join(f"{name}: {value}" for name, value in head.items()), highlight=False, soft_wrap=True)
+    _console().print(
+        ", ".join(f"{NAMES.get(name, name)}: {value}" for name, value in head.items()), highlight=False, soft_wrap=True
+    )
 
 
 def print_result(result: dict[str, Any]) -> None:
@@ -120,7 +150,9 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _label(name: str) -> str:
-    """The label of a JSON key, as rich markup: "forward [ms]" for "forward_ms"."""
+    """The name of a JSON key, as rich markup: "forward [ms]" for "forward_ms"."""
+    if name in NAMES:
+        return escape(NAMES[name])
     for suffix, unit in UNITS.items():
         if name.endswith(suffix):
             name = name.removesuffix(suffix) + unit

@@ -11,6 +11,9 @@ LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 30
 MAX_POINTS = 300
 """Maximum number of points of a curve; more are averaged."""
 
+MAX_VALUES = 75
+"""Maximum number of points of a curve whose values the page shows under the pointer; views show all."""
+
 
 class Series(NamedTuple):
     """One curve of a chart; ``points`` are finite (x, y) in the order of x."""
@@ -50,8 +53,13 @@ def chart(title: str, x_name: str, series: Sequence[Series], dots: bool = False)
         at = [(_pixel_x(x, x_range), _pixel_y(y, y_range)) for x, y in s.points]
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in at)
         parts.append(f'<polyline points="{line}" stroke="{s.color}"><title>{html.escape(s.name)}</title></polyline>')
-        if dots or len(at) == 1:
-            parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="2.5" fill="{s.color}"/>' for x, y in at]
+        is_marked = dots or len(at) == 1
+        stride = 1 if is_marked else math.ceil(len(at) / MAX_VALUES)
+        for k in range(0, len(at), stride):
+            (x, y), (x_value, y_value) = at[k], s.points[k]
+            look = f'r="2.5" fill="{s.color}"' if is_marked else 'r="5" class="value"'
+            value = f"{html.escape(s.name)}, {html.escape(x_name)} {x_value:.6g}: {y_value:.5g}"
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" {look}><title>{value}</title></circle>')
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">{"".join(parts)}</svg>'
 
 

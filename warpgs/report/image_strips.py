@@ -1,4 +1,4 @@
-"""Ground truth, rendered image and error image of views."""
+"""Ground truth, joint, static and dynamic image and error image of views."""
 
 import base64
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from warpgs.runs.run import Device, Run
 
 from .evaluated_run import EvaluatedRun
 
-MAX_WIDTH = 480
+MAX_WIDTH = 800
 """Maximum width of an embedded image [px]."""
 
 QUALITY = 88
@@ -35,6 +35,8 @@ class Strip(NamedTuple):
 
     truth: str
     rendered: str
+    static: str
+    dynamic: str
     error: str
 
 
@@ -77,9 +79,11 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
             raise ValueError(f"{capture.name} has no view {name}")
         frame = capture.frame(name)
         truth = frame.image.to(scene.device).float() / 255.0
-        image = scene.render(align(frame)).joint.image.clamp(0, 1)
-        images = visualize.to_bytes(truth), visualize.to_bytes(image), visualize.error_image(image, truth)
-        strips[name] = Strip(*map(data_uri, images))
+        rendering = scene.render(align(frame), branches=True)
+        layers = (rendering.joint, rendering.static, rendering.dynamic)
+        shown = [visualize.to_bytes(layer.image) for layer in layers if layer is not None]
+        error = visualize.error_image(rendering.joint.image.clamp(0, 1), truth)
+        strips[name] = Strip(*map(data_uri, (visualize.to_bytes(truth), *shown, error)))
     measured, newest = evaluated.metrics.get("iterations"), scene.metadata.iteration
     note = "" if measured == newest else f"the images are of iteration {newest}, the metrics of iteration {measured}"
     return Strips(strips, note)
@@ -104,7 +108,7 @@ def _read_saved(folder: Path, name: str) -> Strip | None:
     if image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:
         return None
     panels = np.split(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[visualize.CAPTION_HEIGHT :], PANELS, axis=1)
-    return Strip(*(data_uri(np.ascontiguousarray(panels[k])) for k in (0, 1, 4)))
+    return Strip(*(data_uri(np.ascontiguousarray(panel)) for panel in panels))
 
 
 def data_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:

@@ -26,11 +26,22 @@ td.text { text-align: left; } td.best { font-weight: 700; } .note { color: var(-
 svg text { fill: currentColor; font-size: 11px; } svg .title { font-size: 13px; font-weight: 600; }
 svg .tick { fill: var(--soft); } svg line { stroke: var(--line); }
 svg polyline { fill: none; stroke-width: 1.6; }
+svg .value { fill: transparent; } svg .value:hover { fill: currentColor; }
+.wide { overflow-x: auto; }
 .dot { display: inline-block; width: .75em; height: .75em; border-radius: 50%; margin-right: .4em; }
 .strips { overflow-x: auto; } .strips td { border: 0; padding: .15rem; vertical-align: top; text-align: left; }
 .strips th { border: 0; padding: .15rem .3rem; }
 .strips img { display: block; width: clamp(140px, (min(100vw, 1500px) - 5rem) / var(--columns) - .3rem, 300px); }
+.zoom { position: relative; display: block; cursor: zoom-in; }
+.zoom input { position: absolute; opacity: 0; }
+.zoom input:focus-visible + img { outline: 2px solid; }
+.zoom input:checked + img { position: fixed; inset: 0; z-index: 1; width: 100vw; height: 100vh; object-fit: contain;
+  background: #000d; cursor: zoom-out; }
+@media (max-width: 600px) { body { margin: 1rem auto; padding: 0 .6rem; } td, th { padding: .15rem .35rem; } }
 """
+
+PER_RUN = {"rendered": "rendered", "static": "static", "dynamic": "dynamic", "error": "error"}
+"""Images of a run beside the truth, and their titles."""
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """Content security policy: the page loads nothing."""
@@ -102,7 +113,7 @@ def _summary(runs: Sequence[EvaluatedRun]) -> str:
             for value, formatted in zip(values, texts, strict=True)
         )
         rows.append(f"<tr><th>{text(TITLES.get(name, name))}</th>{cells}</tr>")
-    return f"<h2>Metrics and timing</h2><table>{_header(runs)}{''.join(rows)}</table>"
+    return f"<h2>Metrics and timing</h2>{_wide(_header(runs) + ''.join(rows))}"
 
 
 def _best(name: str, values: Iterable[Any]) -> float | None:
@@ -135,7 +146,9 @@ def _over_time(index: int, run: EvaluatedRun, name: str) -> Series:
 
 
 def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
-    names = "".join(f"<th colspan=2>{_named(runs, k)}: rendered | error</th>" for k in gallery.runs)
+    names = "".join(
+        f"<th colspan={len(PER_RUN)}>{_named(runs, k)}: {' | '.join(PER_RUN.values())}</th>" for k in gallery.runs
+    )
     notes = "".join(
         f"<p class=note>{text(runs[k].label)}: {text(strips.note)}</p>"
         for k, strips in zip(gallery.runs, gallery.strips, strict=True)
@@ -146,7 +159,7 @@ def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
         if views:
             rows.append(f"<tr><th>{title}: ground truth</th>{names}</tr>")
         rows += [_gallery_row(runs, gallery, view) for view in views]
-    columns = 1 + 2 * len(gallery.runs)
+    columns = 1 + len(PER_RUN) * len(gallery.runs)
     error = f"mean absolute error over the channels, black at 0, brightest from {ERROR_RANGE} on"
     scale = f"<p class=note>Ordered by PSNR. Error: {error}.</p>"
     table = f'<div class="strips" style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
@@ -156,18 +169,19 @@ def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
 def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> str:
     truths = [strips.by_view[name].truth for strips in gallery.strips if name in strips.by_view]
     cells = [
-        f'<td><img src="{text(truths[0])}" alt="ground truth">{text(name)}</td>' if truths else f"<td>{text(name)}</td>"
+        f"<td>{_image(truths[0], f'ground truth of {name}')}{text(name)}</td>" if truths else f"<td>{text(name)}</td>"
     ]
     for index, strips in zip(gallery.runs, gallery.strips, strict=True):
         view = next(view for view in runs[index].views if view.name == name)
         psnr = view.metrics.get("psnr")
         quality = "" if psnr is None else f"{psnr:.2f} dB"
         if name not in strips.by_view:
-            cells.append(f"<td colspan=2>{text(quality)} (no image)</td>")
+            cells.append(f"<td colspan={len(PER_RUN)}>{text(quality)} (no image)</td>")
             continue
         strip = strips.by_view[name]
-        cells.append(f'<td><img src="{text(strip.rendered)}" alt="rendered">{text(quality)}</td>')
-        cells.append(f'<td><img src="{text(strip.error)}" alt="error"></td>')
+        for part, title in PER_RUN.items():
+            below = text(quality) if part == "rendered" else ""
+            cells.append(f"<td>{_image(getattr(strip, part), f'{title} of {name}')}{below}</td>")
     return f"<tr>{''.join(cells)}</tr>"
 
 
@@ -185,7 +199,7 @@ def _views(runs: Sequence[EvaluatedRun]) -> str:
         opened = " open" if len(runs) == 1 else ""
         parts.append(
             f"<details{opened}><summary>{_named(runs, index)}: {len(run.views)} views</summary>"
-            f"<table><tr>{head}</tr>{rows}</table></details>"
+            f"{_wide(f'<tr>{head}</tr>{rows}')}</details>"
         )
     return "".join(parts)
 
@@ -203,4 +217,15 @@ def _config(runs: Sequence[EvaluatedRun]) -> str:
         f"<tr><th>{text(name)}</th>{''.join(f'<td class=text>{text(value)}</td>' for value in values)}</tr>"
         for name, values in rows
     )
-    return f"<h2>{title}</h2><table>{_header(runs)}{body}</table>"
+    return f"<h2>{title}</h2>{_wide(_header(runs) + body)}"
+
+
+def _wide(rows: str) -> str:
+    """A table that scrolls sideways where the screen is narrower."""
+    return f'<div class="wide"><table>{rows}</table></div>'
+
+
+def _image(address: str, description: str) -> str:
+    """An image that fills the window after a click, and no longer after another one; pages have no scripts."""
+    label = f'<input type="checkbox" aria-label="enlarge: {text(description)}">'
+    return f'<label class="zoom">{label}<img src="{text(address)}" alt="{text(description)}"></label>'

@@ -172,8 +172,9 @@ worker.onmessage = ({data}) => {
 };
 
 let before = performance.now(), sortedFor = '';
+document.addEventListener('visibilitychange', () => { before = performance.now(); }); // a hidden page is paused
 function frame(now) {
-  const elapsed = Math.min(0.1, (now - before) / 1000);
+  const elapsed = Math.max(0, now - before) / 1000; // slow machines skip times; playback keeps its speed
   before = now;
   if (state.playing && lastKey > 0) {
     state.time = (state.time + elapsed * Number(element('speed').value) / START.seconds) % 1;
