@@ -39,6 +39,7 @@ TITLES = {
     "fps": "FPS",
     "lpips_net": "LPIPS network",
     "num_views": "views",
+    "poses_aligned": "held-out cameras aligned",
     "train_seconds": "training time [h:m:s]",
     "peak_bytes": "peak memory",
     "num_static": "static Gaussians",
@@ -76,7 +77,9 @@ def formatted(name: str, value: Any) -> str:
     """A metric as text: times and sizes with units, numbers with their significant digits."""
     if value is None:
         return "not measured"
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, int | float):
         return str(value)
     if name == "train_seconds":
         minutes, seconds = divmod(round(value), 60)
