@@ -132,3 +132,12 @@ def test_an_object_whose_gaussians_are_lost_gets_new_ones(trainer, capsys, lost)
     assert (f"{added:,} added there" in capsys.readouterr().out) == lost
     trainer.scene.dynamic.logit_opacities.data[:] = 3.0
     assert lost_share(trainer.views, mask_of) < 0.1
+
+
+def test_an_empty_background_is_not_filled_if_everything_is_assumed_to_be_dynamic(trainer):
+    trainer.capture = trainer.capture.assuming("dynamic")
+    lose_half(trainer)
+    num = len(trainer.scene.dynamic)
+    with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
+        trainer._reseed(PHASE, logger)
+    assert len(trainer.scene.dynamic) == num

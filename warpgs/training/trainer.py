@@ -175,6 +175,8 @@ class Trainer:
 
     def _reseed(self, phase: Phase, logger: TrainingLogger) -> None:
         """Adds dynamic Gaussians where none shows what moves."""
+        if self.capture.assumption == "dynamic":
+            return  # the masks are the whole image then, and its background may be empty
         config, scene, views = self.config, self.scene, self.views
         mask_of = lost_pixels(scene, phase, config.antialias)
         share = lost_share(views, mask_of)
