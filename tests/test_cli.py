@@ -95,7 +95,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         ),
         (
             ["train", "--resume", "r", "--seed", "1"],
-            "warpgs train: --resume takes everything but --device and --iterations from the",
+            "warpgs train: --resume takes all but --device, --iterations and --lpips from the",
         ),
     ],
 )

@@ -206,11 +206,11 @@ class DensifyConfig:
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
-    """Share of the dynamic pixels that no dynamic Gaussian shows, from which on new ones start there, whenever static
+    """Fraction of the dynamic pixels that no dynamic Gaussian shows, from which on new ones start there when static
     Gaussians are pruned during densification. 0: never."""
     weakest: Annotated[float, Bounds(max=1)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
-    views: those that together hold this share of all blend weights. 0: none."""
+    views: those that together hold this fraction of all blend weights. 0: none."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.scenes import error
 from warpgs.config import MaskPerturbation, TrainConfig, scaled
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
@@ -308,9 +309,12 @@ def test_without_corrections_or_checkpoint_the_cameras_are_those_of_the_capture(
     )
 
 
-def test_corrections_of_other_frames_are_refused(data, tmp_path):
-    run, _ = run_with_poses(data, tmp_path / "run")
-    path = run.newest_checkpoint()
-    tiny.edit_metadata(path, lambda facts: facts.update(views=facts["views"][:-1]))
-    with pytest.raises(ValueError, match="other frames"):
-        run.open_corrected_capture(quiet=True)
+def test_frames_that_were_not_trained_on_keep_their_cameras(data, tmp_path, capture):
+    run, trainer = run_with_poses(data, tmp_path / "run")
+    tiny.edit_metadata(run.newest_checkpoint(), lambda facts: facts.update(views=["gone", *facts["views"][1:]]))
+    corrected = run.open_corrected_capture(quiet=True)
+    first, second = capture.train[:2]
+    assert torch.equal(corrected.cameras[first].viewmat, capture.cameras[first].viewmat)
+    expected = trainer.views.cameras()[1].viewmat
+    # The unit of translations is the extent of the frames that are still there.
+    assert error(corrected.cameras[second].viewmat, expected) < 0.1 * error(capture.cameras[second].viewmat, expected)

@@ -165,3 +165,15 @@ def test_the_last_stage_takes_the_added_iterations():
 def test_a_run_is_not_shortened():
     with pytest.raises(ValueError, match="expected at least its 32, got 31"):
         extended(tiny.CONFIG, 31)
+
+
+def test_a_held_out_frame_that_cannot_be_read_ends_the_pictures_and_not_the_training():
+    def read(name):
+        raise ValueError(f"{name}.png is damaged")
+
+    lines = []
+    held_out = callbacks.HeldOut(SimpleNamespace(log=lines.append))
+    capture = SimpleNamespace(val=["a"], frame=read)
+    for iteration in (50, 15_000, 30_000):
+        held_out(callbacks.Progress(Status(iteration, "stage1", 0.1, 30.0, {}, 1, 1), 30_000, None, capture))
+    assert lines == ["warning: without held-out views in TensorBoard: a.png is damaged"]

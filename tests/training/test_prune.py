@@ -207,19 +207,19 @@ def test_blend_weights_are_summed_over_the_joint_images_of_all_views(tmp_path):
     assert (expected > 0).sum() > len(expected) / 2
 
 
-def test_the_weakest_are_those_that_together_hold_the_share():
+def test_the_weakest_are_those_that_together_hold_the_fraction():
     scene, optimizer = make_scene_and_optimizer(random_gaussians(), in_front([2.0] * 4, [0.1] * 4, [0.5] * 4))
     weights = torch.full((64,), 2.0)
     weights[[3, 7, 61]] = torch.tensor([1.0, 0.5, 0.0])
     before = scene.static.means.detach().clone(), scene.dynamic.means.detach().clone()
-    share = 1.6 / weights.sum().item()  # 0 + 0.5 + 1.0 fit, 2.0 more do not
-    assert prune_weakest(scene, optimizer, weights, share) == 3
+    fraction = 1.6 / weights.sum().item()  # 0 + 0.5 + 1.0 fit, 2.0 more do not
+    assert prune_weakest(scene, optimizer, weights, fraction) == 3
     kept = [index for index in range(60) if index not in (3, 7)]
     assert torch.equal(scene.static.means, before[0][kept])
     assert torch.equal(scene.dynamic.means, before[1][[0, 2, 3]])
 
 
-def test_a_share_of_zero_removes_what_contributes_nothing():
+def test_a_fraction_of_zero_removes_what_contributes_nothing():
     scene, optimizer = make_scene_and_optimizer(random_gaussians())
     weights = torch.ones(60)
     weights[5] = 0.0

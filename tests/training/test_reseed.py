@@ -13,7 +13,7 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training import optimizer as optim
 from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.reseed import gaussians_that_show, lost_pixels, lost_share
+from warpgs.training.reseed import gaussians_that_show, lost_fraction, lost_pixels
 from warpgs.training.schedule import Phase
 
 PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True)
@@ -65,14 +65,14 @@ def test_lost_are_the_dynamic_pixels_that_dynamic_gaussians_alone_leave_transpar
     assert 0 < expected.sum() < (~view.static_mask).sum()
 
 
-def test_the_share_of_lost_pixels_grows_with_what_is_lost(trainer):
+def test_the_fraction_of_lost_pixels_grows_with_what_is_lost(trainer):
     mask_of = lost_pixels(trainer.scene, PHASE, antialias=False)
-    before = lost_share(trainer.views, mask_of)
+    before = lost_fraction(trainer.views, mask_of)
     lose_half(trainer)
-    half = lost_share(trainer.views, mask_of)
+    half = lost_fraction(trainer.views, mask_of)
     trainer.scene.dynamic = Gaussians.empty(0, 1)
     assert before < 0.1 < half < 1.0
-    assert lost_share(trainer.views, mask_of) == 1.0
+    assert lost_fraction(trainer.views, mask_of) == 1.0
 
 
 def test_added_gaussians_are_deformed_to_where_they_were_seen(trainer):
@@ -131,7 +131,7 @@ def test_an_object_whose_gaussians_are_lost_gets_new_ones(trainer, capsys, lost)
     assert (added > 0) == lost
     assert (f"{added:,} added there" in capsys.readouterr().out) == lost
     trainer.scene.dynamic.logit_opacities.data[:] = 3.0
-    assert lost_share(trainer.views, mask_of) < 0.1
+    assert lost_fraction(trainer.views, mask_of) < 0.1
 
 
 def test_an_empty_background_is_not_filled_if_everything_is_assumed_to_be_dynamic(trainer):

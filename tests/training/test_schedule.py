@@ -289,12 +289,13 @@ def test_the_weakest_are_pruned_once_densification_has_ended():
     weakest = DensifyConfig(every=10, weakest=0.02)
     assert iterations_where("prune_weakest", densify=weakest) == after(60, 90, 100)
     assert iterations_where("prune_weakest", densify=weakest, vdp=False) == after(60, 90, 100)
+    assert iterations_where("prune_weakest", densify=weakest, stage2=False) == after(60, 90, 120)
     assert iterations_where("prune_weakest") == []
 
 
 def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_network_has_warmed_up():
     reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
-    assert iterations_where("reseed", densify=reseed, schedule=often) == after(50, 60)
+    assert iterations_where("reseed", densify=reseed, schedule=often) == after(50)
     assert iterations_where("reseed", schedule=often) == []
 
 

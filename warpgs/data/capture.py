@@ -15,6 +15,13 @@ from warpgs.cameras import Camera
 MIN_EXTENT = 0.05
 """Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
 
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """The extent of a capture with these training cameras; see ``Capture``."""
+    positions = torch.stack([camera.position for camera in cameras])
+    return max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+
+
 Assumption = Literal["masks", "static", "dynamic"]
 """What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
@@ -99,9 +106,9 @@ class Capture:
         if not self.train:
             raise ValueError(f"{self.name} has no frames to train on")
         self.train, self.val = tuple(self.train), tuple(self.val)
-        positions = torch.stack([self.cameras[name].position for name in self.train])
-        self.extent = max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+        self.extent = extent_of([self.cameras[name] for name in self.train])
         self.assumption = self.unmasked
+        self._moved: frozenset[str] = frozenset()
         self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
 
     def assuming(self, assumption: Assumption) -> "Capture":
@@ -123,7 +130,7 @@ class Capture:
     def with_cameras(self, cameras: Mapping[str, Camera]) -> "Capture":
         """The same capture with other cameras of some frames; the captures have one cache of frames."""
         capture = copy.copy(self)
-        capture.cameras = self.cameras | dict(cameras)
+        capture.cameras, capture._moved = self.cameras | dict(cameras), self._moved | set(cameras)
         return capture
 
     def frame(self, name: str) -> Frame:
@@ -135,7 +142,9 @@ class Capture:
         """
         if name not in self.cameras:
             raise KeyError(name)
-        frame = replace(self._cached(name), camera=self.cameras[name])
+        frame = self._cached(name)
+        if name in self._moved:
+            frame = replace(frame, camera=self.cameras[name])
         if not self.has_depth:
             frame = replace(frame, inverse_depth=None)
         if self.assumption == "masks":

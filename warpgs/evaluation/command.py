@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.config import NetName
+
 
 @dataclass(frozen=True)
 class Eval:
@@ -18,7 +20,7 @@ class Eval:
     """Run folder."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
-    lpips_net: Literal["vgg", "alex", "squeeze"] | None = None
+    lpips_net: NetName | None = None
     """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
     as_taken: bool = False
     """Compare frames as they were taken, with the distortion of their lens; by default they are undistorted first."""

@@ -11,7 +11,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, extent_of
 from warpgs.files import partial_path
 
 from . import checkpoint
@@ -105,25 +105,24 @@ class Run:
         return open_capture(self.config, quiet)
 
     def open_corrected_capture(self, quiet: bool = False) -> Capture:
-        """The capture, with the training cameras where training moved them.
+        """The capture, with the cameras of the frames that the run was trained on where training moved them.
 
         Raises:
-            ValueError: As ``open_capture``, or if the newest checkpoint is damaged or of other frames.
+            ValueError: As ``open_capture``, or if the newest checkpoint is damaged.
             OSError: As ``open_capture``.
         """
         capture, path = self.open_capture(quiet), self.newest_checkpoint()
         if not self.config.optim.poses or path is None:
             return capture
         loaded = checkpoint.load(path)
-        if loaded.metadata.views != capture.train:
-            raise ValueError(f"{path} was trained on other frames than {capture.name} has now")
-        poses = checkpoint.load_poses(loaded, capture.extent)
-        cameras = [capture.cameras[name] for name in capture.train]
+        cameras = {name: capture.cameras[name] for name in loaded.metadata.views if name in capture.cameras}
+        if not cameras:
+            return capture
+        poses = checkpoint.load_poses(loaded, extent_of(list(cameras.values())))
+        indices = {name: torch.tensor([k]) for k, name in enumerate(loaded.metadata.views)}
         with torch.no_grad():
-            moved = [poses(camera.viewmat, torch.tensor([k])) for k, camera in enumerate(cameras)]
-        pairs = zip(cameras, moved, strict=True)
-        corrected = [dataclasses.replace(camera, viewmat=viewmat) for camera, viewmat in pairs]
-        return capture.with_cameras(dict(zip(capture.train, corrected, strict=True)))
+            moved = {name: poses(camera.viewmat, indices[name]) for name, camera in cameras.items()}
+        return capture.with_cameras({n: dataclasses.replace(c, viewmat=moved[n]) for n, c in cameras.items()})
 
     def newest_checkpoint(self) -> Path | None:
         """The checkpoint of the last saved iteration; None if there is none yet."""

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.config import NetName
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -32,7 +34,7 @@ class Sweep:
     """Downscaling factor of the images; the dataset's default if omitted."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS."""
-    lpips_net: Literal["vgg", "alex", "squeeze"] | None = None
+    lpips_net: NetName | None = None
     """Network of LPIPS; vgg by default."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to train on; CUDA by default if there is a GPU."""

@@ -64,18 +64,23 @@ class HeldOut:
 
     def __init__(self, logger: TrainingLogger) -> None:
         self._logger, self._next = logger, 0
-        self._has_truth = False
+        self._has_truth = self._failed = False
 
     @torch.no_grad()
     def __call__(self, progress: Progress) -> None:
         iteration, total = progress.status.iteration, progress.num_iterations
         names = progress.capture.val
-        if not names or (iteration < self._next and iteration < total):
+        if not names or self._failed or (iteration < self._next and iteration < total):
             return
         self._next = iteration + max(1, total // HELD_OUT_TIMES)
         values = []
-        for index in evenly_spaced_indices(len(names), HELD_OUT_VIEWS):
-            frame = progress.capture.frame(names[index])
+        try:
+            frames = [progress.capture.frame(names[k]) for k in evenly_spaced_indices(len(names), HELD_OUT_VIEWS)]
+        except (ValueError, OSError) as error:
+            self._logger.log(f"warning: without held-out views in TensorBoard: {one_line(error)}")
+            self._failed = True
+            return
+        for frame in frames:
             image = progress.scene.render(frame.camera).joint.image.clamp(0, 1)
             values.append(psnr(image, frame.image.to(image.device).float() / 255.0))
             self._logger.add_image(f"held-out/{frame.name}", _reduced(to_bytes(image)), iteration)

@@ -1,4 +1,4 @@
-"""Pruning: of static Gaussians by visibility (paper Eq. 15), and of both branches by their share of the images."""
+"""Pruning: of static Gaussians by visibility (paper Eq. 15), and of both branches by contribution to the images."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -21,7 +21,7 @@ MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
 
 
-OPAQUE = 0.9
+MIN_OPAQUE_OPACITY = 0.9
 """Minimum opacity of the Gaussians that are counted as opaque."""
 
 
@@ -32,7 +32,7 @@ class Pruned(NamedTuple):
 
     Attributes:
         unseen: Those that no frame shows.
-        opaque: Those that few frames show and that have an opacity of at least ``OPAQUE``.
+        opaque: Those that few frames show and that have an opacity of at least ``MIN_OPAQUE_OPACITY``.
         faint: The others that few frames show.
     """
 
@@ -92,7 +92,7 @@ def prune_invisible(
     """Removes the static Gaussians with V̄ < ``threshold``; returns their numbers. Arguments as for ``visibility``."""
     shown, opacities = _fraction_rendered(scene, cameras, sh_degree, antialias), scene.static.opacities
     pruned = shown * (1.0 - opacities.clamp(max=MAX_ALPHA)) < threshold
-    unseen, opaque = pruned & (shown == 0), pruned & (shown > 0) & (opacities >= OPAQUE)
+    unseen, opaque = pruned & (shown == 0), pruned & (shown > 0) & (opacities >= MIN_OPAQUE_OPACITY)
     removed = Pruned(*(int(kind.sum()) for kind in (unseen, opaque, pruned & ~unseen & ~opaque)))
     kept = (~pruned).nonzero()[:, 0]
     optim.gather(optimizer, scene.static, kept, num_kept=len(kept))
@@ -121,18 +121,18 @@ def blend_weights(scene: SplitScene, views: Views, phase: Phase, antialias: bool
 
 
 @torch.no_grad()
-def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], share: float) -> int:
-    """Removes the Gaussians with the smallest weights that together hold at most a share of all; returns their number.
+def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], fraction: float) -> int:
+    """Removes the Gaussians with the smallest weights, which hold at most a fraction of all; returns their number.
 
     Args:
         scene: Changed in place, together with the optimizer's moments.
         optimizer: From ``optimizer.make_optimizer``.
         weights: [N] from ``blend_weights``.
-        share: In [0, 1).
+        fraction: In [0, 1).
     """
     ascending, order = weights.double().sort()
     kept = torch.ones_like(weights, dtype=torch.bool)
-    kept[order[ascending.cumsum(0) <= share * ascending.sum()]] = False
+    kept[order[ascending.cumsum(0) <= fraction * ascending.sum()]] = False
     branches = (scene.static, scene.dynamic)
     for gaussians, keeps in zip(branches, kept.split([len(gaussians) for gaussians in branches]), strict=True):
         indices = keeps.nonzero()[:, 0]

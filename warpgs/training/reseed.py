@@ -52,8 +52,8 @@ def lost_pixels(scene: SplitScene, phase: Phase, antialias: bool) -> Callable[[V
     return mask_of
 
 
-def lost_share(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) -> float:
-    """Share of all views' dynamic pixels that are lost, in [0, 1]; 0 if nothing is dynamic."""
+def lost_fraction(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) -> float:
+    """Fraction of all views' dynamic pixels that are lost, in [0, 1]; 0 if nothing is dynamic."""
     lost = dynamic = 0
     for index in range(len(views)):
         view = views[index]

@@ -172,8 +172,10 @@ class Protocol:
             densify=is_growing and done % self.config.densify.every == 0,
             reset=is_growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
             prune=self.config.vdp and prunes,
-            prune_weakest=self.config.densify.weakest > 0.0 and prunes and done >= schedule.densify_until,
-            reseed=self.config.densify.reseed > 0.0 and prunes and is_growing and done > self._reseed_from,
+            prune_weakest=self.config.densify.weakest > 0.0
+            and prunes
+            and schedule.densify_until <= done <= 2 * schedule.densify_until,
+            reseed=self.config.densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )

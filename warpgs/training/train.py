@@ -153,6 +153,8 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
         saved = extended(read_config(config.resume), config.iterations)
+        if config.lpips is not None:
+            saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
         run = Run(config.resume, dataclasses.replace(saved, device=choose_device(config.device or saved.device)))
         locate(run.config.lpips, run.config.lpips_net)
         capture = check_capture(run.open_capture(quiet), run.config, log)

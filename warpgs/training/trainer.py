@@ -24,7 +24,7 @@ from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .prune import blend_weights, prune_invisible, prune_weakest
-from .reseed import gaussians_that_show, lost_pixels, lost_share
+from .reseed import gaussians_that_show, lost_fraction, lost_pixels
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
 from .views import Views
@@ -179,9 +179,9 @@ class Trainer:
             return  # the masks are the whole image then, and its background may be empty
         config, scene, views = self.config, self.scene, self.views
         mask_of = lost_pixels(scene, phase, config.antialias)
-        share = lost_share(views, mask_of)
-        count = min(self._capacity(), round(share * config.model.dynamic_points))
-        if share < config.densify.reseed or count <= 0:
+        fraction = lost_fraction(views, mask_of)
+        count = min(self._capacity(), round(fraction * config.model.dynamic_points))
+        if fraction < config.densify.reseed or count <= 0:
             return
         generator = self._generator("reseed")
         found = unproject_pixels(self.capture, views, self.alignments, mask_of, count, generator)
@@ -189,7 +189,7 @@ class Trainer:
             added = gaussians_that_show(found, scene, views, config, self.capture.extent)
             optim.append(self.step.optimizer, scene.dynamic, added)
             logger.log(
-                f"iteration {self.iteration + 1}: no dynamic Gaussian shows {share:.0%} of the dynamic pixels; "
+                f"iteration {self.iteration + 1}: no dynamic Gaussian shows {fraction:.0%} of the dynamic pixels; "
                 f"{len(added):,} added there"
             )
 
@@ -246,7 +246,7 @@ class Trainer:
         start = time.monotonic()
         scene = TrainedScene(self.scene, self.config, self._metadata())
         progress = Progress(status, self.protocol.num_iterations, scene, self.capture)
-        stop = [callback(progress) is True for callback in self.callbacks]
+        stop = [bool(callback(progress)) for callback in self.callbacks]
         seconds = time.monotonic() - start
         self._started += seconds
         logger.skip(seconds)

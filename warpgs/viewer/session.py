@@ -152,6 +152,9 @@ class Session:
             set_value(getattr(self.panel, name), value)
         if self._training is not None and view.training_view is not None:
             set_value(self.panel.view, view.training_view)
+            image = self._training.thumbnail(min(max(int(self.panel.view.value), 1), len(self._training.views)) - 1)
+            if image is not None:
+                self.panel.truth.image = image
         with self._client.atomic():
             set_camera(self._client.camera, view.camera)
             self._client.camera.wxyz = view.orientation
@@ -186,8 +189,10 @@ class Session:
                 self.panel.play.label = PLAY
             times = [k / STEPS for k in range(STEPS + 1)] if self._training is None else self._training.times
             now = self.panel.current_time
-            # The slider has three digits.
-            index = bisect.bisect_right(times, now + 1e-3) if forward else bisect.bisect_left(times, now - 1e-3) - 1
+            rounded = 0.51e-3  # the slider has three digits
+            index = (
+                bisect.bisect_right(times, now + rounded) if forward else bisect.bisect_left(times, now - rounded) - 1
+            )
             set_value(self.panel.time, times[min(max(index, 0), len(times) - 1)])
         self._wake.set()
 
