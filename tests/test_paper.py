@@ -111,7 +111,7 @@ PAPER = {
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
 RUN |= {"lpips_net"}
 RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
-"""Options of a run, which are no part of the method."""
+"""Options of a run that do not belong to the method."""
 
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"
 

@@ -252,6 +252,11 @@ class Schedule:
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
     """Iterations between increments of the degree of spherical harmonics, from 0 to ``model.sh_degree``."""
 
+    @property
+    def num_iterations(self) -> int:
+        """Iterations of the whole run."""
+        return self.pretrain + self.stage1 + self.stage2
+
 
 @dataclass(frozen=True)
 class MaskPerturbation:
@@ -378,8 +383,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
     schedule = config.schedule
     if config.iterations is None:
         return config
-    total = schedule.pretrain + schedule.stage1 + schedule.stage2
-    factor = config.iterations / total
+    factor = config.iterations / schedule.num_iterations
     # What is 0 stays 0, what is positive stays positive; the longest stage absorbs the rounding.
     values: dict[str, Any] = {
         name: value if value is None else max(min(value, 1), round(value * factor))

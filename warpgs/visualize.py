@@ -58,6 +58,15 @@ def depth_image(
     return image
 
 
+def reduced(image: UInt8[np.ndarray, "H W 3"], max_width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """An image scaled down to at most ``max_width`` pixels in width."""
+    height, width = image.shape[:2]
+    if width <= max_width:
+        return image
+    size = (max_width, max(1, round(height * max_width / width)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
 def _colored(level: UInt8[np.ndarray, "H W"], colormap: int) -> UInt8[np.ndarray, "H W 3"]:
     return cv2.cvtColor(cv2.applyColorMap(level, colormap), cv2.COLOR_BGR2RGB)
 

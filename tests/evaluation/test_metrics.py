@@ -190,7 +190,7 @@ def test_multi_scale_ssim_is_that_of_the_reference(size):
 
 
 def test_multi_scale_ssim_of_opposite_images_is_a_number():
-    """Their covariance is negative, of which there are no fractional powers."""
+    """Their covariance is negative, and a negative number has no real fractional power."""
     image = torch.rand(161, 161, 3)
     assert metrics.ms_ssim(image, 1.0 - image) == 0.0
 

@@ -109,7 +109,7 @@ def test_a_callback_that_returns_true_ends_training_with_a_checkpoint(config):
     assert run.trained_scene().metadata.iteration == 12
 
 
-def test_held_out_views_are_rendered_at_most_a_few_times_per_run(finished_run, monkeypatch):
+def test_held_out_views_are_rendered_at_regular_intervals_of_a_run(finished_run, monkeypatch):
     capture = warpgs.open_run(finished_run).open_capture()
     image = SimpleNamespace(joint=SimpleNamespace(image=torch.zeros(tiny.SCENE.height, tiny.SCENE.width, 3)))
     scene, written = SimpleNamespace(render=lambda camera: image), []

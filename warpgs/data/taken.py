@@ -1,5 +1,6 @@
 """Frames as they were taken, with the distortion of their lens, for an evaluation that resamples no ground truth."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
@@ -36,6 +37,18 @@ def taken_frame(frame: Frame, lens: Lens) -> TakenFrame:
     K, (width, height), positions = _wide_pinhole(lens)
     camera = replace(frame.camera, K=torch.tensor(K, dtype=torch.float32), width=width, height=height)
     return TakenFrame(replace(frame, camera=camera), torch.tensor(positions, dtype=torch.float32))
+
+
+def taken_reader(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens]) -> Callable[[str], TakenFrame] | None:
+    """Reads frames as they were taken; None if no lens distorts.
+
+    Args:
+        read: Reads a frame, undistorted as for a lens.
+        lenses: The lens of each frame.
+    """
+    if all(lens.is_pinhole for lens in lenses.values()):
+        return None
+    return lambda name: taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
 
 
 @lru_cache(maxsize=4)

@@ -18,7 +18,7 @@ TOLERANCE = 0.002
 MIN_EXPLAINED = 0.8
 """Fraction of the matches of a pair that are explained if the camera only turns."""
 
-LEAST_PAIRS = 0.2
+MAX_WORSE_PAIRS = 0.2
 """Fraction of the pairs that may be explained worse."""
 
 MIN_MATCHES, MIN_PAIRS, MAX_PAIRS = 50, 8, 40
@@ -41,7 +41,7 @@ class Turning:
     """How well turning alone explains the pairs of frames.
 
     Attributes:
-        explained: Fraction of the matches that a rotation explains, in the pair at the ``LEAST_PAIRS`` quantile.
+        explained: Fraction of the matches that a rotation explains, in the pair at the ``MAX_WORSE_PAIRS`` quantile.
         displacement: Median displacement in the examined pairs, relative to the longer side.
     """
 
@@ -76,7 +76,7 @@ def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float |
     tolerance = TOLERANCE * longest
 
     def explained(focal: float, pairs: Sequence[Matches]) -> float:
-        return float(np.quantile([_explained(pair, focal, center, tolerance) for pair in pairs], LEAST_PAIRS))
+        return float(np.quantile([_explained(pair, focal, center, tolerance) for pair in pairs], MAX_WORSE_PAIRS))
 
     if focal is None:
         coarse = max(FOCALS * longest, key=lambda f: explained(f, wide[::3]))

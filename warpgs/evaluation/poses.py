@@ -1,6 +1,5 @@
 """Alignment of held-out cameras to a scene whose training poses were corrected (as in BARF, Lin et al. 2021)."""
 
-import dataclasses
 from collections.abc import Callable
 
 import torch
@@ -70,11 +69,11 @@ def aligned_camera(
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1.0 / ITERATIONS))
     settings = RenderSettings(antialias=antialias)
     for _ in range(ITERATIONS):
-        moved = dataclasses.replace(camera, viewmat=poses(camera.viewmat, index))
-        image = render(splats, moved, settings=settings).joint.image
+        image = render(splats, poses.moved(camera, index), settings=settings).joint.image
         optimizer.zero_grad()
         errors = (image - truth).abs()
         (errors if region is None else errors[region]).mean().backward()
         optimizer.step()
         schedule.step()
-    return dataclasses.replace(camera, viewmat=poses(camera.viewmat, index).detach())
+    with torch.no_grad():
+        return poses.moved(camera, index)

@@ -1,8 +1,12 @@
 """Corrections of camera poses that are trained together with the scene (as BARF, Lin et al. 2021, and others do)."""
 
+import dataclasses
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
+
+from warpgs.cameras import Camera
 
 
 class PoseCorrections(nn.Module):
@@ -41,6 +45,10 @@ class PoseCorrections(nn.Module):
         rotation = 2.0 / (1.0 + half.square().sum()) * (cross + cross @ cross)
         motion = torch.cat([rotation, translation.T], 1)
         return viewmat + torch.cat([motion @ viewmat, torch.zeros_like(viewmat[:1])])
+
+    def moved(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
+        """A camera with its correction."""
+        return dataclasses.replace(camera, viewmat=self(camera.viewmat, index))
 
     def angles(self) -> Float[Tensor, " T"]:
         """Angle by which each camera is turned [rad]."""

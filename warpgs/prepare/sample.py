@@ -115,7 +115,7 @@ def _clutter() -> list[Body]:
         half = random.uniform(0.10, 0.32, 3).tolist()
         frequency = float(random.uniform(1.5, 7.0))
         # On the wall behind, or on the floor behind what moves.
-        place = (x, 2.0 + 1.4 * u, random.uniform(0.1, 2.4)) if k % 2 else (x, 2.2 * u - 0.1, half[2])
+        position = (x, 2.0 + 1.4 * u, random.uniform(0.1, 2.4)) if k % 2 else (x, 2.2 * u - 0.1, half[2])
         shape = SPHERE if k % 5 == 0 else CUBE
-        bodies.append(Body(shape, place, (half[0], half[1], half[2]), colors, frequency, euler(z=turn)))
+        bodies.append(Body(shape, position, (half[0], half[1], half[2]), colors, frequency, euler(z=turn)))
     return bodies

@@ -44,7 +44,7 @@ PRIOR = 0.02
 COLOR_TRUST = 0.05
 """Evidence of colour per pixel and unit of log odds."""
 
-MIN_EVIDENCE = 0.05
+HALVING_EVIDENCE = 0.05
 """Evidence per pixel that a superpixel is static, at which a dynamic colour counts half."""
 
 MAX_LOG_ODDS = 2.5
@@ -177,7 +177,7 @@ class Graph:
         cells = self._cells()
         # Agreement with far frames proves that a surface is static; its absence has other causes than motion, too. So
         # colour may outvote evidence of motion, but not evidence that a superpixel is static.
-        unproven = MIN_EVIDENCE * self._sizes / (self._static + MIN_EVIDENCE * self._sizes)
+        unproven = HALVING_EVIDENCE * self._sizes / (self._static + HALVING_EVIDENCE * self._sizes)
         for _ in range(NUM_COLOR_ROUNDS):
             odds = COLOR_TRUST * self._sizes * self._log_odds(cells, x)
             x = self._solve(np.maximum(-odds, 0.0), np.maximum(odds, 0.0) * unproven)

@@ -113,9 +113,6 @@ def _read_saved(folder: Path, name: str) -> Strip | None:
 
 def data_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
     """An RGB image as a data URI; scaled down to ``MAX_WIDTH``."""
-    height, width = image.shape[:2]
-    if width > MAX_WIDTH:
-        size = (MAX_WIDTH, max(1, round(height * MAX_WIDTH / width)))
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    image = visualize.reduced(image, MAX_WIDTH)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -40,8 +40,8 @@ svg .value { fill: transparent; } svg .value:hover { fill: currentColor; }
 @media (max-width: 600px) { body { margin: 1rem auto; padding: 0 .6rem; } td, th { padding: .15rem .35rem; } }
 """
 
-PER_RUN = {"rendered": "rendered", "static": "static", "dynamic": "dynamic", "error": "error"}
-"""Images of a run beside the truth, and their titles."""
+PER_RUN = ("rendered", "static", "dynamic", "error")
+"""Images of a run beside the truth; fields of ``Strip``."""
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """Content security policy: the page loads nothing."""
@@ -146,9 +146,7 @@ def _over_time(index: int, run: EvaluatedRun, name: str) -> Series:
 
 
 def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
-    names = "".join(
-        f"<th colspan={len(PER_RUN)}>{_named(runs, k)}: {' | '.join(PER_RUN.values())}</th>" for k in gallery.runs
-    )
+    names = "".join(f"<th colspan={len(PER_RUN)}>{_named(runs, k)}: {' | '.join(PER_RUN)}</th>" for k in gallery.runs)
     notes = "".join(
         f"<p class=note>{text(runs[k].label)}: {text(strips.note)}</p>"
         for k, strips in zip(gallery.runs, gallery.strips, strict=True)
@@ -179,9 +177,9 @@ def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> s
             cells.append(f"<td colspan={len(PER_RUN)}>{text(quality)} (no image)</td>")
             continue
         strip = strips.by_view[name]
-        for part, title in PER_RUN.items():
+        for part in PER_RUN:
             below = text(quality) if part == "rendered" else ""
-            cells.append(f"<td>{_image(getattr(strip, part), f'{title} of {name}')}{below}</td>")
+            cells.append(f"<td>{_image(getattr(strip, part), f'{part} of {name}')}{below}</td>")
     return f"<tr>{''.join(cells)}</tr>"
 
 

@@ -121,8 +121,7 @@ class Run:
         poses = checkpoint.load_poses(loaded, extent_of(list(cameras.values())))
         indices = {name: torch.tensor([k]) for k, name in enumerate(loaded.metadata.views)}
         with torch.no_grad():
-            moved = {name: poses(camera.viewmat, indices[name]) for name, camera in cameras.items()}
-        return capture.with_cameras({n: dataclasses.replace(c, viewmat=moved[n]) for n, c in cameras.items()})
+            return capture.with_cameras({name: poses.moved(camera, indices[name]) for name, camera in cameras.items()})
 
     def newest_checkpoint(self) -> Path | None:
         """The checkpoint of the last saved iteration; None if there is none yet."""

@@ -48,8 +48,7 @@ class Cell:
     @property
     def num_iterations(self) -> int:
         """Iterations of the whole run."""
-        schedule = scaled(self.config).schedule
-        return schedule.pretrain + schedule.stage1 + schedule.stage2
+        return scaled(self.config).schedule.num_iterations
 
     @property
     def command(self) -> str:

@@ -6,10 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from warpgs.data.capture import Capture
 from warpgs.errors import one_line
@@ -17,7 +14,7 @@ from warpgs.evaluation.metrics import psnr
 from warpgs.runs import preview
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced_indices
-from warpgs.visualize import to_bytes
+from warpgs.visualize import reduced, to_bytes
 
 from .logger import Status, TrainingLogger
 
@@ -83,20 +80,13 @@ class HeldOut:
         for frame in frames:
             image = progress.scene.render(frame.camera).joint.image.clamp(0, 1)
             values.append(psnr(image, frame.image.to(image.device).float() / 255.0))
-            self._logger.add_image(f"held-out/{frame.name}", _reduced(to_bytes(image)), iteration)
+            self._logger.add_image(f"held-out/{frame.name}", reduced(to_bytes(image), HELD_OUT_WIDTH), iteration)
             if not self._has_truth:
-                self._logger.add_image(f"held-out/{frame.name}, truth", _reduced(frame.image.numpy()), iteration)
+                self._logger.add_image(
+                    f"held-out/{frame.name}, truth", reduced(frame.image.numpy(), HELD_OUT_WIDTH), iteration
+                )
         self._has_truth = True
         self._logger.add_scalar("psnr/held-out", sum(values) / len(values), iteration)
-
-
-def _reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """An image of at most ``HELD_OUT_WIDTH`` pixels in width."""
-    height, width = image.shape[:2]
-    if width <= HELD_OUT_WIDTH:
-        return image
-    size = (HELD_OUT_WIDTH, max(1, round(height * HELD_OUT_WIDTH / width)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 class Previewer:

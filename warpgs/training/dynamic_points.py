@@ -77,7 +77,7 @@ def unproject_pixels(
         views: Its training views.
         alignments: [T, 2] scale and offset of each view's inverse depth.
         mask_of: The pixels of a view.
-        max_count: Most points.
+        max_count: Maximum number of points.
         generator: CPU generator that chooses the pixels.
 
     Returns:
@@ -92,7 +92,7 @@ def unproject_pixels(
     found = _unproject(views, mask_of, known, fraction, generator)
     depth_known = len(found[0]) >= MIN_KNOWN_FRACTION * fraction * num
     if not depth_known:
-        estimated = partial(_depth_before_points, points, mask_of, generator)
+        estimated = partial(_depth_before_points, points, generator)
         found = _unproject(views, mask_of, estimated, fraction, generator)
     chosen = subsample(found[0], max_count, generator)
     positions, colors, indices = (values[chosen] for values in found)
@@ -102,7 +102,7 @@ def unproject_pixels(
 def _unproject(
     views: Views,
     mask_of: Callable[[View], Tensor],
-    depth_of: Callable[[int, View], Tensor],
+    depth_of: Callable[[int, View, Tensor], Tensor],
     fraction: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, ...]:
@@ -110,7 +110,8 @@ def _unproject(
     parts = []
     for index in range(len(views)):
         view = views[index]
-        depth, mask = depth_of(index, view), mask_of(view)
+        mask = mask_of(view)
+        depth = depth_of(index, view, mask)
         if fraction < 1.0:
             mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
         positions, colors = unproject(depth, mask, view.image, view.camera)
@@ -118,17 +119,19 @@ def _unproject(
     return tuple(torch.cat(values) for values in zip(*parts, strict=True))
 
 
-def _metric_depth(alignments: Float[Tensor, "T 2"], index: int, view: View) -> Float[Tensor, "H W"]:
+def _metric_depth(
+    alignments: Float[Tensor, "T 2"], index: int, view: View, mask: Bool[Tensor, "H W"]
+) -> Float[Tensor, "H W"]:
     """Aligned depth of a view; NaN where unknown."""
     return depth_alignment.metric_depth(view.inverse_depth, alignments[index])
 
 
 def _depth_before_points(
     points: Float[Tensor, "P 3"],
-    mask_of: Callable[[View], Tensor],
     generator: torch.Generator,
     index: int,
     view: View,
+    mask: Bool[Tensor, "H W"],
 ) -> Float[Tensor, "H W"]:
     """Depth of each pixel of a mask just before the nearest of the points around it; NaN elsewhere.
 
@@ -139,7 +142,7 @@ def _depth_before_points(
     row, column, z, inside = view.camera.project(points)
     visible = inside.nonzero()[:, 0]
     visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]
-    pixels = mask_of(view).nonzero()
+    pixels = mask.nonzero()
     if len(visible) == 0:
         return depth
     positions = torch.stack([row[visible], column[visible]], 1).float()

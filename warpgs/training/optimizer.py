@@ -133,7 +133,7 @@ def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
         state = optimizer.state.get(parameter, {})
         for moment in MOMENTS:
             if moment in state:
-                state[moment] = torch.cat([state[moment], torch.zeros_like(getattr(added, name).to(parameter.device))])
+                state[moment] = torch.cat([state[moment], state[moment].new_zeros(getattr(added, name).shape)])
 
 
 @torch.no_grad()

@@ -20,7 +20,6 @@ from .views import Views
 MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
 
-
 MIN_OPAQUE_OPACITY = 0.9
 """Minimum opacity of the Gaussians that are counted as opaque."""
 
@@ -60,14 +59,6 @@ def visibility(
         sh_degree: Maximum degree of spherical harmonics in use.
         antialias: As in ``RenderSettings``.
     """
-    opacities = scene.static.opacities.clamp(max=MAX_ALPHA)
-    return _fraction_rendered(scene, cameras, sh_degree, antialias) * (1.0 - opacities)
-
-
-def _fraction_rendered(
-    scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, antialias: bool
-) -> Float[Tensor, " N"]:
-    """Fraction of the cameras that show each static Gaussian."""
     static = scene.static
     splats = scene.static_splats(sh_degree)
     num_rendered = torch.zeros(len(static), device=static.means.device)
@@ -77,7 +68,7 @@ def _fraction_rendered(
         assert rendering.contributed is not None
         num_rendered += rendering.contributed
         num += 1
-    return num_rendered / max(num, 1)
+    return num_rendered / max(num, 1) * (1.0 - static.opacities.clamp(max=MAX_ALPHA))
 
 
 @torch.no_grad()
@@ -90,9 +81,10 @@ def prune_invisible(
     antialias: bool = False,
 ) -> Pruned:
     """Removes the static Gaussians with V̄ < ``threshold``; returns their numbers. Arguments as for ``visibility``."""
-    shown, opacities = _fraction_rendered(scene, cameras, sh_degree, antialias), scene.static.opacities
-    pruned = shown * (1.0 - opacities.clamp(max=MAX_ALPHA)) < threshold
-    unseen, opaque = pruned & (shown == 0), pruned & (shown > 0) & (opacities >= MIN_OPAQUE_OPACITY)
+    scores = visibility(scene, cameras, sh_degree, antialias)
+    pruned, is_opaque = scores < threshold, scene.static.opacities >= MIN_OPAQUE_OPACITY
+    unseen = pruned & (scores == 0)  # 1 − α is at least 1 − MAX_ALPHA
+    opaque = pruned & ~unseen & is_opaque
     removed = Pruned(*(int(kind.sum()) for kind in (unseen, opaque, pruned & ~unseen & ~opaque)))
     kept = (~pruned).nonzero()[:, 0]
     optim.gather(optimizer, scene.static, kept, num_kept=len(kept))

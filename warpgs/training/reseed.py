@@ -68,7 +68,7 @@ def gaussians_that_show(
     """Dynamic Gaussians that the network deforms to points, each at the time of its view.
 
     Their canonical positions x solve x + d(x, t) = p. Points at which the iteration does not come within
-    ``MAX_INVERSION_ERROR`` are left out.
+    ``MAX_INVERSION_ERROR`` are dropped.
 
     Args:
         found: The points p.

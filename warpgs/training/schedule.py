@@ -5,7 +5,7 @@ from typing import Literal
 
 from warpgs.config import TrainConfig
 
-from .optimizer import exponential
+from .optimizer import BRANCHES, exponential
 
 NOISE = 0.1
 """Initial standard deviation of the noise on time, in frame intervals (Deformable-3DGS)."""
@@ -97,7 +97,7 @@ def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
         ValueError: If that is less than the run has.
     """
     schedule = config.schedule
-    total = schedule.pretrain + schedule.stage1 + schedule.stage2
+    total = schedule.num_iterations
     if iterations is None:
         return config
     if iterations < total:
@@ -122,7 +122,7 @@ class Protocol:
         pretrain = schedule.pretrain if config.dap and has_depth else 0
         # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.
         stage2 = schedule.stage2 if config.stage2 else 0
-        stage1 = schedule.pretrain + schedule.stage1 + schedule.stage2 - pretrain - stage2
+        stage1 = schedule.num_iterations - pretrain - stage2
         self.pretrain = Stage("pretrain", 0, pretrain)
         self.stage1 = Stage("stage1", pretrain, pretrain + stage1)
         self.stage2 = Stage("stage2", pretrain + stage1, pretrain + stage1 + stage2)
@@ -182,13 +182,12 @@ class Protocol:
 
     def _means_progress(self, iteration: int) -> dict[str, float]:
         """By branch, fraction done of the iterations over which the rate of its positions decays."""
-        ends = {"static": self.num_iterations, "dynamic": self.num_iterations}
-        starts = dict.fromkeys(ends, 0)
-        if self.config.optim.means_anneal == "trained":
-            starts["dynamic"] = self.stage1.start
-            ends["static"] = self.num_iterations if self.config.static_geometry else self.stage1.end
-        spans = {branch: (starts[branch], max(1, end - starts[branch])) for branch, end in ends.items()}
-        return {branch: min(1.0, max(0.0, (iteration - start) / length)) for branch, (start, length) in spans.items()}
+        if self.config.optim.means_anneal == "run":
+            return dict.fromkeys(BRANCHES, iteration / self.num_iterations)
+        start, end = self.stage1.start, self.num_iterations
+        static_end = end if self.config.static_geometry else self.stage1.end
+        dynamic = max(0, iteration - start) / max(1, end - start)
+        return {"static": min(1.0, iteration / max(1, static_end)), "dynamic": dynamic}
 
     def _progress_from(self, start: int, in_stage1: int) -> float:
         """Fraction done of the iterations from one of stage I to the end of the run."""

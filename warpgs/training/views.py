@@ -1,6 +1,5 @@
 """Training views on the device."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -141,9 +140,7 @@ class Views:
         return [self._corrected(*pair) for pair in zip(cameras, indices, strict=True)]
 
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
-        if self.poses is None:
-            return camera
-        return dataclasses.replace(camera, viewmat=self.poses(camera.viewmat, index))
+        return camera if self.poses is None else self.poses.moved(camera, index)
 
     def _view(self, stored: _Stored, index: Int64[Tensor, "1"]) -> View:
         height, width = stored.static_mask.shape

@@ -10,7 +10,7 @@ import viser
 
 from .browser_camera import set_camera, start_camera
 from .origin import refuse_foreign_pages
-from .session import Session, View
+from .session import PageState, Session
 from .source import Source
 from .training_cameras import TrainingCameras
 
@@ -69,7 +69,7 @@ class Viewer:
         self._source, self._training = source, training
         self._rendering, self._lock = threading.Lock(), threading.Lock()
         self._stopped = False
-        self._left: View | None = None  # what the last page showed; a reload is a browser that leaves and comes back
+        self._left: PageState | None = None  # what the last page showed, for a reload
         self.sessions: dict[int, Session] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # without viser's banner
             self._server = _Server(host, port, label=LABEL, verbose=False)

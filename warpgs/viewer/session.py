@@ -57,7 +57,7 @@ STEPS = 60
 """Steps of the time of a scene without training cameras."""
 
 
-class View(NamedTuple):
+class PageState(NamedTuple):
     """What a browser shows, which survives a reload of its page.
 
     Attributes:
@@ -103,7 +103,7 @@ class Session:
         training: TrainingCameras | None,
         rendering: threading.Lock,
         width: int,
-        view: View | None = None,
+        view: PageState | None = None,
     ) -> None:
         self._client, self._source, self._training = client, source, training
         self._renderer, self._resolution, self._clock = Renderer(rendering), AdaptiveResolution(), Clock()
@@ -140,21 +140,19 @@ class Session:
 
     # A page that is reloaded ------------------------------------------------------------------------------------------
 
-    def view(self) -> View:
+    def view(self) -> PageState:
         """What the browser shows."""
         camera, panel = self._client.camera, self.panel
         seen = BrowserCamera(camera.position, camera.look_at, camera.up_direction, float(camera.fov))
         controls = {name: getattr(panel, name).value for name in KEPT}
-        return View(seen, camera.wxyz, controls, None if self._training is None else panel.view.value)
+        return PageState(seen, camera.wxyz, controls, None if self._training is None else panel.view.value)
 
-    def _restore(self, view: View) -> None:
+    def _restore(self, view: PageState) -> None:
         for name, value in view.controls.items():
             set_value(getattr(self.panel, name), value)
         if self._training is not None and view.training_view is not None:
             set_value(self.panel.view, view.training_view)
-            image = self._training.thumbnail(min(max(int(self.panel.view.value), 1), len(self._training.views)) - 1)
-            if image is not None:
-                self.panel.truth.image = image
+            self._show_thumbnail(self._training)
         with self._client.atomic():
             set_camera(self._client.camera, view.camera)
             self._client.camera.wxyz = view.orientation
@@ -212,18 +210,27 @@ class Session:
     def _snap(self, training: TrainingCameras) -> None:
         """Looks through the training camera that the slider selects, at its time."""
         with self._lock:
-            index = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+            index = self._selected(training)
             view, camera = training.views[index], self._client.camera
             width, height = self._canvas()
             with self._client.atomic():
                 set_camera(camera, through_training_camera(training, index, width / height))
                 camera.wxyz = np.array(view.pose.wxyz)
             set_value(self.panel.time, view.time)
-            image = training.thumbnail(index)
-            self._note = f"the image of {view.name} cannot be read" if image is None else ""
-            if image is not None:
-                self.panel.truth.image = image
+            is_shown = self._show_thumbnail(training)
+            self._note = "" if is_shown else f"the image of {view.name} cannot be read"
         self._wake.set()
+
+    def _selected(self, training: TrainingCameras) -> int:
+        """Index of the training camera that the slider selects."""
+        return min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+
+    def _show_thumbnail(self, training: TrainingCameras) -> bool:
+        """Shows the image of the selected training camera in the panel; whether it can be read."""
+        image = training.thumbnail(self._selected(training))
+        if image is not None:
+            self.panel.truth.image = image
+        return image is not None
 
     def _show_cameras(self, training: TrainingCameras) -> None:
         """Adds the training cameras to the scene or removes them, as the checkbox is set by now."""
@@ -292,7 +299,7 @@ class Session:
         training, wipe = self._training, self.panel.current_wipe
         if training is None or not wipe:
             return None
-        index = min(max(int(self.panel.view.value), 1), len(training.views)) - 1
+        index = self._selected(training)
         camera = camera_of(request.pose, request.size, request.time)
         beside = comparison.is_beside(camera, training.camera(index), training.capture.extent)
         return (index, wipe) if beside else None

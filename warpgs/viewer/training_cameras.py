@@ -3,13 +3,13 @@
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.video.camera_paths import evenly_spaced_indices, focus, upward
+from warpgs.visualize import reduced
 
 from .pose import Pose, pose_of
 
@@ -91,10 +91,4 @@ class TrainingCameras:
     def _thumbnail(self, index: int) -> UInt8[np.ndarray, "H W 3"] | None:
         """The image of a view, scaled down; None if it cannot be read."""
         image = self.image(index)
-        if image is None:
-            return None
-        height, width = image.shape[:2]
-        if width <= THUMBNAIL_WIDTH:
-            return image
-        size = (THUMBNAIL_WIDTH, max(1, round(height * THUMBNAIL_WIDTH / width)))
-        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return None if image is None else reduced(image, THUMBNAIL_WIDTH)

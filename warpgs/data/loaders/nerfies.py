@@ -20,11 +20,11 @@ from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
-from warpgs.data.capture import Capture, Frame, TakenFrame
+from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
-from warpgs.data.taken import taken_frame, without_distortion
+from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import first_file, read_json
 
@@ -96,7 +96,7 @@ class NerfiesLoader(ABC):
             reader.read,
             cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
-            read_taken=None if all(lens.is_pinhole for lens in lenses.values()) else reader.read_taken,
+            read_taken=taken_reader(reader.read_with, lenses),
         )
 
 
@@ -201,12 +201,10 @@ class _FrameReader:
     read_depth: Callable[[Path, tuple[int, int]], np.ndarray]
 
     def read(self, name: str) -> Frame:
-        return self._read(name, self.lenses[name])
+        return self.read_with(name, self.lenses[name])
 
-    def read_taken(self, name: str) -> TakenFrame:
-        return taken_frame(self._read(name, without_distortion(self.lenses[name])), self.lenses[name])
-
-    def _read(self, name: str, lens: Lens) -> Frame:
+    def read_with(self, name: str, lens: Lens) -> Frame:
+        """The frame, undistorted as for a lens."""
         files, size = self.files[name], self.cameras[name].size
 
         def optional(read: Callable[[Path, tuple[int, int]], np.ndarray], path: Path | None) -> np.ndarray | None:

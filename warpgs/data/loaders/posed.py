@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float, UInt8
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data.camera_files import is_rotation
-from warpgs.data.capture import Assumption, Capture, Frame, TakenFrame
+from warpgs.data.capture import Assumption, Capture, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
-from warpgs.data.taken import taken_frame, without_distortion
+from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, scene_units
 
 HOLDOUT = 8
@@ -127,7 +127,7 @@ def posed_capture(
         reader.read,
         options.cache_frames,
         world.assumption,
-        read_taken=None if all(lens.is_pinhole for lens in lenses.values()) else reader.read_taken,
+        read_taken=taken_reader(reader.read_with, lenses),
     )
 
 
@@ -243,12 +243,10 @@ class _FrameReader:
     perturbation: MaskPerturbation
 
     def read(self, name: str) -> Frame:
-        return self._read(name, self.lenses[name])
+        return self.read_with(name, self.lenses[name])
 
-    def read_taken(self, name: str) -> TakenFrame:
-        return taken_frame(self._read(name, without_distortion(self.lenses[name])), self.lenses[name])
-
-    def _read(self, name: str, lens: Lens) -> Frame:
+    def read_with(self, name: str, lens: Lens) -> Frame:
+        """The frame, undistorted as for a lens."""
         frame, size = self.frames[name], self.cameras[name].size
         image = undistort(frame.image(size), lens)
         mask = None if frame.static_mask is None else undistort(frame.static_mask(size), lens)
