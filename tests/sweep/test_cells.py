@@ -38,11 +38,16 @@ def test_the_command_line_precedes_the_variant_which_precedes_the_file(tmp_path)
     assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["fast"].loss.static)
 
 
-@pytest.mark.parametrize("name", ["ablation", "masks", "scenes", "seeds"])
+@pytest.mark.parametrize("name", ["ablation", "best", "masks", "scenes", "seeds"])
 def test_the_command_of_a_cell_trains_its_config(name, tmp_path):
     for cell in plan(read_spec(name), out=tmp_path):
         assert parse(arguments(cell.config)) == cell.config
         assert cell.command.startswith("warpgs train --preset ")
+
+
+def test_every_line_about_best_trains_something_else(tmp_path):
+    configs = [dataclasses.replace(cell.config, out=None, seed=0) for cell in plan(read_spec("best"), out=tmp_path)]
+    assert all(config not in configs[:k] for k, config in enumerate(configs))
 
 
 def test_every_option_survives_the_way_through_the_command_line(tmp_path):

@@ -68,7 +68,7 @@ def test_a_wrong_entry_is_named(tmp_path, text, message):
 
 def test_an_unknown_sweep_names_those_that_ship():
     with pytest.raises(
-        ValueError, match=r"no sweep 'ablations', expected ablation, depth, masks, scenes, seeds or a \.toml"
+        ValueError, match=r"no sweep 'ablations', expected ablation, best, depth, masks, scenes, seeds or a \.toml"
     ):
         read_spec("ablations")
 

@@ -18,8 +18,8 @@ class Sweep:
     """
 
     sweep: Annotated[str, tyro.conf.arg(metavar="SWEEP"), tyro.conf.Positional]
-    """What to train: ablation (paper, Table 4), masks (Table 5), scenes (Tables 1 to 3), seeds, depth, or a TOML
-    file (docs/cluster.md)."""
+    """What to train: ablation (paper, Table 4), masks (Table 5), scenes (Tables 1 to 3), best (what each part of that
+    preset brings), seeds, depth, or a TOML file (docs/cluster.md)."""
     data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAPTURE [CAPTURE ...]")] = ()
     """Captures, folders of captures, or built-in captures (builtin:studio); NAME=CAPTURE gives one a name."""
     out: Path | None = None
