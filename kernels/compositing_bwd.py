@@ -41,7 +41,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
-from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE, NUM_MOMENTS, row_load
+from .rows import GEOMETRY_PARTS, NUM_MOMENTS, NUM_SECOND, SecondNorm, row_load
 from .tiles import DYNAMIC
 
 
@@ -66,13 +66,13 @@ def read_gradient(
 
 @functools.cache
 def make_composite_bwd(
-    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absolute: bool
+    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], second: SecondNorm
 ) -> wp.Kernel:
     """Backward kernel, launched with as many threads as the forward kernel.
 
     Args:
         num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
-        absolute: Whether the absolute-value variant of the gradient of the means is accumulated, too.
+        second: Which second gradient of the means is accumulated, too.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which is initially zero. Each image has its own arrays of
     gradients; a missing array stands for zeros, and bit m of ``images_with_gradient`` is set if image m has any
@@ -81,12 +81,16 @@ def make_composite_bwd(
     Depth is one more channel of the traversal, D = Σ_i alpha_i T_i depth_i. Wherever alpha is above MIN_ALPHA,
 
         depth = D / alpha,      v_D = v_depth / alpha,      v_alpha += -v_depth D / alpha².
+
+    v_alpha_i is linear in the gradients: that of the images alone has the same form, without the channel of depth and
+    with an R of its own.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
+    absolute, of_images = second == "absolute", second == "images"
     scalars, integers, colors, features_vector = state_types(C, P)
-    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_ABSOLUTE if absolute else 0))
+    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_SECOND if second else 0))
 
     # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
@@ -155,6 +159,7 @@ def make_composite_bwd(
 
         T = scalars()
         R = scalars()
+        R_images = scalars()
         n = integers()
         v_color = colors()
         n_max = int(0)
@@ -180,6 +185,8 @@ def make_composite_bwd(
                                 v_color[k * wp.static(C) + c] += v
                                 if background.shape[0] > 0:
                                     v_transmittance += background[m * background_stride + c] * v
+                            if wp.static(of_images):
+                                R_images[k] += T[k] * v_transmittance
                             if wp.static(with_depth):
                                 v_depth = read_gradient(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
                                 v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
@@ -232,6 +239,7 @@ def make_composite_bwd(
                             alpha = wp.min(ALPHA_MAX, unclamped)
                             scale = 1.0 / (1.0 - alpha)
                             v_alpha = float(0.0)
+                            v_alpha_images = float(0.0)
                             k = j * wp.static(columns) + i
                             if position <= n[k]:
                                 contributes = 1
@@ -242,6 +250,12 @@ def make_composite_bwd(
                                     v = v_color[k * wp.static(C) + c]
                                     v_weight += features[c] * v
                                     sums[c] += w * v
+                                if wp.static(of_images):
+                                    v_weight_images = float(0.0)
+                                    for c in range(wp.static(num_features)):
+                                        v_weight_images += features[c] * v_color[k * wp.static(C) + c]
+                                    v_alpha_images = t * v_weight_images - R_images[k] * scale
+                                    R_images[k] = R_images[k] + w * v_weight_images
                                 v_alpha = t * v_weight - R[k] * scale
                                 R[k] = R[k] + w * v_weight
                                 T[k] = t
@@ -256,6 +270,10 @@ def make_composite_bwd(
                                 if wp.static(absolute):
                                     sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
                                     sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
+                                if wp.static(of_images):
+                                    s = LN_2 * alpha * v_alpha_images
+                                    sums[wp.static(C + 6)] += s * (2.0 * row0[2] * dx + row0[3] * dy)
+                                    sums[wp.static(C + 7)] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
                 if lane_any(contributes) != 0:
                     lane_add(sums, gradients, g)
             lane_sync()

@@ -14,6 +14,7 @@ features and the moments of s = alpha v_alpha over its pixels, and
 """
 
 import functools
+from typing import Literal
 
 import warp as wp
 
@@ -26,8 +27,12 @@ GEOMETRY_PARTS = wp.constant(2)
 NUM_MOMENTS = 6
 """Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy²."""
 
-NUM_ABSOLUTE = 2
-"""Σ |s (conic d)_x| and Σ |s (conic d)_y|, the absolute-value variant of the gradient of the mean."""
+SecondNorm = Literal["absolute", "images"] | None
+"""A second gradient of the mean whose length is reported: with absolute values per pixel, or that of the images alone,
+without depth."""
+
+NUM_SECOND = 2
+"""Σ |s (conic d)_x| and Σ |s (conic d)_y|, or Σ s' (conic d)_x and Σ s' (conic d)_y with s' of the images alone."""
 
 
 # Warp's vec4 is aligned to 4 bytes, so a load or store takes four instructions; rows are aligned to 16: one is enough.
@@ -55,8 +60,8 @@ def row_parts(num_channels: int) -> int:
 
 
 def gradient_stride(num_channels: int) -> int:
-    """Number of floats in a Gaussian's gradient row: features, moments, absolute sums, padded to 16 bytes."""
-    return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE + 3) // 4 * 4
+    """Number of floats in a Gaussian's gradient row: features, moments, second gradient, padded to 16 bytes."""
+    return (num_channels + NUM_MOMENTS + NUM_SECOND + 3) // 4 * 4
 
 
 @wp.func
@@ -145,7 +150,7 @@ def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
     return pack_features
 
 
-sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE, dtype=float)
+sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_SECOND, dtype=float)
 
 
 @functools.cache
@@ -153,7 +158,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
     """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat.
 
     ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``norms`` receives the length of
-    the gradient of the mean and of its absolute-value variant, both scaled per axis by ``half_width`` and
+    the gradient of the mean and of the second one (``SecondNorm``), both scaled per axis by ``half_width`` and
     ``half_height``.
     """
     num_channels = num_features + int(with_depth)
@@ -184,7 +189,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
             else:
                 v_depths[i] = total
         s = sums_vector()
-        for k in range(wp.static(NUM_MOMENTS + NUM_ABSOLUTE)):
+        for k in range(wp.static(NUM_MOMENTS + NUM_SECOND)):
             total = float(0.0)
             for shard in range(gradients.shape[0]):
                 total += gradients[shard, i, wp.static(num_channels) + k]

@@ -31,7 +31,7 @@ SETTINGS = [
     RenderSettings(),
     RenderSettings(branches=True, statistics=True, absgrad=True),
     RenderSettings(depth=True, antialias=True),
-    RenderSettings(depth=True, branches=True),
+    RenderSettings(depth=True, branches=True, imagegrad=True),
 ]
 
 

@@ -220,6 +220,34 @@ def test_gradient_norms_equal_those_of_the_screen_space_means(settings, monkeypa
     assert absolute.sum() > 1.1 * plain.sum()
 
 
+@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("dynamic", ["some", "none"])  # with none, one traversal serves the joint and the static image
+def test_gradient_norms_of_the_images_are_those_without_a_loss_of_depth(dynamic, depth):
+    settings = RenderSettings(branches=True, depth=depth, imagegrad=True)
+
+    def norms(with_depth_loss):
+        splats = make_splats()
+        if dynamic == "none":
+            splats = dataclasses.replace(splats, is_dynamic=torch.zeros(60, dtype=torch.bool))
+        result = render(as_leaves(splats), CAMERA, background(), settings)
+        layers = (result.joint, result.static, result.dynamic)
+        depths = [layer.depth * layer.alpha.detach() for layer in layers if depth]
+        loss = weighted_sum(outputs(result), random_like(outputs(result)))
+        (loss + with_depth_loss * weighted_sum(depths, random_like(depths))).backward()
+        return result.gradient_norms.unbind(-1)
+
+    (everything, images), (expected, same) = norms(with_depth_loss=1.0), norms(with_depth_loss=0.0)
+    assert expected.count_nonzero() > 30
+    assert relative_error(images, expected) < 1e-6
+    assert relative_error(same, expected) < 1e-6
+    assert (relative_error(everything, expected) > 0.1) == depth
+
+
+def test_gradients_of_images_and_absolute_ones_exclude_each_other():
+    with pytest.raises(ValueError, match="absgrad or imagegrad"):
+        RenderSettings(absgrad=True, imagegrad=True)
+
+
 def test_the_order_of_the_gaussians_does_not_matter():
     splats, order = as_leaves(make_splats()), torch.randperm(60)
     shuffled = as_leaves(select(splats, order))

@@ -48,8 +48,8 @@ class RenderSettings:
         branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
         depth: Also render depth, as one more channel.
         statistics: Also compute whether and how much each Gaussian contributed to the joint image.
-        absgrad: In the backward pass, also sum the absolute values of the screen-space gradients over the pixels of all
-            images (AbsGS).
+        absgrad: In the backward pass, also sum the absolute values of the pixels' screen-space gradients (AbsGS).
+        imagegrad: In the backward pass, also sum the screen-space gradients without those of depth; not with absgrad.
         antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
         replay: On CUDA, replay small renders of the main thread from CUDA graphs: the same results with less launch
@@ -61,6 +61,7 @@ class RenderSettings:
     depth: bool = False
     statistics: bool = False
     absgrad: bool = False
+    imagegrad: bool = False
     antialias: bool = False
     near: float = 0.01
     replay: bool = True
@@ -68,6 +69,8 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if not 0 < self.near < math.inf:
             raise ValueError(f"near must be positive and finite, got {self.near}")
+        if self.absgrad and self.imagegrad:
+            raise ValueError("expected absgrad or imagegrad, got both: they fill the same column of gradient_norms")
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,7 @@ class ModelConfig:
     time_bands: Annotated[int, Bounds(max=64)] = 10
     """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
     raw_input: bool = True
-    """Whether position and time themselves are inputs of the networks beside their encodings, as in Deformable-3DGS;
-    not in paper Eq. 6."""
+    """Whether the networks get position and time beside their encodings, as in Deformable-3DGS; not in paper Eq. 6."""
     min_period: float = 0.0
     """Minimum period of these frequencies, in training frames; higher frequencies are dropped, because they overfit to
     the training times. 0: none are dropped (paper)."""
@@ -193,6 +195,8 @@ class DensifyConfig:
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
+    depth_gradients: bool = True
+    """Whether that gradient includes the terms of depth, or those of images alone (paper)."""
     dense_fraction: float = 0.01
     """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
     min_opacity: float = 0.005

@@ -11,7 +11,7 @@ from torch import Tensor
 from .cameras import Camera
 from .config import RenderSettings
 from .model.splats import Splats
-from .ops.compositing import NUM_BRANCH_IMAGES, Composite, record_composite
+from .ops.compositing import NUM_BRANCH_IMAGES, Composite, SecondNorm, record_composite
 from .ops.projection import Geometry, View, record_projection
 from .ops.rows import Rows
 from .ops.sh import degree_of, record_sh
@@ -48,7 +48,8 @@ class Rendering:
         static, dynamic: The Gaussians of one branch alone; None unless requested.
         radii: [N, 2] half sizes on screen [px]; 0 = culled.
         gradient_norms: [N, 2] after the backward pass: length of the screen-space gradient of each mean, plain and (if
-            requested) with absolute values per pixel, in normalised device coordinates as in the densification of 3DGS.
+            requested) with absolute values per pixel or of the images alone, in normalised device coordinates as in the
+            densification of 3DGS.
         contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless requested.
         weights: [N] sum of its blend weights over the joint image, not differentiable; None unless requested.
     """
@@ -157,5 +158,6 @@ def _record(
     if sh_degree is not None:
         features = record_sh(ctx, means, appearance, viewmat, projection.radii, sh_degree)
     rows.add_features(ctx, features)
-    composite = record_composite(ctx, rows, tiles, size, background, settings.statistics, settings.absgrad)
+    second_norm: SecondNorm = "absolute" if settings.absgrad else "images" if settings.imagegrad else None
+    composite = record_composite(ctx, rows, tiles, size, background, settings.statistics, second_norm)
     return (projection.radii, *composite.flat())

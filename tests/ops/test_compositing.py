@@ -233,7 +233,7 @@ FEW = make_inputs(8, size=(20, 17))
 def test_absolute_gradient_norms_sum_absolute_values_over_pixels(inputs, dynamic):
     size = (20, 17)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
-    result = ours(single, size, absgrad=True, is_dynamic=dynamic)
+    result = ours(single, size, second_norm="absolute", is_dynamic=dynamic)
     images = [
         theirs(double, size, selected)[0] for selected in ([None] if dynamic is None else [None, ~dynamic, dynamic])
     ]

@@ -1,5 +1,6 @@
 """A training step: its inputs by name, and that nothing but the phase and tensors decides what it does."""
 
+import copy
 import dataclasses
 import inspect
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.scenes import relative_error
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.training.optimizer import GROUPS
 from warpgs.training.schedule import Phase
@@ -134,6 +136,23 @@ def test_phases_that_differ_in_one_field_are_different_keys(field):
     phase = Phase("stage1", use_deformation=True, use_appearance=True, sh_degree=1, with_depth=True, with_joint=True)
     other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
     assert len({phase, other}) == 2
+
+
+@pytest.mark.parametrize("depth_gradients", [True, False])
+def test_densification_looks_at_the_terms_of_depth_only_if_asked_to(data, tmp_path, depth_gradients):
+    densify = dataclasses.replace(tiny.CONFIG.densify, depth_gradients=depth_gradients)
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify))
+    plan = trainer.protocol.at(0)
+    assert plan.phase.with_depth
+    sample, state, totals = trainer._sample(plan), copy.deepcopy(trainer.scene.state_dict()), []
+    for depth_weight in (0.0, 1.0):
+        trainer.scene.load_state_dict(state)
+        trainer.step.reset_statistics()
+        trainer.step(dataclasses.replace(plan, depth_weight=depth_weight), sample)
+        totals.append(trainer.step.statistics.total)
+    without, with_depth = totals
+    assert without.any()
+    assert (relative_error(with_depth, without) < 1e-6) == (not depth_gradients)
 
 
 def test_every_parameter_group_has_a_learning_rate(data, tmp_path):

@@ -11,7 +11,7 @@ from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
-from warpgs.kernels.rows import gradient_stride
+from warpgs.kernels.rows import SecondNorm, gradient_stride
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
 from warpgs.runtime.launch import PerShard
 from warpgs.runtime.tape import OpContext, differentiable
@@ -127,14 +127,14 @@ class _Images:
         outputs = (image, self._depth, alpha, *self._saved, *statistics)
         self._launch(ctx, make_composite_fwd, weights is not None, *outputs)
 
-    def record_backward(self, ctx: OpContext, absgrad: bool) -> None:
-        """Records the backward pass, with absolute-value gradients or without."""
+    def record_backward(self, ctx: OpContext, second_norm: SecondNorm) -> None:
+        """Records the backward pass, with a second gradient norm or without."""
         _, alphas, depths = self.layers
         ctx.on_backward(
-            lambda ctx: self._backward(ctx, absgrad), reads=(*depths, *(() if self._background is None else alphas))
+            lambda ctx: self._backward(ctx, second_norm), reads=(*depths, *(() if self._background is None else alphas))
         )
 
-    def _backward(self, ctx: OpContext, absgrad: bool) -> None:
+    def _backward(self, ctx: OpContext, second_norm: SecondNorm) -> None:
         v_layers = [[ctx.gradient(t) for t in tensors] for tensors in self.layers]
         images_with_gradient = sum({1 << m for values in v_layers for m, v in enumerate(values) if v is not None})
         if images_with_gradient == 0:
@@ -144,7 +144,7 @@ class _Images:
         v_arrays = [None if v is None else v.view(-1) for vs in v_layers for v in (vs + missing)[:NUM_BRANCH_IMAGES]]
         gradients = ctx.zeros(ctx.num_shards, len(rows.packed), gradient_stride(rows.num_channels))
         inputs = (self._depth, *self._saved, *v_arrays, images_with_gradient)
-        self._launch(ctx, make_composite_bwd, absgrad, *inputs, PerShard(gradients))
+        self._launch(ctx, make_composite_bwd, second_norm, *inputs, PerShard(gradients))
         ctx.add_gradient(rows.packed, gradients)
         if self._background is not None:
             ctx.add_gradient(self._background, self._background_gradient(ctx, v_layers[0]))
@@ -158,10 +158,12 @@ class _Images:
                 v_colors[m] = (transmittance[m] @ v_image.view(-1, num_features))[0]
         return v_colors.sum(0) if self._stride == 0 else v_colors
 
-    def _launch(self, ctx: OpContext, make_kernel: Callable[..., Any], flag: bool, *arguments: Any) -> None:
+    def _launch(
+        self, ctx: OpContext, make_kernel: Callable[..., Any], variant: bool | SecondNorm, *arguments: Any
+    ) -> None:
         """Launches a compositing kernel over all blocks of pixels of all images."""
         rows = self._rows
-        kernel = make_kernel(rows.num_features, rows.with_depth, self._num_images, self._pixels, flag)
+        kernel = make_kernel(rows.num_features, rows.with_depth, self._num_images, self._pixels, variant)
         work = TILE_SIZE * TILE_SIZE
         ctx.launch(kernel, self._dim, *self._inputs, *arguments, block_dim=BLOCK_DIM, work=work)
 
@@ -173,7 +175,7 @@ def record_composite(
     size: tuple[int, int],
     background: Tensor | None,
     statistics: bool,
-    absgrad: bool,
+    second_norm: SecondNorm,
 ) -> Composite:
     """Composites packed rows as a part of a larger op: three images if the tiles have branches, otherwise one.
 
@@ -184,7 +186,7 @@ def record_composite(
         size: (width, height) [px].
         background: [features], or [images, features] with one for each image; None is black. Depth has none.
         statistics: Whether to fill ``contributed`` and ``weights``.
-        absgrad: Whether the backward pass also accumulates the absolute-value gradient norms.
+        second_norm: What the second column of ``gradient_norms`` is; zeros if None.
 
     Raises:
         ValueError: If all images together have too many pixels to be counted.
@@ -194,7 +196,7 @@ def record_composite(
     contributed = ctx.zeros(N, dtype=torch.uint8) if statistics else None
     weights = ctx.zeros(ctx.num_shards, N) if statistics else None
     images.composite(ctx, contributed, weights)
-    images.record_backward(ctx, absgrad)
+    images.record_backward(ctx, second_norm)
     return Composite(
         *images.layers,
         gradient_norms=rows.gradient_norms,
@@ -211,7 +213,7 @@ def composite(
     background: Float[Tensor, " C"] | None = None,
     is_dynamic: Bool[Tensor, " N"] | None = None,
     statistics: bool = False,
-    absgrad: bool = False,
+    second_norm: SecondNorm = None,
 ) -> Composite:
     """Composites projected splats front to back; differentiable in their geometry, opacities, features, background.
 
@@ -223,7 +225,7 @@ def composite(
         background: [C] value behind everything; zero by default.
         is_dynamic: [N] branch of each splat; if given, three images are made: joint, static only, dynamic only.
         statistics: Whether to report the contribution of each splat.
-        absgrad: Whether the backward pass also accumulates the absolute-value gradient norms.
+        second_norm: What the second column of ``gradient_norms`` is; zeros if None.
 
     Raises:
         ValueError: On a wrong shape, dtype, device or size.
@@ -237,7 +239,7 @@ def composite(
         rows = Rows(ctx, projection, features.shape[1], False, size)
         tiles = record_tiles(ctx, rows, size, branch)
         rows.add_features(ctx, features)
-        return record_composite(ctx, rows, tiles, size, background, statistics, absgrad).flat()
+        return record_composite(ctx, rows, tiles, size, background, statistics, second_norm).flat()
 
     tensors = differentiable(op, *splats[:4], features, background)
     return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES, with_depth=False)

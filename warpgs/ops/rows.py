@@ -24,9 +24,9 @@ class Rows:
         packed: [N, parts, 4] rows.
         num_features, with_depth: As given.
         num_channels: Number of features, plus one with depth.
-        gradient_norms: [N, 2] length of the gradient of the screen-space mean and of its absolute-value variant (terms
-            are summed over pixels by absolute value), in normalised device coordinates (pixels × size / 2) as in the
-            densification of 3DGS; zero until the backward pass.
+        gradient_norms: [N, 2] length of the gradient of the screen-space mean and of a second one (``SecondNorm``;
+            zero without), in normalised device coordinates (pixels × size / 2) as in the densification of 3DGS; zero
+            until the backward pass.
         depth_keys, gaussian_from_rank: [2 N] int32 input of the depth sort, in the first half.
     """
 

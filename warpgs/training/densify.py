@@ -32,15 +32,15 @@ class GradientStatistics:
         self.count = torch.zeros(num, device=device)
 
     @torch.no_grad()
-    def observe(self, norms: Float[Tensor, "N 2"], radii: Int32[Tensor, "N 2"]) -> None:
+    def observe(self, norms: Float[Tensor, " N"], radii: Int32[Tensor, "N 2"]) -> None:
         """Adds one view, after its backward pass.
 
         Args:
-            norms: [N, 2] ``Rendering.gradient_norms``; the first column counts.
+            norms: [N] a column of ``Rendering.gradient_norms``.
             radii: [N, 2] ``Rendering.radii``; 0 = culled.
         """
         visible = radii[:, 0] > 0
-        self.total += torch.where(visible, norms[:, 0], 0.0)
+        self.total += torch.where(visible, norms, 0.0)
         self.count += visible
 
     def mean(self) -> Float[Tensor, " N"]:

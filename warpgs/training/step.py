@@ -138,7 +138,7 @@ class Step:
         self._choose_trained(phase)
         flags = (phase.use_deformation, phase.use_appearance)
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise, late_sh=True)
-        settings = RenderSettings(branches=True, depth=phase.with_depth, antialias=self.config.antialias, replay=False)
+        settings = self._settings(phase)
         rendering = render(splats, view.camera, self._inputs.backgrounds, settings)
         alignment = self.alignments.index_select(0, self._index)[0] if phase.with_depth else None
         trust = self._depth_trust.index_select(0, self._index)[0] if phase.with_depth else None
@@ -149,8 +149,14 @@ class Step:
         torch.autograd.backward(list(terms.values()), [self._inputs.scale[name] for name in terms])
         self.optimizer.step()
         self.optimizer.zero_grad()
-        self.statistics.observe(rendering.gradient_norms, rendering.radii)
+        self.statistics.observe(rendering.gradient_norms[:, int(settings.imagegrad)], rendering.radii)
         self._add_to_sums(terms, rendering, view)
+
+    def _settings(self, phase: Phase) -> RenderSettings:
+        """What is rendered in a phase; without depth all gradients are those of images."""
+        options = {"depth": phase.with_depth, "antialias": self.config.antialias}
+        imagegrad = phase.with_depth and not self.config.densify.depth_gradients
+        return RenderSettings(branches=True, imagegrad=imagegrad, replay=False, **options)
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""
