@@ -145,6 +145,29 @@ def test_inverse_depth_of_any_scale_is_fit(root):
     assert "off at the points" in texts(report, "note")
 
 
+def check_metric(root, convert):
+    """Checks the capture with depth in files that DyCheck's layout takes for those of a sensor."""
+    write_depth(root, convert)
+    return check_capture(root, "iphone", factor=1)
+
+
+def test_metric_depth_is_compared_as_it_is(root):
+    assert "metric depth is 0.0% off" in texts(check_metric(root, lambda depth: depth), "note")
+    report = check_metric(root, lambda depth: 2.0 * depth)  # a scale would hide it
+    assert "metric depth is 50.0% off" in texts(report, "note")
+    assert "12 of 12 frames is hardly better than a constant" in texts(report, "warning")
+
+
+def test_metric_depth_without_points_to_compare_with_is_fit(root):
+    report = check_metric(root, lambda depth: np.where(np.arange(256) == 5, depth, 0.0))  # 0 is unknown
+    assert "cannot" not in str(report)
+    assert "too few to align" not in str(report)
+
+
+def test_metric_depth_that_is_known_nowhere_is_a_warning(root):
+    assert "is known nowhere" in texts(check_metric(root, np.zeros_like), "warning")
+
+
 def test_depth_instead_of_inverse_depth_is_a_warning(root):
     write_depth(root, lambda depth: depth)
     assert "the depth of 12 of 12 frames cannot be aligned to the points: it grows" in texts(

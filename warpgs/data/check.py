@@ -253,7 +253,7 @@ def _contrast_at_points(frame: Frame, points: torch.Tensor) -> float | None:
 
 
 def _depth(capture: Capture) -> Iterator[Finding]:
-    """Aligns the depth of the sampled frames to the points and measures its error."""
+    """Aligns the depth of the sampled frames to the points as training does, and measures its error."""
     errors, unusable, count = [], 0, 0
     problems: Counter[DepthProblem] = Counter()
     for name in _sampled(capture.train, SAMPLES):
@@ -264,10 +264,11 @@ def _depth(capture: Capture) -> Iterator[Finding]:
         everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
         static = everywhere if frame.static_mask is None else frame.static_mask
         sources = (frame.inverse_depth, static, frame.camera, capture.points)
-        if problem := alignment_problem(*sources):
+        if problem := alignment_problem(*sources, capture.metric_depth):
             problems[problem] += 1
-        else:
-            found = relative_errors(*sources, align_to_points(*sources))
+            continue
+        found = relative_errors(*sources, align_to_points(*sources, capture.metric_depth))
+        if bool(found.isfinite().all()):
             errors.append(float(found[0]))
             unusable += int(is_unusable(found))
     for problem, number in problems.items():
@@ -275,7 +276,8 @@ def _depth(capture: Capture) -> Iterator[Finding]:
             yield Finding("warning", "depth", f"the depth of {number} of {count} frames {DEPTH_PROBLEMS[problem]}")
     if errors:
         median = float(np.median(errors))
-        yield Finding("note", "depth", f"aligned depth is {median:.1%} off at the points (median)")
+        kind = "metric" if capture.metric_depth else "aligned"
+        yield Finding("note", "depth", f"{kind} depth is {median:.1%} off at the points (median)")
     if unusable:
         yield Finding("warning", "depth", f"the depth of {unusable} of {count} frames is hardly better than a constant")
 

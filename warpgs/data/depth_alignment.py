@@ -78,8 +78,15 @@ def align_to_points(
     static: Tensor,
     camera: Camera,
     points: Float[Tensor, "P 3"],
+    is_metric: bool = False,
 ) -> Float[Tensor, "2"]:
-    """Scale and offset that align a frame's inverse depth with the visible sparse points in its static region."""
+    """Scale and offset that align a frame's inverse depth with the visible sparse points in its static region.
+
+    Metric depth (``Capture.metric_depth``) stays as it is: (1, 0), or NaN if it is known nowhere.
+    """
+    if is_metric:
+        known = bool(inverse_depth.isfinite().any())
+        return inverse_depth.new_tensor([1.0, 0.0] if known else [torch.nan, torch.nan])
     return fit_scale_offset(*_samples(inverse_depth, static, camera, points))
 
 
@@ -93,10 +100,13 @@ def alignment_problem(
     static: Tensor,
     camera: Camera,
     points: Float[Tensor, "P 3"],
+    is_metric: bool = False,
 ) -> DepthProblem | None:
     """Why ``align_to_points`` finds no alignment of a frame; None if it finds one."""
     if not bool(inverse_depth.isfinite().any()):
         return "unknown"
+    if is_metric:
+        return None
     values, targets = _samples(inverse_depth, static, camera, points)
     if len(values) < MIN_SAMPLES:
         return "few points"

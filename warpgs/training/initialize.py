@@ -16,7 +16,7 @@ from warpgs.rendering import render
 
 from .dynamic_points import max_scale, unproject_pixels
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
-from .views import View, Views
+from .views import Views
 
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views from which points without colours are coloured."""
@@ -125,7 +125,7 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
     for index in range(len(views)):
         view = views[index]
         sources = (view.inverse_depth, view.static_mask, view.camera, points)
-        alignments[index] = _alignment(view, capture)
+        alignments[index] = depth_alignment.align_to_points(*sources, capture.metric_depth)
         errors[index] = depth_alignment.relative_errors(*sources, alignments[index])
         if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
             factor, error = depth_alignment.smooth_factor(*sources, alignments[index])
@@ -133,14 +133,6 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
                 views.set_depth_factor(index, alignments[index], factor)
                 errors[index, 0] = error
     return DepthAlignment(alignments, errors)
-
-
-def _alignment(view: View, capture: Capture) -> Float[Tensor, "2"]:
-    """Scale and offset of a view's inverse depth; NaN where they cannot be determined."""
-    depth = view.inverse_depth
-    if capture.metric_depth:
-        return depth.new_tensor([1.0, 0.0] if bool(depth.isfinite().any()) else [torch.nan, torch.nan])
-    return depth_alignment.align_to_points(depth, view.static_mask, view.camera, capture.points.to(depth.device))
 
 
 @torch.no_grad()
