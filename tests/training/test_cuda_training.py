@@ -8,6 +8,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator, relative_error
+from warpgs.ops.encoding import aligned
 from warpgs.ops.mlp import num_values, perceptron, split
 from warpgs.rendering import render
 from warpgs.runs.checkpoint import Metadata
@@ -136,7 +137,7 @@ def plain(encoding, weights, biases, skip):
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])
 @pytest.mark.parametrize("num", [0, 1, 1000])
-@pytest.mark.parametrize("outputs", [3, 10])
+@pytest.mark.parametrize("outputs", [3, 10, 49])
 def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outputs):
     g = generator()
     encoding = torch.rand(num, 21, generator=g).double() * 2 - 1
@@ -149,7 +150,7 @@ def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outp
     values = plain(encoding, expected[:5], expected[5:], skip=2)
     values.backward(v_outputs.double())
 
-    padded = [(64, 24), (64, 64), (64, 88), (64, 64), (16, 64)]
+    padded = [(64, 24), (64, 64), (64, 88), (64, 64), (aligned(outputs), 64)]
     flat = torch.zeros(num_values(padded))
     for layer, weight, bias in zip(split(flat, padded), weights, biases, strict=True):
         layer.weight[: weight.shape[0], : weight.shape[1]] = weight
