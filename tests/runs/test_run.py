@@ -16,6 +16,7 @@ from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_run
+from warpgs.training.schedule import Protocol
 
 UNUSUAL = dataclasses.replace(
     tiny.CONFIG,
@@ -98,6 +99,22 @@ def test_a_run_folder_cannot_be_locked_twice_and_is_unlocked_after_an_error(run)
             fail_locked(run)
     with Run.open(run, "cpu").lock(), pytest.raises(ValueError, match="is being trained by another process"):
         fail_locked(run)
+
+
+@pytest.mark.parametrize("dap", [False, True])
+@pytest.mark.parametrize("is_old", [False, True])
+def test_earlier_runs_without_pretraining_stay_without_a_depth_loss(run, dap, is_old):
+    def change(values):
+        values["dap"] = dap
+        if is_old:
+            del values["loss"]["depth_gate"]
+
+    depth = read_config(run).loss.depth
+    assert depth > 0
+    edit(run, change)
+    config = read_config(run)
+    assert config.loss.depth == (0 if is_old and not dap else depth)
+    assert Protocol(config, has_depth=True).phase_at(0).with_depth == (config.loss.depth > 0)
 
 
 @pytest.mark.parametrize("part", [None, "model", "schedule"])

@@ -41,7 +41,19 @@ def read_config(folder: Path) -> TrainConfig:
     path = folder / NAME
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    return dataclasses.replace(parse_config(read_json(path, max_bytes=MAX_BYTES), path), out=folder)
+    values = _with_old_meaning(read_json(path, max_bytes=MAX_BYTES))
+    return dataclasses.replace(parse_config(values, path), out=folder)
+
+
+def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
+    """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
+
+    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all.
+    """
+    loss = values.get("loss")
+    if values.get("dap") is False and isinstance(loss, dict) and "depth_gate" not in loss:
+        return {**values, "loss": {**loss, "depth": 0.0}}
+    return values
 
 
 def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
