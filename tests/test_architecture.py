@@ -18,7 +18,7 @@ ORDER = [
     "cameras",
     "model",
     "rendering",
-    "visualize",
+    "depth_colors visualize",
     "data",
     "runs",
     "video",

@@ -1,6 +1,5 @@
 """Images for people to look at."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -63,37 +62,3 @@ def test_a_comparison_shows_truth_joint_static_dynamic_and_error_in_that_order(r
 def test_every_image_of_a_comparison_has_a_caption(rendering):
     bar = visualize.comparison(torch.ones(H, W, 3), rendering)[: visualize.CAPTION_HEIGHT]
     assert all(bar[:, k * W : (k + 1) * W].max() > 100 for k in range(5))
-
-
-def test_near_depth_is_red_and_far_depth_blue():
-    image = visualize.depth_image(np.linspace(0.1, 2.0, W, dtype=np.float32)[None].repeat(H, 0))
-    (far_red, _, far_blue), (near_red, _, near_blue) = image[0, 1].astype(int), image[0, -2].astype(int)
-    assert far_blue > far_red
-    assert near_red > near_blue
-
-
-def test_depth_colours_are_those_of_turbo_between_the_percentiles():
-    inverse = np.random.default_rng(0).uniform(0.5, 1.5, (H, W)).astype(np.float32)
-    low, high = np.percentile(inverse, [2, 98])
-    level = np.clip((inverse - low) / (high - low) * 255, 0, 255).round().astype(np.uint8)
-    expected = cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[..., ::-1]
-    assert np.array_equal(visualize.depth_image(inverse), expected)
-
-
-@pytest.mark.parametrize("unknown", [0, 96])
-def test_unknown_depth_has_the_requested_grey_and_changes_no_other_colour(unknown):
-    inverse = np.random.default_rng(0).uniform(0.5, 1.5, (H, W)).astype(np.float32)
-    complete = visualize.depth_image(np.concatenate([inverse, inverse]))
-    inverse_with_gap = np.concatenate([inverse, inverse, np.full((3, W), np.nan, np.float32)])
-    image = visualize.depth_image(inverse_with_gap, unknown)
-    assert np.array_equal(image[: 2 * H], complete)
-    assert (image[2 * H :] == unknown).all()
-
-
-def test_an_image_without_any_depth_is_grey():
-    assert (visualize.depth_image(np.full((H, W), np.nan, np.float32), 96) == 96).all()
-
-
-def test_a_wall_at_one_depth_has_one_colour():
-    inverse = np.float32(0.5) + np.random.default_rng(0).uniform(-1e-8, 1e-8, (H, W)).astype(np.float32)
-    assert len(np.unique(visualize.depth_image(inverse).reshape(-1, 3), axis=0)) == 1

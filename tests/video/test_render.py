@@ -201,9 +201,9 @@ def test_alpha_is_grey(run, capture, scene, tmp_path):
 
 
 def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):
-    bounds, original = [], visualize.depth_image
+    bounds, original = [], frames.depth_image
     monkeypatch.setattr(frames, "MIN_ALPHA", 0.05)
-    monkeypatch.setattr(visualize, "depth_image", lambda *a, **k: bounds.append(k["bounds"]) or original(*a, **k))
+    monkeypatch.setattr(frames, "depth_image", lambda *a, **k: bounds.append(k["bounds"]) or original(*a, **k))
     render(run, tmp_path, path="moving", layers="depth", frames=4)
     assert len(bounds) == 4
     assert len(set(bounds)) == 1

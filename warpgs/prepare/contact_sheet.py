@@ -6,6 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from warpgs.data.sampling import evenly_spaced
+from warpgs.depth_colors import depth_image
+
 MAX_THUMBNAILS = 30
 COLUMNS = 6
 THUMBNAIL_WIDTH = 256
@@ -21,7 +24,7 @@ def contact_sheet(images: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequen
 
 def choose_evenly(count: int) -> list[int]:
     """At most 30 indices, evenly spaced over ``count``."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_THUMBNAILS)).round().astype(int)).tolist()
+    return evenly_spaced(count, MAX_THUMBNAILS)
 
 
 def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
@@ -35,12 +38,7 @@ def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H
 
 def colored_depth(inverse_depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     """[H, W, 3] inverse depth as colours: near is red, unknown is grey."""
-    known = np.isfinite(inverse_depth)
-    low, high = np.percentile(inverse_depth[known], [2, 98]) if known.any() else (0.0, 1.0)
-    level = np.clip((np.where(known, inverse_depth, low) - low) / max(high - low, 1e-12), 0, 1)
-    colors = cv2.cvtColor(cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
-    colors[~known] = 96
-    return colors
+    return depth_image(inverse_depth, unknown=96)
 
 
 def _thumbnail(image: np.ndarray, caption: str) -> np.ndarray:

@@ -11,6 +11,7 @@ from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
+from warpgs.depth_colors import depth_bounds, depth_image
 from warpgs.progress import progress
 from warpgs.rendering import Layer, render
 from warpgs.runs.trained import TrainedScene
@@ -56,7 +57,7 @@ def depth_range(scene: TrainedScene, cameras: list[Camera]) -> tuple[float, floa
     """
     chosen = camera_paths.evenly_spaced_indices(len(cameras), NUM_SAMPLES)
     inverse = np.concatenate([_inverse_depth(scene, cameras[k]).ravel() for k in chosen])
-    return visualize.depth_bounds(inverse[np.isfinite(inverse)])
+    return depth_bounds(inverse[np.isfinite(inverse)])
 
 
 @torch.no_grad()
@@ -87,7 +88,7 @@ def _pixels(layer: Layer, options: Render) -> Float[Tensor, "H W C"]:
 
 def _depth_image(scene: TrainedScene, camera: Camera, depths: tuple[float, float]) -> Float[Tensor, "H W 3"]:
     """Inverse depth in colours: red is near, blue is far, black is empty."""
-    image = visualize.depth_image(_inverse_depth(scene, camera), bounds=depths)
+    image = depth_image(_inverse_depth(scene, camera), bounds=depths)
     return torch.from_numpy(image).to(scene.device).float() / 255.0
 
 

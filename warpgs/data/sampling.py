@@ -1,0 +1,8 @@
+"""Samples of a sequence; needs no torch."""
+
+import numpy as np
+
+
+def evenly_spaced(count: int, max_count: int) -> list[int]:
+    """At most ``max_count`` indices below ``count``, evenly spaced, with the first and the last one."""
+    return np.unique(np.linspace(0, count - 1, min(count, max_count)).round().astype(int)).tolist()
