@@ -41,7 +41,7 @@ class Sweep:
     per_gpu: int = 1
     """Number of trainings that share a GPU; small captures do not fill one."""
     cpus: int | None = None
-    """Cores of each training; by default 1 on a GPU, 2 without."""
+    """Cores of each training; by default an equal share of a node's on a GPU, 2 without."""
     address: str | None = None
     """HOST:PORT of the head of a Ray cluster; by default Ray is started on this machine."""
     compare: Path | None = None

@@ -1,6 +1,7 @@
 """Runs cells on Ray: this machine, all of its GPUs, or a cluster."""
 
 import logging
+import os
 import socket
 import time
 import warnings
@@ -18,8 +19,18 @@ PROBE_SECONDS = 5.0
 MAX_SILENCE = 20.0
 """Time without an accepted connection after which a cluster is gone [s]; Ray ends the program after 60 s."""
 
+OBJECT_STORE_BYTES = 100 << 20
+"""Shared memory of a Ray that is started here [bytes]; nothing is exchanged through it. Ray would take 30 % of the
+memory, which containers seldom have in /dev/shm."""
 
-def _import_ray() -> Any:
+
+def _import_ray(address: str | None) -> Any:
+    """Ray, which reads these variables when it is imported."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address is None:
+        # Whoever reaches a Ray can run code: one of this machine alone listens on 127.0.0.1. So Ray does on macOS and
+        # Windows; on Linux it does if it is told so by the variable that was meant for these two.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray
     except ImportError as error:
@@ -34,7 +45,7 @@ class RayPool:
         address: HOST:PORT of the head of a cluster; None starts Ray on this machine.
         device: Device of the trainings; CUDA if None and the cluster has GPUs.
         per_gpu: Number of trainings that share a GPU.
-        cpus: Cores of each training; if None, 1 on a GPU and 2 without.
+        cpus: Cores of each training; if None, its share of those of a node on a GPU, and 2 without.
 
     Raises:
         ImportError: If Ray is not installed.
@@ -43,12 +54,12 @@ class RayPool:
     """
 
     def __init__(self, address: str | None, device: str | None, per_gpu: int, cpus: int | None) -> None:
-        self._ray = _import_ray()
+        self._ray = _import_ray(address)
         self._connect(address)
         total = self._ray.cluster_resources()
         self.device = device or ("cuda" if total.get("GPU", 0) else "cpu")
         gpus = 1.0 / per_gpu if self.device == "cuda" else 0.0
-        cores = cpus or (1 if gpus else min(2, round(total.get("CPU", 1))))
+        cores = cpus or (self._share_of_cores(per_gpu) if gpus else min(2, round(total.get("CPU", 1))))
         self._check_room(gpus, cores)
         # Attempts are counted by the sweep, and a worker's memory must not outlive its training.
         remote = self._ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=0, max_calls=1)
@@ -61,7 +72,7 @@ class RayPool:
         if address is not None:
             _probe(address)  # Ray would try for a minute and a half, and then end the program
         logging.getLogger("ray").setLevel(logging.ERROR)
-        options = {} if address else {"include_dashboard": False}
+        options = {} if address else _local_options()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Ray's announcements of its future versions
@@ -75,8 +86,16 @@ class RayPool:
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ConnectionError(f"Ray cannot be reached at {address or 'this machine'}: {one_line(error)}") from error
 
+    def _nodes(self) -> list[dict[str, float]]:
+        return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+
+    def _share_of_cores(self, per_gpu: int) -> int:
+        """Cores per training on the node with the fewest; Ray limits the threads of torch to them."""
+        shares = (node.get("CPU", 0) / (node["GPU"] * per_gpu) for node in self._nodes() if node.get("GPU", 0))
+        return max(1, int(min(shares, default=1)))
+
     def _check_room(self, gpus: float, cores: int) -> None:
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        nodes = self._nodes()
         if not any(node.get("GPU", 0) >= gpus and node.get("CPU", 0) >= cores for node in nodes):
             raise ValueError(
                 f"no node of the cluster has {cores} cores{f' and {gpus:g} GPUs' if gpus else ''} for a training: "
@@ -127,6 +146,17 @@ class RayPool:
     def close(self) -> None:
         """Disconnects; a Ray that was started here ends."""
         self._ray.shutdown()
+
+
+def _local_options() -> dict[str, Any]:
+    """How a Ray of this machine alone is started: with the GPUs that torch sees, which Ray may count otherwise."""
+    import torch
+
+    return {
+        "include_dashboard": False,
+        "num_gpus": torch.cuda.device_count(),
+        "object_store_memory": OBJECT_STORE_BYTES,
+    }
 
 
 def _probe(address: str) -> None:
