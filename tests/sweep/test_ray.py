@@ -132,9 +132,15 @@ def cluster(request):
     made.shutdown()
 
 
+def running_from(out, iteration):
+    """The cells that run and have a checkpoint of this iteration or a later one; older checkpoints are removed."""
+    saved = (path for path in out.glob("*/checkpoints/*.safetensors") if int(path.stem) >= iteration)
+    return {path.parents[1].name for path in saved} & {path.name for path in out.glob("running/*")}
+
+
 @contextlib.contextmanager
 def sweeping(cluster, folder):
-    """The command in a process of its own; yields it once two cells have written checkpoints."""
+    """The command in a process of its own; yields it once two running cells have written checkpoints."""
     from tests import tiny
 
     (folder / "tiny.toml").write_text(TOML)
@@ -142,7 +148,7 @@ def sweeping(cluster, folder):
     command += ["--out", "out", "--address", cluster.address, "--cpus", "1"]
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
-        while process.poll() is None and len(list(folder.glob("out/*/checkpoints/*20.safetensors"))) < 2:
+        while process.poll() is None and len(running_from(folder / "out", 20)) < 2:
             time.sleep(0.1)
         yield process
     finally:
