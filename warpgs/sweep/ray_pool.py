@@ -3,6 +3,7 @@
 import logging
 import os
 import socket
+import sys
 import time
 import warnings
 from contextlib import suppress
@@ -27,7 +28,7 @@ memory, which containers seldom have in /dev/shm."""
 def _import_ray(address: str | None) -> Any:
     """Ray, which reads these variables when it is imported."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if address is None:
+    if address is None and "ray" not in sys.modules:
         # Whoever reaches a Ray can run code: one of this machine alone listens on 127.0.0.1. So Ray does on macOS and
         # Windows; on Linux it does if it is told so by the variable that was meant for these two.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
