@@ -41,11 +41,11 @@ BEST = TrainConfig(
         mask_margin=0.008,
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
-    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.01, reseed=0.05),
+    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.02, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
-        stage2=37_500,
+        stage2=22_500,
         realign_at=200,
         densify_from=100,
         densify_until=4_500,
