@@ -4,12 +4,14 @@ from pathlib import Path
 
 import jaxtyping
 
+import tests.typechecks  # noqa: F401  # named below
+
 # The kernels lie outside this folder and are left out: Warp reads their annotations itself.
 PACKAGE = Path(__file__).parent.parent / "warpgs"
 CHECKED = [
     f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if path.stem not in ("__init__", "__pycache__", "kernels")
 ]
-jaxtyping.install_import_hook(CHECKED, "beartype.beartype")
+jaxtyping.install_import_hook(CHECKED, "tests.typechecks.check")
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
