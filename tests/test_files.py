@@ -5,6 +5,7 @@ import json
 import math
 import os
 import struct
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from warpgs.files import (
+    complete_or_absent,
     natural_order,
     partial_path,
     read_array,
@@ -68,6 +70,48 @@ def test_ctrl_c_leaves_the_old_file_and_nothing_else(path, monkeypatch):
         write_text(path, "new")
     assert path.read_bytes() == b"old"
     assert list(path.parent.iterdir()) == [path]
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from warpgs.files import complete_or_absent
+with complete_or_absent(Path(sys.argv[1])) as partial:
+    (partial / "image.png").write_bytes(b"x")
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends processes differently")
+def test_what_a_killed_process_left_of_a_folder_is_removed_by_the_next(tmp_path):
+    folder = tmp_path / "c[a]pture"
+    subprocess.run([sys.executable, "-c", KILLED, folder], env=os.environ, timeout=60)
+    (left,) = tmp_path.iterdir()
+    assert (left / folder.name / "image.png").is_file()
+    with complete_or_absent(folder) as partial:
+        (partial / "image.png").write_bytes(b"y")
+        assert not left.exists()
+    assert list(tmp_path.iterdir()) == [folder]
+    assert [path.name for path in folder.iterdir()] == ["image.png"]
+
+
+def test_a_folder_that_another_process_still_writes_is_kept(tmp_path):
+    with complete_or_absent(tmp_path / "capture") as first:
+        (first / "image.png").write_bytes(b"x")
+        with complete_or_absent(tmp_path / "capture", keep_existing=True) as second:
+            assert first != second
+            assert (first / "image.png").is_file()
+        (tmp_path / "capture").rmdir()
+    assert [path.name for path in tmp_path.rglob("*")] == ["capture", "image.png"]
+
+
+def test_hidden_folders_of_the_user_are_kept(tmp_path):
+    mine = tmp_path / ".capture-mine" / "capture" / "image.png"
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b"x")
+    with complete_or_absent(tmp_path / "capture"):
+        pass
+    assert mine.is_file()
 
 
 def test_files_that_differ_in_their_suffix_have_different_partial_paths(tmp_path):

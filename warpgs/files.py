@@ -1,5 +1,6 @@
 """Reading and writing files: atomic writes, bounded reads, JSON, PNG and .npy; every error names the file."""
 
+import glob
 import io
 import json
 import math
@@ -18,6 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from filelock import FileLock, Timeout
 from jaxtyping import Float, Shaped, UInt
 
 MAX_JSON = 64 << 20
@@ -26,6 +28,9 @@ MAX_JSON = 64 << 20
 MAX_NUMBER = 1e9
 """Maximum magnitude of a position, a focal length or another measured number in a file: larger ones are damage, and
 their products overflow in single precision."""
+
+OWNED = ".warpgs.lock"
+"""File that the process which writes a temporary folder keeps locked."""
 
 MAX_NPY_HEADER = 1 << 20
 """Maximum size of what precedes the numbers of a .npy file [bytes]."""
@@ -81,6 +86,7 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
     Raises:
         OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent.
     """
+    _remove_abandoned(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
@@ -88,15 +94,38 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
         raise OSError(f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
     partial = beside / folder.name  # only its owner may open ``beside``
     try:
-        partial.mkdir()
-        yield partial
-        try:
-            partial.rename(folder)
-        except OSError:
-            if not (keep_existing and folder.is_dir()):
-                raise
+        with _locked(beside):
+            partial.mkdir()
+            yield partial
+            try:
+                partial.rename(folder)
+            except OSError:
+                if not (keep_existing and folder.is_dir()):
+                    raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Removes what processes that were killed in ``complete_or_absent`` left of a folder; others hold their locks."""
+    for partial in folder.parent.glob(f".{glob.escape(folder.name)}-*/{glob.escape(folder.name)}"):
+        if (partial.parent / OWNED).is_file():
+            with suppress(OSError, Timeout, NotImplementedError), FileLock(partial.parent / OWNED, timeout=0):
+                shutil.rmtree(partial)
+            if not partial.exists():
+                shutil.rmtree(partial.parent, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Locks a temporary folder of this process, before there is anything in it, as long as the process lives."""
+    lock = FileLock(folder / OWNED)
+    with suppress(NotImplementedError):  # a file system without locks
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def write_bytes(path: Path, parts: Iterable[bytes]) -> int:
