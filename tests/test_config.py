@@ -32,6 +32,7 @@ def test_presets_are_valid(name):
         ("keep_checkpoints", 0),
         ("densify.every", 0),
         ("densify.gradient", -1e-4),
+        ("densify.weakest", 1.0),  # would leave no Gaussian
         ("model.depth", 0),
         ("model.width", -4),
         ("model.max_static_points", -1),

@@ -27,7 +27,7 @@ class Bounds:
     """
 
     min: int = 0
-    max: int = MAX_VALUE
+    max: int | float = MAX_VALUE
     positive: bool = False
 
     def check(self, name: str, value: int | float) -> None:
@@ -212,7 +212,7 @@ class DensifyConfig:
     reseed: Annotated[float, Bounds(max=1)] = 0.0
     """Fraction of the dynamic pixels that no dynamic Gaussian shows, from which on new ones start there when static
     Gaussians are pruned during densification. 0: never."""
-    weakest: Annotated[float, Bounds(max=1)] = 0.0
+    weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
 
