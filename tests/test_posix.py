@@ -11,8 +11,8 @@ from warpgs import posix
 
 
 def findings(code: str, path: str) -> str:
-    """What the linter finds in a file of the package."""
-    command = [sys.executable, "-m", "ruff", "check", "--select", "TID251", "--stdin-filename", path, "-"]
+    """What the linter finds in a file of the package, as JSON."""
+    command = [sys.executable, "-m", "ruff", "check", "--output-format", "json", "--stdin-filename", path, "-"]
     return subprocess.run(command, input=code, capture_output=True, text=True).stdout
 
 
@@ -38,6 +38,13 @@ def test_the_linter_refuses_syntax_that_python_3_10_does_not_have(code):
     assert "Python 3.10" in findings(code, "warpgs/runs/new.py")
 
 
+@pytest.mark.parametrize(("call", "arguments"), [("open", '"a"'), ("open", '"a", "a"'), ('Path("a").read_text', "")])
+def test_the_linter_refuses_text_in_the_encoding_of_the_system(call, arguments):
+    assert "PLW1514" in findings(f"from pathlib import Path\n\n{call}({arguments})\n", "warpgs/runs/new.py")
+    with_encoding = f"from pathlib import Path\n\n{call}({arguments}, encoding='utf-8')\n".replace("(, ", "(")
+    assert "PLW1514" not in findings(with_encoding, "warpgs/runs/new.py")
+
+
 def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     monkeypatch.delattr(os, "nice")
     monkeypatch.delattr(signal, "pthread_sigmask")
@@ -47,3 +54,6 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     posix.unblock_interrupts()
     assert posix.end_with_parent(os.getppid())
     assert not posix.end_with_parent(-1)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        posix.interrupt(child)
+    assert child.returncode == -signal.SIGTERM

@@ -6,6 +6,7 @@ The linter refuses such calls in all other modules.
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 
 PR_SET_PDEATHSIG = 1
@@ -30,6 +31,14 @@ def end_with_parent(parent: int) -> bool:
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     return os.getppid() == parent
+
+
+def interrupt(process: subprocess.Popen[bytes]) -> None:
+    """Asks a child process to stop, as Ctrl-C does; on Windows, which cannot, it is ended."""
+    if sys.platform == "win32":
+        process.terminate()
+    else:
+        process.send_signal(signal.SIGINT)
 
 
 def unblock_interrupts() -> None:

@@ -72,7 +72,7 @@ def machine(device: str) -> dict[str, Any]:
 def cpu_model() -> str:
     """The name of the processor, or its architecture if the system does not provide the name."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -161,7 +161,7 @@ def _match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
     for start in range(0, len(pairs), step):
         report("matches", start, len(pairs))
         lines = [f"{job.files[a]} {job.files[b]}\n" for a, b in pairs[start : start + step]]
-        listed.write_text("".join(lines))
+        listed.write_text("".join(lines), "utf-8")
         pycolmap.match_image_pairs(job.database, pairing_options=options, device=pycolmap.Device.cpu)
 
 

@@ -114,6 +114,6 @@ def _run(job: dict[str, Any], log: Path, quiet: bool) -> tuple[int, dict[str, An
 def _ending(code: int, log: Path) -> str:
     """How COLMAP's process ended without an answer, in words."""
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    lines = log.read_text(errors="replace").strip().splitlines()
+    lines = log.read_text("utf-8", errors="replace").strip().splitlines()
     advice = "; out of memory? try --longest-side 640 or fewer frames" if name == "SIGKILL" else ""
     return f"its process ended with {name}{advice}" + (f" ({lines[-1][:200]})" if lines else "")

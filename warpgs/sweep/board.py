@@ -111,7 +111,7 @@ class Board:
         self._hosts = {}
         with suppress(OSError):  # files come and go meanwhile
             for path in self._running.iterdir():
-                self._hosts[path.name] = path.read_text()[:60]
+                self._hosts[path.name] = path.read_text("utf-8")[:60]
         self._live.update(self.table())
 
     def table(self) -> Table:

@@ -1,7 +1,6 @@
 """Runs one cell in a child process; the part of a sweep that happens on the nodes of a cluster."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from typing import NamedTuple
 
 from warpgs.errors import one_line
 from warpgs.files import write_text
+from warpgs.posix import interrupt
 
 POLL_SECONDS = 0.2
 GRACE_SECONDS = 120.0
@@ -69,7 +69,7 @@ def _train(job: Job) -> str | None:
     arguments = ["--resume", job.folder] if resumed else list(job.arguments)
     arguments += ["--device", job.device]
     Path(job.log).parent.mkdir(parents=True, exist_ok=True)
-    with open(job.log, "a") as log:
+    with open(job.log, "a", encoding="utf-8") as log:
         log.write(f"{socket.gethostname()}: warpgs train {' '.join(arguments)}\n")
         log.flush()
         command = [sys.executable, "-m", "warpgs.sweep.child", str(os.getpid()), *arguments]
@@ -91,7 +91,7 @@ def _wait(child: subprocess.Popen[bytes]) -> int:
                 return child.wait(POLL_SECONDS)
     finally:
         if child.poll() is None:
-            child.send_signal(signal.SIGINT)
+            interrupt(child)
             try:
                 child.wait(GRACE_SECONDS)
             except subprocess.TimeoutExpired:
