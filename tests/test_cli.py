@@ -1,6 +1,8 @@
 """The command itself."""
 
+import contextlib
 import importlib.metadata
+import io
 import os
 import re
 import subprocess
@@ -47,6 +49,18 @@ def test_help_of_train_is_short_and_help_all_complete(capsys):
     assert "--densify.max-gaussians INT" in complete
     assert "warpgs train --help-all" in short
     assert shown(capsys, "train", "--help") == short
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [(["train", "--help-all"], b"max-gaussians INT"), (["check", "missing \N{RIGHTWARDS ARROW}"], rb"missing \u2192")],
+)
+def test_what_the_output_cannot_represent_is_escaped(arguments, shown, monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "cp1252", write_through=True))
+    with contextlib.suppress(SystemExit):
+        assert main(arguments) in (0, 1)
+    assert shown in written.getvalue()
 
 
 @pytest.mark.parametrize("command", COMMANDS)

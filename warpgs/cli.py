@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from .errors import FAILED, run_command, stoppable, visible
+from .errors import FAILED, program, run_command, visible
 
 
 class Command(NamedTuple):
@@ -52,7 +52,7 @@ TRAIN_OPTIONS = (
 """Options of ``train`` that --help shows; --help-all shows all."""
 
 
-@stoppable
+@program
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(options.run)
 
 
-@stoppable
+@program
 def train(arguments: Sequence[str], prog: str) -> int:
     """``warpgs train`` and ``train.py``: trains, then evaluates; returns the exit code."""
     if "--version" in arguments:

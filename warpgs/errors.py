@@ -1,6 +1,7 @@
 """Errors of commands: one line on stderr and an exit code."""
 
 import functools
+import io
 import sys
 from collections.abc import Callable
 from typing import ParamSpec
@@ -44,12 +45,18 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
     return code if type(code) is int else 0
 
 
-def stoppable(main: Callable[P, int]) -> Callable[P, int]:
-    """Ends a program's main function with one line after Ctrl-C also while it imports and reads its options."""
+def program(main: Callable[P, int]) -> Callable[P, int]:
+    """A program's main function.
+
+    It ends with one line after Ctrl-C also while it imports and reads its options. Characters that standard output
+    cannot represent (outside of terminals on Windows) are escaped, as those of standard error are.
+    """
 
     @functools.wraps(main)
     def run(*args: P.args, **kwargs: P.kwargs) -> int:
         try:
+            if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+                sys.stdout.reconfigure(errors="backslashreplace")
             return main(*args, **kwargs)
         except KeyboardInterrupt:
             sys.stderr.write("warpgs: stopped\n")
