@@ -27,7 +27,7 @@ from warpgs.viewer import serve
 assert posix.sys.platform == "win32" and not hasattr(posix.os, "fork") and not hasattr(posix.signal, "SIGKILL")
 serve._wait = lambda: None
 capture, out = sys.argv[1:]
-tiny = "--model.width 8 --model.depth 2 --model.skip 1 --factor 1 --checkpoint-every 1 --device cpu".split()
+tiny = "--preset quick --model.width 8 --model.depth 2 --model.skip 1 --checkpoint-every 1 --device cpu".split()
 
 def run(*arguments):
     try:
