@@ -1,12 +1,14 @@
-"""Memory stays flat in a long training."""
+"""Memory stays flat in long trainings, and from one training to the next."""
 
 import dataclasses
+import gc
 import sys
-from pathlib import Path
+import time
 
 import pytest
 
 from tests import tiny
+from tests.campaign.memory import MAX_GROWTH, growth, in_mebibytes, needs_proc, resident
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import scaled
 
@@ -15,31 +17,28 @@ pytestmark = pytest.mark.usefixtures("quickly")
 MIN_ITERATIONS = 1000
 """Fewer iterations are too few for memory to settle."""
 
-MAX_GROWTH = 8 << 20
-"""Bytes by which resident memory may grow after the first third."""
 
-
-def resident() -> int:
-    """Resident memory of this process [bytes]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs /proc")
-def test_the_memory_of_a_long_training_is_flat(tmp_path, count):
+@needs_proc
+def test_the_memory_of_long_trainings_is_flat(tmp_path, count, minutes):
     if count < MIN_ITERATIONS:
-        pytest.skip(f"takes minutes: --campaign {MIN_ITERATIONS} trains as many iterations")
+        pytest.skip(f"takes minutes: --campaign {MIN_ITERATIONS} trains as many iterations, --minutes 30 repeatedly")
     config = scaled(dataclasses.replace(tiny.CONFIG, iterations=count, checkpoint_every=97, keep_checkpoints=2))
-    trainer = tiny.trainer(tiny.write(tmp_path / "cache"), tmp_path / "run", config)
+    data, start, runs = tiny.write(tmp_path / "cache"), time.monotonic(), 0
     sizes: list[int] = []
+    while not sizes or time.monotonic() < start + 60 * minutes:
+        trainer = tiny.trainer(data, tmp_path / f"run{runs}", config)
 
-    def measure() -> bool:
-        if trainer.iteration % 20 == 0:
-            sizes.append(resident())
-        return False
+        def measure(trainer=trainer) -> bool:
+            if trainer.iteration % 20 == 0:
+                sizes.append(resident())
+            return False
 
-    assert tiny.train(trainer, tiny.StopWhen(measure))
-    assert trainer.iteration == count
-    settled = sizes[len(sizes) // 3 :]
-    growth = max(settled[len(settled) // 2 :]) - max(settled[: len(settled) // 2])
-    sys.stdout.write(f"resident memory over {count} iterations [MiB]: {[size >> 20 for size in sizes]}\n")
-    assert growth < MAX_GROWTH
+        assert tiny.train(trainer, tiny.StopWhen(measure))
+        assert trainer.iteration == count
+        runs += 1
+        del trainer, measure
+        gc.collect()
+    duration = (time.monotonic() - start) / 60
+    sys.stdout.write(f"{runs} trainings of {count} iterations in {duration:.0f} minutes\n")
+    sys.stdout.write(f"resident memory [MiB]: {in_mebibytes(sizes)}, growth {growth(sizes) / 2**20:.2f}\n")
+    assert growth(sizes) < MAX_GROWTH
