@@ -1,8 +1,11 @@
 """The server of the viewer, its sessions, and one-line errors."""
 
 import importlib.util
+import random
 import shutil
 import socket
+import threading
+import time
 import urllib.request
 from types import SimpleNamespace
 
@@ -10,10 +13,12 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
+from tests.campaign.browser import Browser
 from tests.viewer import watched
 from warpgs.cli import main
 from warpgs.viewer import serve, server
 from warpgs.viewer.command import View
+from warpgs.viewer.renderer import Renderer
 from warpgs.viewer.serve import training_cameras
 from warpgs.viewer.server import Viewer, check_address
 from warpgs.viewer.source import open_source
@@ -100,6 +105,36 @@ def test_a_session_created_while_the_viewer_stops_is_stopped(viewer, monkeypatch
     viewer._add_session(client)
     assert viewer.sessions == {}
     assert sessions[1].stopped
+
+
+@pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
+def test_images_are_rendered_by_threads_that_end_with_their_browsers(run, monkeypatch):
+    """Each thread keeps what it learns of the sizes of images, also of screenshots."""
+    rendered, render = [], Renderer.render
+
+    def recorded(renderer, request, scale):
+        rendered.append((threading.current_thread(), request, scale))
+        return render(renderer, request, scale)
+
+    monkeypatch.setattr(Renderer, "render", recorded)
+    with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
+        with Browser(viewer.port, random.Random(0)) as browser:
+            browser.look()
+            until(lambda: viewer.sessions)
+            (session,) = viewer.sessions.values()
+            until(lambda: session._shown == (session._request(), 1))
+            del rendered[:]
+            browser.set("Screenshot", True)
+            until(lambda: rendered)
+        assert [thread for thread, *_ in rendered] == [session._thread]
+        until(lambda: not session._thread.is_alive())
+
+
+def until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end, "timeout"
+        time.sleep(0.01)
 
 
 def test_a_port_is_free_again_after_the_viewer(run):

@@ -107,7 +107,7 @@ class Session:
     ) -> None:
         self._client, self._source, self._training = client, source, training
         self._renderer, self._resolution, self._clock = Renderer(rendering), AdaptiveResolution(), Clock()
-        self._stopped, self._wake = threading.Event(), threading.Event()
+        self._stopped, self._wake, self._wants_screenshot = (threading.Event() for _ in range(3))
         self._lock = threading.Lock()  # each event of the panel is handled on its own thread
         self._requested: RenderRequest | None = None
         self._changed_at = 0.0
@@ -166,7 +166,7 @@ class Session:
             control.on_update(lambda _: self._wake.set())
         panel.play.on_click(lambda _: self._toggle())
         panel.step.on_click(lambda _: self._step(panel.step.value == FORWARD))
-        panel.screenshot.on_click(lambda _: self._send_screenshot())
+        panel.screenshot.on_click(lambda _: self._ask_for_screenshot())
         if training is not None:
             panel.wipe.on_update(lambda _: self._wake.set())
             panel.view.on_update(lambda _: self._snap(training))
@@ -192,6 +192,11 @@ class Session:
                 bisect.bisect_right(times, now + rounded) if forward else bisect.bisect_left(times, now - rounded) - 1
             )
             set_value(self.panel.time, times[min(max(index, 0), len(times) - 1)])
+        self._wake.set()
+
+    def _ask_for_screenshot(self) -> None:
+        """Lets the thread of this session render it: what a thread learns of image sizes is kept until it ends."""
+        self._wants_screenshot.set()
         self._wake.set()
 
     def _send_screenshot(self) -> None:
@@ -255,6 +260,9 @@ class Session:
 
     def _run(self) -> None:
         while not self._stopped.is_set():
+            if self._wants_screenshot.is_set():
+                self._wants_screenshot.clear()
+                self._send_screenshot()
             try:
                 wait = self._update_image()
             except (ValueError, RuntimeError) as error:  # out of memory is a RuntimeError
