@@ -12,8 +12,8 @@ import viser
 import zstandard
 from websockets.sync.client import connect
 
-SECONDS = 60.0
-"""Maximum time to wait for an image [s], on a machine that may have other work."""
+SECONDS = 120.0
+"""Maximum time to wait for the viewer [s], on a machine that may have other work."""
 
 
 class Browser:
@@ -25,9 +25,13 @@ class Browser:
     """
 
     def __init__(self, port: int, r: random.Random) -> None:
-        origin, protocol = f"http://127.0.0.1:{port}", f"viser-v{viser.__version__}"
         self._socket = connect(
-            f"ws://127.0.0.1:{port}", origin=origin, subprotocols=[protocol], compression=None, max_size=None
+            f"ws://127.0.0.1:{port}",
+            origin=f"http://127.0.0.1:{port}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            compression=None,
+            max_size=None,
+            open_timeout=SECONDS,
         )
         self._r, self.images = r, 0
         self._controls: dict[str, str] = {}

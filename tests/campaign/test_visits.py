@@ -21,7 +21,7 @@ from warpgs.viewer.layers import LAYERS
 PER_VISIT = 20
 """Inputs of the other campaigns per visit, which takes longer."""
 
-PAUSE = 2.0
+PAUSE = 1.0
 """From one visit to the next, in visits that are to last some time [s]."""
 
 MIN_VISITS = 100
