@@ -109,8 +109,9 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
 def _remove_abandoned(folder: Path) -> None:
     """Removes what processes that were killed in ``complete_or_absent`` left of a folder; others hold their locks."""
     for partial in folder.parent.glob(f".{glob.escape(folder.name)}-*/{glob.escape(folder.name)}"):
-        if (partial.parent / OWNED).is_file():
-            with suppress(OSError, Timeout, NotImplementedError), FileLock(partial.parent / OWNED, timeout=0):
+        lock = partial.parent / OWNED
+        if lock.is_file() and not lock.is_symlink():  # opening it may empty it
+            with suppress(OSError, Timeout, NotImplementedError), FileLock(lock, timeout=0):
                 shutil.rmtree(partial)
             if not partial.exists():
                 shutil.rmtree(partial.parent, ignore_errors=True)
