@@ -37,12 +37,15 @@ def run(finished_run, tmp_path):
 
 
 @pytest.fixture
-def viewer(run):
+def viewer(run, tmp_path):
     """A viewer in a process of its own, and its port."""
     command = [sys.executable, "-m", "warpgs", "view", str(run), "--port", "0", "--device", "cpu", "--while-training"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        found = (re.search(r"http://127.0.0.1:(\d+)", line) for line in process.stdout)
-        yield process, int(next(match for match in found if match)[1])
+    output = tmp_path / "output.txt"
+    with output.open("w") as file, subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT) as process:
+        while (found := re.search(r"http://127.0.0.1:(\d+) ", output.read_text())) is None:
+            assert process.poll() is None, output.read_text()
+            time.sleep(0.05)
+        yield process, int(found[1])
         process.terminate()
 
 
