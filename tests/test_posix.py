@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -52,8 +53,20 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     monkeypatch.delattr(posix.ctypes, "CDLL")
     posix.lower_priority(10)
     posix.unblock_interrupts()
+    posix.release_free_memory()
     assert posix.end_with_parent(os.getppid())
     assert not posix.end_with_parent(-1)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         posix.interrupt(child)
     assert child.returncode == -signal.SIGTERM
+
+
+def test_free_memory_is_returned_only_by_the_c_library_that_can(monkeypatch):
+    calls = []
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(posix.ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=calls.append))
+    posix.release_free_memory()
+    assert calls == [0]
+    monkeypatch.setattr(posix.ctypes, "CDLL", lambda name: SimpleNamespace())  # musl
+    posix.release_free_memory()
+    assert calls == [0]

@@ -33,6 +33,12 @@ def end_with_parent(parent: int) -> bool:
     return os.getppid() == parent
 
 
+def release_free_memory() -> None:
+    """Returns memory that the C library keeps for every thread after it ended to the system, with glibc."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
+        trim(0)
+
+
 def interrupt(process: subprocess.Popen[bytes]) -> None:
     """Asks a child process to stop, as Ctrl-C does; on Windows, which cannot, it is ended."""
     if sys.platform == "win32":

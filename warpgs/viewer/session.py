@@ -12,6 +12,7 @@ import viser
 
 from warpgs.cameras import Camera
 from warpgs.files import encode_png
+from warpgs.posix import release_free_memory
 
 from . import comparison
 from .adaptive_resolution import AdaptiveResolution
@@ -270,6 +271,7 @@ class Session:
             self._update_status()
             if wait and self._wake.wait(wait):
                 self._wake.clear()
+        release_free_memory()  # every visit has threads of its own
 
     def _update_image(self) -> float:
         """Renders an image if it would be better than the one shown; returns how long to wait for the next [s]."""
