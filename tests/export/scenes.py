@@ -4,7 +4,7 @@ import torch
 
 from tests import tiny
 from warpgs.cameras import Camera
-from warpgs.config import TrainConfig
+from warpgs.config import RenderSettings, TrainConfig
 from warpgs.export.cloud import Cloud
 from warpgs.export.clouds import Clouds
 from warpgs.model.gaussians import Gaussians
@@ -38,7 +38,8 @@ def camera(width=64, height=48, time=0.0):
 
 def image(cloud, through=None):
     with torch.no_grad():
-        return render(cloud.splats(), through or camera()).joint.image.clamp(0, 1)
+        settings = RenderSettings(antialias=cloud.antialias)
+        return render(cloud.splats(), through or camera(), settings=settings).joint.image.clamp(0, 1)
 
 
 def psnr(a, b):

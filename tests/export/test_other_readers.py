@@ -1,20 +1,24 @@
 """Exported files as other programs read them; skipped where these are not installed.
 
-``npm install -g @playcanvas/splat-transform`` and ``pip install fourdgs``. Version 2 of splat-transform reads SPZ with
+``npm install --global @playcanvas/splat-transform @mkkellogg/gaussian-splats-3d gsplat three`` and
+``pip install fourdgs gsplat``; Spark is in ``test_spark.py``. Version 2 of splat-transform reads SPZ with
 Niantic's decoder, with y up as specified; version 3 leaves the axes as they are in the file, as if y were down.
 """
 
+import json
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
+import torch
 
-from tests.export import scenes
+from tests.export import node, scenes
 from warpgs.export import orientation
-from warpgs.export.cloud import sigmoid
+from warpgs.export.cloud import Cloud, logit, sigmoid
 from warpgs.export.compressed import write_compressed
 from warpgs.export.gltf import write_glb
+from warpgs.export.ply import read_ply
 from warpgs.export.sog import write_sog
 from warpgs.export.spz import write_spz, write_spz_gzip
 from warpgs.export.standard import read_standard, write_standard
@@ -66,3 +70,84 @@ def test_fourdgs_reads_gltf(tmp_path, degree):
     color = np.concatenate([0.5 + SH_C0 * cloud.sh[:, 0], sigmoid(cloud.logit_opacities)[:, None]], 1)
     assert read.gaussians.colors == pytest.approx(np.clip(color, 0, 1), abs=1e-5)
     assert read.gaussians.sh_degree == degree
+
+
+GAUSSIAN_SPLATS_3D = """
+import { readFileSync } from "node:fs";
+import { Quaternion, Vector3, Vector4 } from "ROOT/three/build/three.module.js";
+import * as GS3D from "ROOT/@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js";
+
+globalThis.window = globalThis;  // its loader waits by window.setTimeout
+const [path, degree] = process.argv.slice(2);
+const file = readFileSync(path);
+const data = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
+const read = await GS3D.PlyLoader.loadFromFileData(data, 0, 0, false, +degree);
+const [N, width] = [read.getSplatCount(), 3 * ((+degree + 1) ** 2 - 1)];
+const sh = new Float32Array(N * width);
+if (width) read.fillSphericalHarmonicsArray(sh, +degree, null, 0, N - 1, 0, 0);
+const [mean, scale, quat, color] = [new Vector3(), new Vector3(), new Quaternion(), new Vector4()];
+const rows = [];
+for (let k = 0; k < N; k++) {
+  read.getSplatCenter(k, mean);
+  read.getSplatScaleAndRotation(k, scale, quat);
+  read.getSplatColor(k, color);
+  rows.push([...mean, ...scale, quat.w, quat.x, quat.y, quat.z, ...color, ...sh.subarray(k * width, (k + 1) * width)]);
+}
+console.log(JSON.stringify(rows));
+"""
+
+GSPLAT_JS = """
+import { readFileSync } from "node:fs";
+import * as SPLAT from "ROOT/gsplat/dist/index.es.js";
+
+const file = readFileSync(process.argv[2]);
+const data = file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength);
+const read = SPLAT.PLYLoader.LoadFromArrayBuffer(data, new SPLAT.Scene()).data;
+const rows = [];
+for (let k = 0; k < read.vertexCount; k++) {
+  const part = (array, width) => [...array.subarray(k * width, (k + 1) * width)];
+  rows.push([part(read.positions, 3), part(read.scales, 3), part(read.rotations, 4), part(read.colors, 4)].flat());
+}
+console.log(JSON.stringify(rows));
+"""
+
+PROGRAMS = {
+    "@mkkellogg/gaussian-splats-3d": (GAUSSIAN_SPLATS_3D, [0, 1, 2]),
+    "gsplat": (GSPLAT_JS, [0]),
+}
+"""Programs that print mean, scale, quaternion, colour and the other coefficients of each Gaussian of a PLY file, by the
+package of npm whose loader they use, and the degrees that it reads."""
+
+
+@pytest.mark.parametrize(
+    ("package", "degree"), [(package, degree) for package, (_, degrees) in PROGRAMS.items() for degree in degrees]
+)
+def test_readers_of_javascript_read_the_ply_file(tmp_path, package, degree):
+    if not node.has(package, "three"):
+        pytest.skip(f"{package} of npm is not installed")
+    cloud = scenes.cloud(300, degree)
+    write_standard(tmp_path / "a.ply", cloud)
+    program = PROGRAMS[package][0].replace("ROOT", str(node.packages()))
+    rows = np.array(json.loads(node.run(tmp_path, program, tmp_path / "a.ply", degree)), np.float64)
+    means, scales, quats, colors, rest = np.split(rows, [3, 6, 10, 14], axis=1)
+    constant = (colors[:, :3] / 255 - 0.5) / SH_C0
+    arrays = (means, quats, np.log(scales), logit(colors[:, 3] / 255), np.c_[constant, rest].reshape(300, -1, 3))
+    back = Cloud(*(values.astype(np.float32) for values in arrays), is_dynamic=cloud.is_dynamic)
+    assert back.means == pytest.approx(cloud.means)
+    assert scenes.psnr(scenes.image(back), scenes.image(cloud)) > 38
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gsplat_writes_the_same_values(tmp_path, degree):
+    """gsplat reads no PLY file, but writes them: in the same columns."""
+    exporter = pytest.importorskip("gsplat.exporter", reason="gsplat is not installed")
+    cloud = scenes.cloud(30, degree)
+    write_standard(tmp_path / "ours.ply", cloud)
+    names = ("means", "log_scales", "quats", "logit_opacities")
+    parts = [torch.from_numpy(getattr(cloud, name)) for name in names]
+    sh = torch.from_numpy(cloud.sh)
+    exporter.export_splats(*parts, sh[:, :1], sh[:, 1:], format="ply", save_to=str(tmp_path / "theirs.ply"))
+    ours, theirs = (read_ply(tmp_path / name)["vertex"] for name in ("ours.ply", "theirs.ply"))
+    assert set(ours.dtype.names) == set(theirs.dtype.names) | {"nx", "ny", "nz"}
+    for name in theirs.dtype.names:
+        assert (ours[name] == theirs[name]).all(), name

@@ -1,0 +1,127 @@
+"""Spark (three.js) draws exported files as warpgs does; skipped without Chromium and Spark.
+
+``npm install --global @sparkjsdev/spark three``. Version 2.2 reads SPZ up to version 3.
+"""
+
+import functools
+import http.server
+import json
+import threading
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+
+from tests.export import node, scenes
+from tests.export.browser import Browser, executable
+from warpgs.export import orientation
+from warpgs.export.compressed import write_compressed
+from warpgs.export.sog import write_sog
+from warpgs.export.spz import write_spz_gzip
+from warpgs.export.standard import write_standard
+from warpgs.video.camera_paths import UP
+
+pytestmark = [
+    pytest.mark.skipif(executable() is None, reason="the test needs Chromium"),
+    pytest.mark.skipif(not node.has("@sparkjsdev/spark", "three"), reason="Spark is not installed"),
+]
+
+SIZE = (160, 120)
+
+FILES = {
+    "a.ply": (write_standard, False),
+    "a.compressed.ply": (write_compressed, False),
+    "a.sog": (write_sog, False),
+    "a.spz": (write_spz_gzip, True),
+}
+"""Functions that write a file, and whether y is up in it."""
+
+BLUR = {False: {"preBlurAmount": 0.3, "blurAmount": 0.0}, True: {}}
+"""Options of Spark by whether opacities compensate for the low-pass filter; its defaults are for those that do."""
+
+PAGE = """<!doctype html>
+<style>body { margin: 0 } canvas { display: block }</style>
+<link rel="icon" href="data:,">
+<script type="importmap">{"imports": {
+  "three": "/npm/three/build/three.module.js",
+  "three/addons/": "/npm/three/examples/jsm/",
+  "@sparkjsdev/spark": "/npm/@sparkjsdev/spark/dist/spark.module.js"
+}}</script>
+<script type="module">
+import * as THREE from "three";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+
+const options = JSON.parse(decodeURIComponent(location.hash.slice(1)));
+const renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
+renderer.setPixelRatio(1);
+renderer.setSize(options.width, options.height);
+renderer.setClearColor(0, 1);
+document.body.append(renderer.domElement);
+// Sorted by depth as 3DGS does; colours above 1 are not clipped before they are blended.
+const spark = new SparkRenderer({ renderer, sortRadial: false, accumExtSplats: true, ...options.spark });
+const scene = new THREE.Scene();
+const mesh = new SplatMesh({ url: options.file });
+if (!options.yUp) mesh.quaternion.set(1, 0, 0, 0);
+scene.add(spark, mesh);
+const fieldOfView = 2 * Math.atan(options.height / 2 / options.focal) * 180 / Math.PI;
+const camera = new THREE.PerspectiveCamera(fieldOfView, options.width / options.height, 0.01, 100);
+camera.position.z = 3;
+try {
+  await mesh.initialized;
+  for (let sorted = 0; sorted < 3; sorted += !spark.sorting && !spark.sortDirty) {
+    renderer.render(scene, camera);
+    await new Promise(requestAnimationFrame);
+  }
+  window.count = mesh.packedSplats.numSplats;
+} catch (error) {
+  window.problem = String(error);
+}
+</script>
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder that is served, and its address."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "npm").symlink_to(node.packages())
+    (folder / "index.html").write_text(PAGE)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Browser(tmp_path_factory.mktemp("profile"), *SIZE) as browser:
+        yield browser
+
+
+def drawn(browser, address, **options):
+    """The image [H, W, 3] in [0, 1] that Spark draws, and the number of Gaussians that it read."""
+    options |= {"width": SIZE[0], "height": SIZE[1], "focal": float(scenes.camera(*SIZE).K[0, 0])}
+    browser.open(f"{address}#{quote(json.dumps(options))}")
+    browser.until("'count' in window || 'problem' in window")
+    assert browser.value("window.problem") is None
+    return browser.screenshot() / 255, browser.value("window.count")
+
+
+@pytest.mark.parametrize(
+    ("name", "degree", "antialias"), [("a.ply", 0, True), ("a.ply", 1, False), *((name, 3, False) for name in FILES)]
+)
+def test_spark_draws_the_scene(browser, site, name, degree, antialias):
+    (folder, address), (write, y_up) = site, FILES[name]
+    cloud = scenes.cloud(300, degree).replaced(antialias=antialias)
+    write(folder / name, orientation.rotated(cloud, orientation.upright(UP, y_up)))
+    image, count = drawn(browser, address, file=name, yUp=y_up, spark=BLUR[antialias])
+    truth = scenes.image(cloud, scenes.camera(*SIZE)).numpy()
+    assert count == 300
+    assert truth.std() > 0.1
+    psnr = -10 * np.log10(np.square(image - truth).mean())
+    assert psnr > 38
