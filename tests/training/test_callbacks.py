@@ -104,6 +104,17 @@ def test_the_scene_is_written_for_a_viewer_only_while_one_asks(watched):
     assert not (watched.folder / preview.SCENE).exists()  # removed at the end: the last checkpoint is newer
 
 
+def test_a_training_that_fails_leaves_no_preview(config):
+    def fail(progress):
+        if preview.read_state(config.out) is not None:
+            raise RuntimeError("no")
+        preview.request(config.out)
+
+    with pytest.raises(RuntimeError, match="no"):
+        warpgs.train(config, callbacks=[fail])
+    assert not any((config.out / name).exists() for name in (preview.REQUEST, preview.SCENE, preview.STATE))
+
+
 def test_a_callback_that_returns_true_ends_training_with_a_checkpoint(config):
     run = warpgs.train(config, callbacks=[lambda progress: progress.status.iteration >= 12])
     assert run.trained_scene().metadata.iteration == 12

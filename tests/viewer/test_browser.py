@@ -74,9 +74,10 @@ def viewer(run):
 def visit(browser, viewer):
     """The page and the addresses that it requested."""
     page, asked = browser.new_page(viewport=SIZE), []
+    page.set_default_timeout(60_000)
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"http://127.0.0.1:{viewer.port}")
-    page.get_by_text("Training cameras").wait_for(timeout=60_000)
+    page.get_by_text("Training cameras").wait_for()
     until(lambda: viewer.sessions)
     page.locator(".mantine-Notification-closeButton").first.click()  # "software rendering"
     return page, asked
@@ -111,11 +112,20 @@ def settle(session):
     until(lambda: session._shown and session._shown == (session._request(), 1))
 
 
-def seen(page, session):
+def handled(page, session):
+    """Waits until the browser has handled all messages of the session, which arrive in their order."""
+    mark = session._client.gui.add_html('<i class="mark"></i>')
+    page.locator(".mark").wait_for(state="attached")
+    mark.remove()
+    page.locator(".mark").wait_for(state="detached")
+
+
+def seen(page, session, seconds=60.0):
     """What the browser shows beside the panel, once it no longer changes."""
     settle(session)
-    before = None
-    for _ in range(40):
+    handled(page, session)
+    before, end = None, time.monotonic() + seconds
+    while time.monotonic() < end:
         now = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :LEFT]
         if before is not None and np.array_equal(now, before):
             return now.astype(float)
@@ -185,7 +195,7 @@ def test_camera_and_controls_survive_a_reload(page, session, viewer):
     settle(session)
     pose, time_shown = session._pose(), session.panel.time.value
     page.reload()
-    page.get_by_text("Training cameras").wait_for(timeout=60_000)
+    page.get_by_text("Training cameras").wait_for()
     until(lambda: viewer.sessions and session not in viewer.sessions.values())
     (after,) = viewer.sessions.values()
     settle(after)
@@ -309,14 +319,19 @@ def path_folder(page):
         page.get_by_text("Camera path").click()
 
 
+def click_until_there_are(count, page, session, button):
+    """Clicks a button that adds or removes one keyframe; each click is handled on its own thread."""
+    page.get_by_role("button", name=button).click()
+    until(lambda: len(session.path.cameras) == count)
+    handled(page, session)
+
+
 @pytest.mark.usefixtures("path_folder")
 def test_a_camera_path_is_saved(page, session, run):
-    page.get_by_role("button", name="Add keyframe").click()
-    until(lambda: len(session.path.cameras) == 1)
+    click_until_there_are(1, page, session, "Add keyframe")
     session.panel.view.value = 5
     settle(session)
-    page.get_by_role("button", name="Add keyframe").click()
-    until(lambda: len(session.path.cameras) == 2)
+    click_until_there_are(2, page, session, "Add keyframe")
     page.get_by_role("button", name="Save path").click()
     until((run / "paths" / "path.json").exists)
     page.get_by_text("2 keyframes saved as").wait_for()
@@ -330,12 +345,9 @@ def test_a_camera_path_is_saved(page, session, run):
 
 @pytest.mark.usefixtures("path_folder")
 def test_keyframes_can_be_removed(page, session):
-    page.get_by_role("button", name="Add keyframe").click()
-    until(lambda: session.path.cameras)
-    while session.path.cameras:
-        count = len(session.path.cameras)
-        page.get_by_role("button", name="Remove keyframe").click()
-        until(lambda count=count: len(session.path.cameras) < count)
+    click_until_there_are(len(session.path.cameras) + 1, page, session, "Add keyframe")
+    for count in reversed(range(len(session.path.cameras))):
+        click_until_there_are(count, page, session, "Remove keyframe")
     page.get_by_text("no keyframes").wait_for()
     page.get_by_role("button", name="Save path").click()
     page.get_by_text("a path needs at least one keyframe").wait_for()
@@ -351,7 +363,7 @@ def test_newer_checkpoints_are_shown(page, session, run):
     before = seen(page, session)
     iteration = session._shown.request.scene.metadata.iteration
     watched.advance(run, 7)
-    page.get_by_text(f"iteration {iteration + 7}").wait_for(timeout=20_000)
+    page.get_by_text(f"iteration {iteration + 7}").wait_for()
     assert np.abs(seen(page, session) - before).max() > 0
 
 

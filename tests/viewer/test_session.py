@@ -4,6 +4,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
@@ -197,7 +198,8 @@ CONTROLS = ("saved", "name", "selected", "add", "replace", "remove", "preview", 
 @pytest.fixture
 def editor(tmp_path):
     controls = SimpleNamespace(**{name: Control("path") for name in CONTROLS})
-    made = PathEditor(Scene(), controls, tmp_path, Browser(), 0.1, TRAINING.capture)
+    run = SimpleNamespace(folder=tmp_path, device=torch.device("cpu"))
+    made = PathEditor(Scene(), controls, run, Browser(), 0.1, TRAINING.capture)
     made.click = lambda name: getattr(controls, name).click()
     made.controls, made.browser = controls, made._browser
     return made
@@ -264,7 +266,7 @@ def test_only_paths_of_the_run_are_loaded(editor, sent):
 
 
 def test_a_damaged_path_is_reported(editor):
-    file = editor._run / "paths" / "bad.json"
+    file = editor._run.folder / "paths" / "bad.json"
     file.parent.mkdir()
     file.write_text("{}")
     editor.controls.saved.value = "bad"
@@ -280,6 +282,33 @@ def test_a_preview_moves_along_the_path(editor, monkeypatch):
     editor.click("preview")
     assert len(seen) == 12
     assert positions([seen[0], seen[-1]]) == [0.0, 2.0]
+
+
+def test_a_second_click_ends_the_preview(editor, monkeypatch):
+    seen = []
+
+    def go_to(camera):
+        seen.append(camera)
+        if len(seen) == 3:
+            assert editor.controls.preview.label == "End preview"
+            editor.click("preview")
+
+    add(editor, 0.0, 2.0)
+    monkeypatch.setattr(editor.browser, "go_to", go_to)
+    editor.click("preview")
+    assert len(seen) == 3
+    assert editor.controls.preview.label == "Preview"
+    monkeypatch.setattr(path_editor, "PREVIEW_SECONDS", 0.2)
+    editor.click("preview")
+    assert len(seen) == 3 + 5
+
+
+def test_a_preview_ends_with_the_browser(editor, monkeypatch):
+    seen = []
+    add(editor, 0.0, 2.0)
+    monkeypatch.setattr(editor.browser, "go_to", lambda camera: (seen.append(camera), editor.stop()))
+    editor.click("preview")
+    assert len(seen) == 1
 
 
 def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
@@ -299,8 +328,9 @@ def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
     add(editor, 0.0, 2.0)
     editor.click("render")
     (command,) = commands
-    assert command[1:5] == ["-m", "warpgs", "render", str(editor._run)]
-    assert (editor._run / "paths" / "path.json").is_file()
+    assert command[1:5] == ["-m", "warpgs", "render", str(editor._run.folder)]
+    assert command[command.index("--device") + 1] == "cpu"
+    assert (editor._run.folder / "paths" / "path.json").is_file()
     assert editor.controls.note.content == "wrote video.mp4"
 
 

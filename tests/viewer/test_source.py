@@ -146,6 +146,15 @@ def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, without_in
     assert source.progress == ""
 
 
+def test_a_viewer_that_ends_leaves_no_request(run, without_interval):
+    source = open_source(run, "cpu", True)
+    source.current()
+    assert preview.is_requested(run)
+    source.stop()
+    source.current()
+    assert not (run / preview.REQUEST).exists()
+
+
 def test_a_run_that_is_not_followed_is_not_asked(run, without_interval):
     open_source(run, "cpu", False).current()
     assert not preview.is_requested(run)

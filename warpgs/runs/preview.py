@@ -43,6 +43,12 @@ def request(folder: Path) -> None:
         (folder / REQUEST).touch()
 
 
+def withdraw(folder: Path) -> None:
+    """Ends a request."""
+    with suppress(OSError):
+        (folder / REQUEST).unlink()
+
+
 def is_requested(folder: Path) -> bool:
     """Whether a viewer has asked for the scene lately."""
     try:

@@ -102,8 +102,10 @@ def _train(trainer: Trainer, run: Run, is_extended: bool, callbacks: Sequence[Ca
         if is_extended:
             write_config(run.folder, run.config)
         trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
-        finished = trainer.train(logger, interrupt)
-        preview.remove(run.folder)
+        try:
+            finished = trainer.train(logger, interrupt)
+        finally:
+            preview.remove(run.folder)
     if not finished and interrupt.requested:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
 

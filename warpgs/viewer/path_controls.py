@@ -5,6 +5,9 @@ import viser
 NEW = "(new path)"
 """Entry of the menu of saved paths that stands for none."""
 
+PREVIEW, END_PREVIEW = "Preview", "End preview"
+"""Labels of the button that starts and ends a preview."""
+
 
 class PathControls:
     """A folder of controls; ``PathEditor`` implements what they do."""
@@ -17,7 +20,7 @@ class PathControls:
             self.add = gui.add_button("Add keyframe", hint="The current camera and time, behind the selected keyframe")
             self.replace = gui.add_button("Replace keyframe", hint="By the current camera and time")
             self.remove = gui.add_button("Remove keyframe")
-            self.preview = gui.add_button("Preview", hint="Moves along the path, in 5 seconds")
+            self.preview = gui.add_button(PREVIEW, hint="Moves along the path, in 5 seconds")
             self.save = gui.add_button("Save path")
             self.render = gui.add_button("Render video", hint="Saves the path and renders it, as warpgs render does")
             self.note = gui.add_markdown("no keyframes")

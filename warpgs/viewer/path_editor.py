@@ -13,11 +13,12 @@ import viser
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.errors import one_line
+from warpgs.runs.run import Run
 from warpgs.video import keyframes
 
 from .frustums import ORANGE, add_frustum
 from .panel import escape, set_value
-from .path_controls import NEW, PathControls
+from .path_controls import END_PREVIEW, NEW, PREVIEW, PathControls
 from .pose import camera_of, pose_of
 
 MAX_KEYFRAMES = 1000
@@ -45,7 +46,7 @@ class PathEditor:
     Args:
         scene: Scene of the browser, which shows the keyframes.
         controls: Controls of the browser.
-        run: Run folder to save into.
+        run: The run, whose folder paths are saved into and whose device renders their videos.
         browser: The browser's camera.
         scale: Size of the keyframes in the scene [scene units].
         capture: Capture whose views paths may name; None if it cannot be read: then paths cannot be loaded.
@@ -55,7 +56,7 @@ class PathEditor:
         self,
         scene: viser.SceneApi,
         controls: PathControls,
-        run: Path,
+        run: Run,
         browser: BrowserView,
         scale: float,
         capture: Capture | None,
@@ -66,6 +67,7 @@ class PathEditor:
         self._lock = threading.RLock()
         self._stopped = threading.Event()
         self._child: subprocess.Popen[str] | None = None
+        self._preview_ended: threading.Event | None = None  # set to end the preview that runs
         self.cameras: list[Camera] = []
         for button, action in (
             (controls.add, self._add),
@@ -83,6 +85,9 @@ class PathEditor:
     def stop(self) -> None:
         """Ends a preview and a video that is being rendered."""
         self._stopped.set()
+        with self._lock:
+            if self._preview_ended is not None:
+                self._preview_ended.set()
         if self._child is not None:
             self._child.terminate()
 
@@ -150,12 +155,12 @@ class PathEditor:
     # Files ------------------------------------------------------------------------------------------------------------
 
     def _list_saved(self) -> None:
-        self._controls.saved.options = (NEW, *keyframes.saved_names(self._run))
+        self._controls.saved.options = (NEW, *keyframes.saved_names(self._run.folder))
 
     def _save(self) -> Path | None:
         try:
             with self._lock:  # otherwise two clicks could choose the same file
-                path = keyframes.path_of(self._run, self._controls.name.value)
+                path = keyframes.path_of(self._run.folder, self._controls.name.value)
                 keyframes.write_path(path, self.cameras)
         except (ValueError, OSError) as error:
             self._note(str(error))
@@ -166,13 +171,13 @@ class PathEditor:
 
     def _load(self) -> None:
         name = self._controls.saved.value
-        if name not in keyframes.saved_names(self._run):  # a browser may send anything
+        if name not in keyframes.saved_names(self._run.folder):  # a browser may send anything
             return
         if self._capture is None:
             self._note("paths cannot be loaded without the capture")
             return
         try:
-            cameras, _ = keyframes.read_keyframes(self._run / keyframes.FOLDER / f"{name}.json", self._capture)
+            cameras, _ = keyframes.read_keyframes(self._run.folder / keyframes.FOLDER / f"{name}.json", self._capture)
         except (ValueError, OSError) as error:
             self._note(str(error))
             return
@@ -191,9 +196,9 @@ class PathEditor:
             if self._child is not None and self._child.poll() is None:
                 self._note("another video is being rendered")
                 return
-            command = [sys.executable, "-m", "warpgs", "render", str(self._run), "--keyframes", str(path)]
+            command = [sys.executable, "-m", "warpgs", "render", str(self._run.folder), "--keyframes", str(path)]
             self._child = child = subprocess.Popen(
-                [*command, "--write", "mp4", "--quiet"],
+                [*command, "--device", self._run.device.type, "--write", "mp4", "--quiet"],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -206,19 +211,27 @@ class PathEditor:
             self._note(one_line(ValueError(lines[-1])) if lines else f"the video ended with {child.returncode}")
 
     def _preview(self) -> None:
-        """Moves the browser's camera along the path."""
+        """Moves the browser's camera along the path; a second click ends that."""
         with self._lock:
-            cameras = list(self.cameras)
-        if len(cameras) < 2:
-            self._note("a preview needs two keyframes")
-            return
-        frames = keyframes.along(
-            cameras, [float(k) for k in range(len(cameras))], round(PREVIEW_SECONDS * PREVIEW_RATE)
-        )
-        for camera in frames:
-            self._browser.go_to(camera)
-            if self._stopped.wait(1.0 / PREVIEW_RATE):
+            if self._preview_ended is not None:
+                self._preview_ended.set()
                 return
+            if len(self.cameras) < 2:
+                self._note("a preview needs two keyframes")
+                return
+            cameras, self._preview_ended = list(self.cameras), threading.Event()
+            ended = self._preview_ended
+        self._controls.preview.label = END_PREVIEW
+        try:
+            times = [float(k) for k in range(len(cameras))]
+            for camera in keyframes.along(cameras, times, round(PREVIEW_SECONDS * PREVIEW_RATE)):
+                self._browser.go_to(camera)
+                if ended.wait(1.0 / PREVIEW_RATE) or self._stopped.is_set():
+                    return
+        finally:
+            self._controls.preview.label = PREVIEW
+            with self._lock:
+                self._preview_ended = None
 
 
 def _without_event(action: Callable[[], object], event: object) -> None:

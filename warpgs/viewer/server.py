@@ -94,7 +94,7 @@ class Viewer:
         self.stop()
 
     def stop(self) -> None:
-        """Ends all sessions and the server; waits ``STOP_SECONDS`` at most for images and for slow browsers."""
+        """Ends sessions, server and source; waits ``STOP_SECONDS`` at most for images and for slow browsers."""
         end = time.monotonic() + STOP_SECONDS
         sessions = self._remove_all()
         for session in sessions:
@@ -104,6 +104,7 @@ class Viewer:
             stop.start()
             for join in (*(session.join for session in sessions), stop.join):
                 join(max(end - time.monotonic(), 0.0))
+        self._source.stop()
 
     def _remove_all(self) -> list[Session]:
         with self._lock:

@@ -120,7 +120,7 @@ class Session:
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
         capture = None if training is None else training.capture
-        self.path = PathEditor(client.scene, self.panel.path, source.run.folder, self, scale, capture)
+        self.path = PathEditor(client.scene, self.panel.path, source.run, self, scale, capture)
         if view is not None:
             self._restore(view)
         self._connect()

@@ -55,6 +55,13 @@ class Source:
                 self._reload()
             return self._scene
 
+    def stop(self) -> None:
+        """Follows the run no longer; nothing of the viewer remains in its folder."""
+        with self._lock:
+            if self.follow:
+                self.follow = False
+                preview.withdraw(self.run.folder)
+
     def _reload(self) -> None:
         preview.request(self.run.folder)
         try:
