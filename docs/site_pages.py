@@ -1,6 +1,7 @@
 """Fills in the generated parts of the site: the tables of options.md, from the dataclasses that commands parse."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +12,9 @@ from warpgs.presets import PRESETS
 
 MARKER = "<!-- options -->"
 
+SHOWN = "best"
+"""Preset whose values are the defaults of ``train`` in the tables: that of captures."""
+
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """mkdocs calls this for the text of every page."""
@@ -20,18 +24,26 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def sections() -> Iterator[str]:
     """The tables of all commands; those of ``train`` by group, followed by what its presets change."""
     for name, command in COMMANDS.items():
-        options = command.load()
-        yield f"## warpgs {name}\n\n{summary(options)}\n"
+        yield f"## warpgs {name}\n\n{summary(command.load())}\n"
+        if name == "train":
+            yield f"Defaults are those of the preset `{SHOWN}`, which is the default for captures."
+            yield "[Below](#what-the-presets-change) are those of the others.\n"
         groups: dict[str, list[Option]] = {}
-        for option in documented(options):
+        for option in options_of(name):
             groups.setdefault(group_of(option.name), []).append(option)
         for group, members in groups.items():
             if group:
-                yield f"### train --{group}.…\n\n{summary(type(getattr(PRESETS['paper'], group)))}\n"
+                yield f"### train --{group}.…\n\n{summary(type(getattr(PRESETS[SHOWN], group)))}\n"
             yield from table(("option", "default", "meaning"), [row(option) for option in members])
         if name == "train":
             yield "### What the presets change\n\nOptions that are not listed are the same in all presets.\n"
             yield from table(("option", *PRESETS), preset_rows())
+
+
+def options_of(command: str) -> Iterator[Option]:
+    """The options of a command, with the defaults that it has on the command line."""
+    for option in documented(COMMANDS[command].load()):
+        yield option._replace(default=value(PRESETS[SHOWN], option.name)) if command == "train" else option
 
 
 def summary(options: type) -> str:
@@ -66,18 +78,15 @@ def preset_rows() -> list[tuple[str, ...]]:
     """Options that differ between the presets, with the value of each."""
     rows = []
     for option in documented(TrainConfig):
-        names = option.name.removeprefix("--").replace("-", "_").split(".")
-        values = [value(preset, names) for preset in PRESETS.values()]
-        if names != ["preset"] and any(v != values[0] for v in values):
+        values = [value(preset, option.name) for preset in PRESETS.values()]
+        if option.name != "--preset" and any(v != values[0] for v in values):
             rows.append((code(option.name), *(value_of(v) or "none" for v in values)))
     return rows
 
 
-def value(config: Any, names: list[str]) -> Any:
-    """A (nested) field of a config."""
-    for name in names:
-        config = getattr(config, name)
-    return config
+def value(config: TrainConfig, option: str) -> Any:
+    """The value of an option, such as ``--model.depth``, in a config."""
+    return functools.reduce(getattr, option.removeprefix("--").replace("-", "_").split("."), config)
 
 
 def code(text: str) -> str:

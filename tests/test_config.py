@@ -81,6 +81,12 @@ def test_the_config_imports_neither_torch_nor_numpy():
     assert run.stdout == "set()\n"
 
 
+def test_a_config_of_defaults_has_no_preset(tmp_path):
+    write_config(tmp_path, TrainConfig())
+    assert read_config(tmp_path).preset is None
+    assert all(config.preset == name for name, config in PRESETS.items())
+
+
 def test_a_config_file_without_newer_fields_has_their_defaults(tmp_path):
     write_config(tmp_path, TrainConfig())
     values = json.loads((tmp_path / NAME).read_text())

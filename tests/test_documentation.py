@@ -15,7 +15,7 @@ import pytest
 from tests import tiny
 from warpgs import presets
 from warpgs.cli import COMMANDS
-from warpgs.command_line import documented, flags, parse
+from warpgs.command_line import flags, parse
 from warpgs.runs.run import Run
 from warpgs.training import command as training
 
@@ -116,14 +116,27 @@ def test_every_option_is_on_the_page_of_options(monkeypatch):
     pages = importlib.import_module("site_pages")
     text = pages.on_page_markdown((ROOT / "docs" / "options.md").read_text())
     assert pages.MARKER not in text
-    for command in COMMANDS.values():
-        for option in documented(command.load()):
+    for command in COMMANDS:
+        for option in pages.options_of(command):
             name, default, meaning = pages.row(option)
             assert meaning, option.name
             assert f"| {name} | {default} | {meaning} |" in text
     assert "| `--no-graph` | on |" in text
+    assert "| `--no-exposure` | on |" in text
     assert "| `--densify.max-gaussians INT` | `3000000` |" in text
     assert "| `--schedule.joint-from` | none | `0` | none | `0` | `0` |" in text
+
+
+def test_the_page_of_options_has_the_defaults_of_the_command_line(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    config = training.parse(["--data", "capture"])
+    options = [option for option in pages.options_of("train") if option.name != "--data"]
+    assert len(options) > 90
+    for option in options:
+        assert option.default == pages.value(config, option.name), option.name
+    defaults = {option.name: option.default for option in pages.options_of("render")}
+    assert (defaults["RUN"], defaults["--supersample"]) == (dataclasses.MISSING, 1)
 
 
 SITE = ("mkdocs", "material", "mkdocstrings")

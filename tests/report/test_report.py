@@ -15,6 +15,7 @@ import pytest
 
 from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
+from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.presets import PRESETS
@@ -190,6 +191,7 @@ def test_settings_that_differ_are_listed(run, other):
 def test_for_one_run_settings_that_differ_from_the_preset_are_listed():
     config = dataclasses.replace(PRESETS["quick"], seed=3, out=Path("run"))
     assert config_rows([config]) == [("seed", ["3"])]
+    assert config_rows([TrainConfig(seed=3)]) == [("seed", ["3"])]
 
 
 def test_without_views_nothing_is_rendered_and_no_capture_is_read(tmp_path, run):

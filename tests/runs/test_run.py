@@ -77,6 +77,15 @@ def test_paths_are_saved_as_absolute_paths(tmp_path, capture, monkeypatch):
     assert kept.lpips == tmp_path / "weights"
 
 
+@pytest.mark.parametrize(("preset", "suffix"), [("best", "-best"), (None, "")])
+def test_a_folder_is_named_after_the_capture_and_its_preset(tmp_path, capture, monkeypatch, preset, suffix):
+    monkeypatch.chdir(tmp_path)
+    config = dataclasses.replace(tiny.CONFIG, preset=preset, out=None)
+    folder = create(config, capture)
+    assert folder == Path("runs") / f"{capture.name}{suffix}"
+    assert new_folder(config, capture) == Path("runs") / f"{capture.name}{suffix}-2"
+
+
 def test_what_a_kill_in_the_first_write_leaves_is_an_empty_folder(tmp_path, capture):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -44,7 +44,7 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
     """
     folder = config.out
     if folder is None:
-        stem = Path("runs") / f"{capture.name}-{config.preset}"
+        stem = Path("runs") / "-".join(filter(None, (capture.name, config.preset)))
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or not _is_empty(folder)):
         raise ValueError(

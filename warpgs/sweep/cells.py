@@ -160,6 +160,7 @@ def _update(options: dict[str, Any], layer: Mapping[str, Any]) -> None:
 
 def arguments(config: TrainConfig) -> list[str]:
     """Arguments of ``warpgs train`` for a config: its preset, and every option that differs from it."""
+    assert config.preset is not None
     first = ["--preset", config.preset]
     return first + [word for words in _different("", config, PRESETS[config.preset]) for word in words]
 
