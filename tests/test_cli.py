@@ -98,14 +98,19 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["render", "r", "--zzz"], "warpgs render: there is no option --zzz; warpgs render --help lists all"),
         (["\x1b[2J"], "warpgs: there is no command \\x1b[2J; warpgs --help lists all"),
         (["export", "--\x1b[2J"], "warpgs export: there is no option --\\x1b[2J; "),
-        (["export"], "warpgs export: missing: RUN Run folder. (required)"),
+        (["export"], "warpgs export: missing: RUN\n"),
+        (["import"], "warpgs import: missing: SOURCE CAPTURE\n"),
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
-        (["train", "--preset", "x"], "warpgs train: argument --preset: invalid choice: 'x' (choose from "),
         (
-            ["render", "r", "--layers", "x"],
-            "warpgs render: invalid choice 'x' for argument '--layers'. Expected one of",
+            ["train", "--preset", "x"],
+            "warpgs train: --preset must be one of best, fast, paper, patient, quick, got 'x'\n",
+        ),
+        (["train", "--device", "x"], "warpgs train: --device must be one of cpu, cuda, got 'x'\n"),
+        (
+            ["render", "r", "--layers", "it's"],
+            "warpgs render: --layers must be one of all, alpha, depth, dynamic, joint, static, got ",
         ),
         (
             ["train", "--resume", "r", "--seed", "1"],

@@ -15,7 +15,7 @@ import sys
 import textwrap
 import types
 import typing
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
@@ -27,10 +27,23 @@ Options = TypeVar("Options")
 
 METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH"}
 
-REWORDED = (
+
+def _choices(match: re.Match[str]) -> str:
+    """The same message for tyro's and argparse's, which quotes the choices in some versions of Python."""
+    choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
+    return f"{match['option']} must be one of {', '.join(choices)}, got {match['given']}"
+
+
+REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"invalid literal for int\(\) with base 10: (.*)", r"expected INT, got \1"),
     (r"could not convert string to float: (.*)", r"expected FLOAT, got \1"),
     (r"^Missing from [^:]*: ", "missing: "),
+    (r"([A-Z]{2,}) (?:(?!\(required\)).)*\(required\)", r"\1"),
+    (
+        r"^invalid choice (?P<given>'.*') for argument '(?P<option>\S+)'\. Expected one of \((?P<choices>.*)\)\.$",
+        _choices,
+    ),
+    (r"^argument (?P<option>\S+): invalid choice: (?P<given>'.*') \(choose from (?P<choices>.*)\)$", _choices),
     (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
 )
 """Parts of tyro's messages and what is said instead."""

@@ -44,8 +44,8 @@ class Render:
     """For views: show the ground truth beside the rendered image."""
     scale: float = 1.0
     """Image size as a factor of the capture's."""
-    size: str | None = None
-    """Image size WIDTHxHEIGHT instead, such as 1080x1920; the view is cropped to it, not stretched [px]."""
+    size: Annotated[str | None, tyro.conf.arg(metavar="WIDTHxHEIGHT")] = None
+    """Image size instead, such as 1080x1920; the view is cropped to it, not stretched [px]."""
     supersample: int = 1
     """Render at this multiple of the size, then average down."""
     data: Path | None = None
