@@ -1,6 +1,7 @@
 """Values from a browser are checked, and its events may arrive in any order."""
 
 import math
+import signal
 from types import SimpleNamespace
 
 import pytest
@@ -313,7 +314,7 @@ def test_a_preview_ends_with_the_browser(editor, monkeypatch):
 
 def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
     """In a process of its own; what the process prints is shown."""
-    commands = []
+    commands, signals = [], []
 
     class Child:
         returncode = 0
@@ -324,6 +325,9 @@ def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
         def communicate(self):
             return "wrote video.mp4\n", ""
 
+        def send_signal(self, number):
+            signals.append(number)
+
     monkeypatch.setattr(path_editor.subprocess, "Popen", Child)
     add(editor, 0.0, 2.0)
     editor.click("render")
@@ -332,6 +336,8 @@ def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
     assert command[command.index("--device") + 1] == "cpu"
     assert (editor._run.folder / "paths" / "path.json").is_file()
     assert editor.controls.note.content == "wrote video.mp4"
+    editor.stop()
+    assert signals == [signal.SIGINT]
 
 
 def test_a_step_goes_to_the_next_training_time_and_pauses():

@@ -1,5 +1,6 @@
 """The keyframes that one browser collects: added, edited, previewed, saved, loaded and rendered."""
 
+import signal
 import subprocess
 import sys
 import threading
@@ -89,7 +90,7 @@ class PathEditor:
             if self._preview_ended is not None:
                 self._preview_ended.set()
         if self._child is not None:
-            self._child.terminate()
+            self._child.send_signal(signal.SIGINT)  # as Ctrl-C: it removes what it has written of the video
 
     # Keyframes --------------------------------------------------------------------------------------------------------
 
