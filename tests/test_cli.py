@@ -105,7 +105,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
         (
             ["train", "--preset", "x"],
-            "warpgs train: --preset must be one of best, fast, paper, patient, quick, got 'x'\n",
+            "warpgs train: --preset must be one of best, paper, patient, quick, got 'x'\n",
         ),
         (["train", "--device", "x"], "warpgs train: --device must be one of cpu, cuda, got 'x'\n"),
         (

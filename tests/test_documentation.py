@@ -124,7 +124,7 @@ def test_every_option_is_on_the_page_of_options(monkeypatch):
     assert "| `--no-graph` | on |" in text
     assert "| `--no-exposure` | on |" in text
     assert "| `--densify.max-gaussians INT` | `3000000` |" in text
-    assert "| `--schedule.joint-from` | none | `0` | none | `0` | `0` |" in text
+    assert "| `--schedule.joint-from` | none | `0` | `0` | `0` |" in text
 
 
 def test_the_page_of_options_has_the_defaults_of_the_command_line(monkeypatch):

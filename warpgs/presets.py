@@ -61,25 +61,6 @@ BEST = TrainConfig(
 )
 """What real captures need is in docs/design/real-captures.md."""
 
-FAST = TrainConfig(
-    preset="fast",
-    schedule=Schedule(
-        pretrain=1_000,
-        stage1=4_000,
-        stage2=10_000,
-        realign_at=500,
-        densify_from=300,
-        densify_until=3_500,
-        reset_every=2_500,
-        prune_every=2_000,
-        deform_from=500,
-        warmup=500,
-        noise_until=3_500,
-        sh_degree_every=500,
-    ),
-    checkpoint_every=2_500,
-)
-
 PATIENT = dataclasses.replace(
     BEST,
     preset="patient",
@@ -140,5 +121,5 @@ QUICK = dataclasses.replace(
     ),
 )
 
-PRESETS = {"paper": PAPER, "best": BEST, "fast": FAST, "patient": PATIENT, "quick": QUICK}
+PRESETS = {"paper": PAPER, "best": BEST, "patient": PATIENT, "quick": QUICK}
 """Defaults by name."""

@@ -58,7 +58,7 @@ def edit(run, change):
 # config.json --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["fast"]), UNUSUAL, tiny.CONFIG])
+@pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["best"]), UNUSUAL, tiny.CONFIG])
 def test_a_config_round_trips(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
     assert read_config(create(config, capture)) == config
@@ -124,6 +124,12 @@ def test_earlier_runs_without_pretraining_stay_without_a_depth_loss(run, dap, is
     config = read_config(run)
     assert config.loss.depth == (0 if is_old and not dap else depth)
     assert Protocol(config, has_depth=True).phase_at(0).with_depth == (config.loss.depth > 0)
+
+
+def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
+    before = read_config(run)
+    edit(run, lambda values: values.update(preset="fast"))
+    assert read_config(run) == dataclasses.replace(before, preset=None)
 
 
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
@@ -227,8 +233,8 @@ def test_an_empty_folder_is_trained_into(tmp_path, capture):
 
 def test_runs_without_a_folder_get_one_each(tmp_path, capture, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folders = [create(TrainConfig(preset="fast"), capture) for _ in range(3)]
-    assert [folder.name for folder in folders] == ["builtin-fast", "builtin-fast-2", "builtin-fast-3"]
+    folders = [create(TrainConfig(preset="best"), capture) for _ in range(3)]
+    assert [folder.name for folder in folders] == ["builtin-best", "builtin-best-2", "builtin-best-3"]
 
 
 def test_cuda_is_refused_without_a_gpu(monkeypatch):

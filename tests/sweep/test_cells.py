@@ -14,7 +14,7 @@ from warpgs.training.command import parse
 
 
 def spec(*variants, seeds=(0,), options=None):
-    return SweepSpec("mine", "Mine", "fast", seeds, (), options or {}, variants or (Variant("full", "full", {}),))
+    return SweepSpec("mine", "Mine", "best", seeds, (), options or {}, variants or (Variant("full", "full", {}),))
 
 
 def plan(spec, scenes=None, out=None, **overrides):
@@ -35,7 +35,7 @@ def test_the_command_line_precedes_the_variant_which_precedes_the_file(tmp_path)
     )
     assert (plan(made, out=tmp_path)[0].config.factor, plan(made, out=tmp_path, factor=4)[0].config.factor) == (2, 4)
     loss = plan(made, out=tmp_path)[0].config.loss
-    assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["fast"].loss.static)
+    assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["best"].loss.static)
 
 
 @pytest.mark.parametrize("name", ["ablation", "best", "masks", "scenes", "seeds"])

@@ -14,7 +14,7 @@ def write(folder, text):
 def test_a_file_is_read(tmp_path):
     text = """
     title = "Rates"
-    preset = "fast"
+    preset = "best"
     seeds = [3, 5]
     data = ["nerfds/as"]
     options.iterations = 500
@@ -28,7 +28,7 @@ def test_a_file_is_read(tmp_path):
     assert (spec.name, spec.title, spec.preset, spec.seeds, spec.data) == (
         "rates",
         "Rates",
-        "fast",
+        "best",
         (3, 5),
         ("nerfds/as",),
     )

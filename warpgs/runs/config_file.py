@@ -16,6 +16,8 @@ NAME = "config.json"
 MAX_BYTES = 1 << 20
 """Size of config.json [bytes]."""
 
+REMOVED_PRESETS = ("fast",)
+
 RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""
 
@@ -48,8 +50,11 @@ def read_config(folder: Path) -> TrainConfig:
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
     """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
 
-    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all.
+    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
+    is gone is none: the file has all of its values.
     """
+    if values.get("preset") in REMOVED_PRESETS:
+        values = {**values, "preset": None}
     loss = values.get("loss")
     if values.get("dap") is False and isinstance(loss, dict) and "depth_gate" not in loss:
         return {**values, "loss": {**loss, "depth": 0.0}}
