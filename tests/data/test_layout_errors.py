@@ -75,7 +75,7 @@ def shift_far(matrix: np.ndarray) -> None:
     matrix[0, 3] = np.nan
 
 
-FISHEYE = cameras_bin(5, layouts.PARAMS)
+FIELD_OF_VIEW = cameras_bin(7, [*layouts.PARAMS[:4], 0.9])
 BENT = [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0]
 ROW = np.zeros((layouts.COUNT, 17))
 INDICES = np.arange(layouts.COUNT)
@@ -83,7 +83,7 @@ INDICES = np.arange(layouts.COUNT)
 DAMAGES = [
     ("colmap", lambda r: (r / "images/frame_00003.png").unlink(), r"frame_00003\.png is missing: the COLMAP model"),
     ("colmap", lambda r: (r / "sparse/0/images.bin").unlink(), "is not a COLMAP model"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(FISHEYE), "OPENCV_FISHEYE is not supported; first"),
+    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(FIELD_OF_VIEW), "FOV is not supported; first"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(4, BENT)), "too strong"),
     ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
@@ -106,8 +106,7 @@ DAMAGES = [
     ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", np.zeros((9, 9), np.uint8)), "the mask is 9×9"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[3]), "frames must be a list"),
-    ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE is not"),
-    ("nerfstudio", lambda r: edit_json(r / "transforms.json", is_fisheye=True), "fisheye lenses are not supported"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR is"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w="wide"), "w must hold numbers"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w=-3), "expected 1 to"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", k4=0.1), "k4 must be 0"),

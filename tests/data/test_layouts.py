@@ -5,12 +5,15 @@ import shutil
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json, write_png
 from warpgs.config import MaskPerturbation
+from warpgs.data.colmap import lens_of
+from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.loaders.posed import plain_names, times_of_names
 
@@ -215,6 +218,31 @@ def test_distorted_nerfstudio_images_are_undistorted(edited):
     bent = layouts.NAMES[-1]  # frames are listed in reverse
     assert capture.cameras[bent].K[0, 0] > layouts.FOCAL
     assert capture.cameras[layouts.NAMES[1]].K[0, 0] == layouts.FOCAL
+
+
+@pytest.mark.parametrize("fields", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_fisheye_images_of_nerfstudio_are_undistorted(edited, fields):
+    root = edited("nerfstudio")
+    edit_json(root / "transforms.json", **fields, k1=0.1, k4=0.01)
+    capture = load_capture(root)
+    (fx, fy), size = (layouts.FOCAL, layouts.FOCAL), layouts.SIZE
+    lens = Lens(*size, (fx, fy), layouts.CENTER, fisheye=(0.1, 0.0, 0.0, 0.01))
+    name = layouts.NAMES[2]
+    assert np.array_equal(capture.frame(name).image.numpy(), undistort(layouts.image(2), lens))
+    assert not np.array_equal(capture.frame(name).image.numpy(), layouts.image(2))
+    assert capture.read_taken is None
+
+
+@pytest.mark.parametrize(
+    ("model", "bent"),
+    [("OPENCV_FISHEYE", (0.1, 0.02, 0.03, 0.01)), ("RADIAL_FISHEYE", (0.1, 0.02)), ("SIMPLE_RADIAL_FISHEYE", (0.1,))],
+)
+def test_fisheye_models_of_colmap_project_as_colmap_does(model, bent):
+    focals = (50.0, 52.0) if model == "OPENCV_FISHEYE" else (50.0,)
+    camera = pycolmap.Camera(model=model, width=80, height=60, params=[*focals, 41.0, 29.0, *bent])
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 2))
+    theirs = camera.img_from_cam(np.concatenate([points, np.ones((30, 1))], 1))
+    assert np.allclose(lens_of(camera).image(*points.T).T, theirs, atol=1e-9)
 
 
 def test_nerfstudio_splits_and_times_are_used(edited):

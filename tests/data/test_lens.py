@@ -11,6 +11,7 @@ from warpgs.data.lens import Lens, filling_zoom, pinhole_matrix, undistort
 PINHOLE = Lens(160, 120, (140.0, 150.0), (83.0, 57.0))
 PINCUSHION = dataclasses.replace(PINHOLE, radial=(0.25, -0.05, 0.01), tangential=(0.01, -0.02))
 BARREL = dataclasses.replace(PINHOLE, radial=(-0.2, 0.03, 0.0), tangential=(0.004, 0.003))
+FISHEYE = Lens(160, 120, (75.0, 78.0), (81.0, 58.0), fisheye=(0.03, -0.01, 0.004, -0.001))
 DISTORTED = pytest.mark.parametrize("lens", [PINCUSHION, BARREL], ids=["pincushion", "barrel"])
 
 
@@ -101,3 +102,39 @@ def test_a_lens_out_of_bounds_is_refused(changes, message):
 def test_a_resized_lens_has_the_same_view():
     small = Lens(64, 48, (50.0, 52.0), (30.0, 25.0)).resized(32, 24)
     assert small == Lens(32, 24, (25.0, 26.0), (15.0, 12.5))
+
+
+def test_the_fisheye_model_is_that_of_opencv_up_to_half_a_pixel():
+    points = np.append(np.random.default_rng(0).uniform(-3.0, 3.0, (50, 2)), [[0.0, 0.0]], 0)
+    K = np.array([[75.0, 0, 80.5], [0, 78.0, 57.5], [0, 0, 1]])
+    theirs = cv2.fisheye.projectPoints(
+        np.concatenate([points, np.ones((51, 1))], 1)[:, None], np.zeros(3), np.zeros(3), K, np.array(FISHEYE.fisheye)
+    )[0][:, 0]
+    assert np.allclose(FISHEYE.image(*points.T).T, theirs + 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [PINHOLE, PINCUSHION, BARREL, FISHEYE], ids=["pinhole", "in", "out", "fisheye"])
+def test_unprojecting_is_the_inverse_of_projecting(lens):
+    v, u = np.mgrid[: lens.height, : lens.width] + 0.5
+    assert np.abs(lens.image(*lens.unproject(u, v)) - [u, v]).max() < 1e-4
+
+
+def test_a_fisheye_is_inverted_up_to_its_maximum_angle():
+    wide = dataclasses.replace(FISHEYE, focal=(30.0, 30.0))
+    angles = np.arctan(np.hypot(*wide.unproject(np.array([81.0, 160.0]), np.array([58.0, 58.0]))))
+    assert np.degrees(angles).tolist() == pytest.approx([0.0, 85.0])
+
+
+def test_undistorting_a_fisheye_gives_the_image_of_the_pinhole():
+    def color(x, y):
+        return np.repeat((127.5 + 60 * np.cos(9 * x) + 60 * np.cos(9 * y)).round().astype(np.uint8)[..., None], 3, 2)
+
+    v, u = np.mgrid[: FISHEYE.height, : FISHEYE.width] + 0.5
+    undistorted = undistort(color(*FISHEYE.unproject(u, v)), FISHEYE).astype(int)
+    assert not FISHEYE.is_pinhole
+    assert np.abs(undistorted - image_of_pinhole(FISHEYE, color)).max() <= 6
+
+
+def test_a_fisheye_that_is_not_invertible_is_refused():
+    with pytest.raises(ValueError, match=r"too strong to undistort: \(-3.0,"):
+        dataclasses.replace(FISHEYE, fisheye=(-3.0, 0.0, 0.0, 0.0)).checked()

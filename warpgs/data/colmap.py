@@ -23,6 +23,9 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 SIMPLE = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Camera models with one focal length."""
 
+FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+"""Models of fisheye lenses, with 1, 2 and 4 coefficients; the first two have one focal length."""
+
 
 class ModelImage(NamedTuple):
     """An image of a model: its file name, lens, and [3, 4] world-to-camera pose."""
@@ -75,8 +78,11 @@ def lens_of(camera: pycolmap.Camera) -> Lens:
         ValueError: If its camera model cannot be represented, or a number is out of range.
     """
     model, params = camera.model.name, camera.params.tolist()
-    if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", *SIMPLE) or any(params[9:]):
+    if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", *SIMPLE, *FISHEYE) or any(params[9:]):
         raise ValueError(f"the camera model {model} is not supported; first run colmap image_undistorter")
-    fx, fy, cx, cy, *bent = (params[0], *params) if model in SIMPLE else params
+    fx, fy, cx, cy, *bent = (params[0], *params) if model in (*SIMPLE, *FISHEYE[:2]) else params
+    if model in FISHEYE:
+        k1, k2, k3, k4 = [*bent, 0.0, 0.0, 0.0][:4]
+        return Lens(camera.width, camera.height, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked()
     k1, k2, p1, p2, k3 = [*bent, 0.0, 0.0, 0.0, 0.0, 0.0][:5]  # in this order, as far as the model has them
     return Lens(camera.width, camera.height, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()

@@ -8,10 +8,15 @@ The camera model of the files (google/nerfies, camera.py), with x, y on the plan
     u  = focal x' + cx
     v  = focal aspect y' + cy
 
+or, for a fisheye lens, OpenCV's (cv2.fisheye), with θ = atan r the angle from the axis:
+
+    x', y' = x d, y d,  d = (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹) / r.
+
 u, v are measured from the corner of the image: Nerfies casts the ray of a pixel through its index + 0.5, as we do, so K
 needs no conversion. OpenCV has pixel centres at integers, hence the − 0.5 in the maps.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -23,6 +28,12 @@ from .images import MAX_PIXELS, MAX_SIDE
 
 MIN_FOCAL = 1e-3
 """Minimum focal length [px]; the reciprocals of smaller ones overflow."""
+
+MAX_ANGLE = np.radians(85.0)
+"""Maximum angle from the axis at which a fisheye lens is inverted [radians]; the plane z = 1 ends at 90°."""
+
+NUM_NEWTON_STEPS = 10
+"""Steps that invert a fisheye lens; they converge to 1e-9 in five for real lenses."""
 
 MAX_ZOOM = 2.0
 """Maximum zoom of the undistorted image; distortion that needs more is considered an error in the file."""
@@ -38,6 +49,7 @@ class Lens:
         center: (x, y) principal point from the corner of the image [px].
         radial: Distortion coefficients k1, k2, k3.
         tangential: Distortion coefficients p1, p2.
+        fisheye: Coefficients k1 to k4 of a fisheye lens, which has no others; None if it is none.
     """
 
     width: int
@@ -46,6 +58,7 @@ class Lens:
     center: tuple[float, float]
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: tuple[float, float, float, float] | None = None
 
     def checked(self) -> "Lens":
         """The same lens.
@@ -54,7 +67,7 @@ class Lens:
             ValueError: If a number is not finite, a focal length is below ``MIN_FOCAL``, the size is out of range, or
                 the distortion is too strong to undistort.
         """
-        values = (*self.focal, *self.center, *self.radial, *self.tangential)
+        values = (*self.focal, *self.center, *self.radial, *self.tangential, *(self.fisheye or ()))
         if not np.isfinite(values).all() or min(self.focal) < MIN_FOCAL:
             raise ValueError(f"focal lengths must be at least {MIN_FOCAL} px and intrinsics finite, got {values}")
         if not 0 < min(self.width, self.height) <= max(self.width, self.height) <= MAX_SIDE:
@@ -73,10 +86,15 @@ class Lens:
     @property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion."""
-        return not (any(self.radial) or any(self.tangential))
+        return not (any(self.radial) or any(self.tangential)) and self.fisheye is None
 
     def image(self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "2 ..."]:
         """Projects points on the plane z = 1 to u, v [px from the corner]."""
+        if self.fisheye is not None:
+            r = np.hypot(x, y)
+            theta = np.arctan(r)
+            d = np.where(r > 0.0, _bent(theta, self.fisheye) / np.where(r > 0.0, r, 1.0), 1.0)
+            return np.stack([self.focal[0] * x * d + self.center[0], self.focal[1] * y * d + self.center[1]])
         k1, k2, k3 = self.radial
         p1, p2 = self.tangential
         r2 = x * x + y * y
@@ -84,6 +102,27 @@ class Lens:
         distorted_x = x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
         distorted_y = y * d + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
         return np.stack([self.focal[0] * distorted_x + self.center[0], self.focal[1] * distorted_y + self.center[1]])
+
+    def unproject(
+        self, u: Float[np.ndarray, "*N"], v: Float[np.ndarray, "*N"]
+    ) -> tuple[Float[np.ndarray, "*N"], Float[np.ndarray, "*N"]]:
+        """x, y on the plane z = 1 that the lens sees at u, v: the inverse of ``image``, up to ``MAX_ANGLE``."""
+        x, y = self.rays(1.0, u, v)
+        if self.fisheye is not None:
+            bent = np.hypot(x, y)
+            theta = np.minimum(bent, MAX_ANGLE)
+            for _ in range(NUM_NEWTON_STEPS):
+                theta = theta - (_bent(theta, self.fisheye) - bent) / np.maximum(_slope(theta, self.fisheye), 0.1)
+                theta = np.clip(theta, 0.0, MAX_ANGLE)
+            scale = np.where(bent > 0.0, np.tan(theta) / np.where(bent > 0.0, bent, 1.0), 1.0)
+            return x * scale, y * scale
+        if not self.is_pinhole:
+            coefficients = np.array([*self.radial[:2], *self.tangential, self.radial[2]])
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+            distorted = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float64)
+            found = cv2.undistortPoints(distorted, np.eye(3), coefficients, None, None, None, criteria)
+            x, y = found[:, 0].T.reshape(2, *np.shape(x))
+        return x, y
 
     def rays(
         self, zoom: float, u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
@@ -100,10 +139,25 @@ class Lens:
         x, y = self.rays(zoom, border_u, border_v)
         u, v = self.image(x, y)
         inside = (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
-        k1, k2, k3 = self.radial
         r2 = np.linspace(0.0, float((x * x + y * y).max()), 64)
-        increasing = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0  # d(r d)/dr > 0
+        if self.fisheye is not None:
+            increasing = _slope(np.arctan(np.sqrt(r2)), self.fisheye) > 0.0
+        else:
+            k1, k2, k3 = self.radial
+            increasing = 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0  # d(r d)/dr > 0
         return bool(inside.all() and increasing.all())
+
+
+def _bent(theta: Float[np.ndarray, "..."], k: Sequence[float]) -> Float[np.ndarray, "..."]:
+    """Distance from the principal point, over the focal length, that a fisheye lens gives to an angle."""
+    t = theta * theta
+    return theta * (1.0 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))))
+
+
+def _slope(theta: Float[np.ndarray, "..."], k: Sequence[float]) -> Float[np.ndarray, "..."]:
+    """Derivative of ``_bent``."""
+    t = theta * theta
+    return 1.0 + t * (3.0 * k[0] + t * (5.0 * k[1] + t * (7.0 * k[2] + t * 9.0 * k[3])))
 
 
 @lru_cache(maxsize=4096)
@@ -120,7 +174,9 @@ def filling_zoom(lens: Lens) -> float:
         return 1.0
     low, high = 1.0, MAX_ZOOM
     if not lens.covers(high):
-        raise ValueError(f"the distortion is too strong to undistort: {lens.radial}, {lens.tangential}")
+        raise ValueError(
+            f"the distortion is too strong to undistort: {lens.fisheye or (*lens.radial, *lens.tangential)}"
+        )
     for _ in range(16):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if lens.covers(middle) else (middle, high)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -21,7 +20,7 @@ MAX_ERROR = 0.05
 
 def without_distortion(lens: Lens) -> Lens:
     """The lens as if it did not distort, for which ``undistort`` leaves images as they are."""
-    return replace(lens, radial=(0.0, 0.0, 0.0), tangential=(0.0, 0.0))
+    return replace(lens, radial=(0.0, 0.0, 0.0), tangential=(0.0, 0.0), fisheye=None)
 
 
 def taken_frame(frame: Frame, lens: Lens) -> TakenFrame:
@@ -40,13 +39,15 @@ def taken_frame(frame: Frame, lens: Lens) -> TakenFrame:
 
 
 def taken_reader(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens]) -> Callable[[str], TakenFrame] | None:
-    """Reads frames as they were taken; None if no lens distorts.
+    """Reads frames as they were taken; None if no lens distorts, or one is a fisheye.
+
+    A pinhole camera that sees what a fisheye sees would be far larger than the frame.
 
     Args:
         read: Reads a frame, undistorted as for a lens.
         lenses: The lens of each frame.
     """
-    if all(lens.is_pinhole for lens in lenses.values()):
+    if all(lens.is_pinhole for lens in lenses.values()) or any(lens.fisheye for lens in lenses.values()):
         return None
     return lambda name: taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
 
@@ -57,11 +58,9 @@ def _wide_pinhole(lens: Lens) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int]
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     (fx, fy), (cx, cy) = lens.focal, lens.center
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    coefficients = np.array([*lens.radial[:2], *lens.tangential, lens.radial[2]])
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-    pixels = np.stack([u, v], 2).reshape(-1, 1, 2)
-    positions = cv2.undistortImagePoints(pixels, K, coefficients, None, criteria).reshape(*u.shape, 2)
-    error = np.abs(lens.image((positions[..., 0] - cx) / fx, (positions[..., 1] - cy) / fy) - np.stack([u, v])).max()
+    x, y = lens.unproject(u, v)
+    positions = np.stack([fx * x + cx, fy * y + cy], -1)
+    error = np.abs(lens.image(x, y) - np.stack([u, v])).max()
     if not error < MAX_ERROR or np.ptp(positions, (0, 1)).max() > MAX_ZOOM * max(lens.width, lens.height):
         raise ValueError(f"the distortion cannot be inverted: {lens.radial}, {lens.tangential}")
     corner = np.floor(positions.min((0, 1))) - MARGIN

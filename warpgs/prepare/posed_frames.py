@@ -138,8 +138,4 @@ def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: flo
 def pixel_rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
     """[H, W, 2] x, y on the plane z = 1 of the centre of every pixel of a distorted image."""
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    K = np.array([[lens.focal[0], 0, lens.center[0]], [0, lens.focal[1], lens.center[1]], [0, 0, 1.0]])
-    k1, k2, k3 = lens.radial
-    distorted = np.stack([u, v], -1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(distorted, K, np.array([k1, k2, *lens.tangential, k3]))
-    return rays.reshape(lens.height, lens.width, 2).astype(np.float32)
+    return np.stack(lens.unproject(u, v), -1).astype(np.float32)

@@ -2,11 +2,12 @@
 
 ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). Intrinsics are pixels from the
 corner of the image: ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h``, or ``camera_angle_x`` (the horizontal field of
-view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``, ``p2``, ``k3``. Each may
-be given once or per frame.
+view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``, ``p2``, ``k3``, or of a
+fisheye lens ``k1`` to ``k4``. Each may be given once or per frame.
 """
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from warpgs.files import read_json, read_numbers
 from .posed import opencv_from_opengl, world_to_camera
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-"""Values of ``camera_model`` that can be represented."""
+"""Values of ``camera_model`` of a perspective lens; the other one that is read is ``FISHEYE``."""
+
+FISHEYE = "OPENCV_FISHEYE"
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """Suffixes that ``file_path`` may lack."""
@@ -44,14 +47,12 @@ class Transforms:
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
         self.frames: list[dict[str, Any]] = frames
-        if self.fields.get("is_fisheye"):  # instant-ngp
-            raise ValueError(f"{path}: fisheye lenses are not supported; undistort the images first")
         for frame in frames:
-            model = frame.get("camera_model", self.fields.get("camera_model", "OPENCV"))
-            if model not in PERSPECTIVE:
+            model = self._model(frame)
+            if model not in (*PERSPECTIVE, FISHEYE):
                 raise ValueError(
-                    f"{path}: the camera model {model} is not supported, expected one of {', '.join(PERSPECTIVE)}; "
-                    "undistort the images first"
+                    f"{path}: the camera model {model} is not supported, expected one of "
+                    f"{', '.join((*PERSPECTIVE, FISHEYE))}; undistort the images first"
                 )
 
     def file(self, frame: dict[str, Any], key: str) -> Path | None:
@@ -107,9 +108,11 @@ class Transforms:
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
         k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-        if k4:
-            raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
         lens = Lens(width, height, (focal, focal_y or focal), center, (k1, k2, k3), (p1, p2))
+        if self._model(frame) == FISHEYE:
+            lens = replace(lens, radial=(0.0, 0.0, 0.0), tangential=(0.0, 0.0), fisheye=(k1, k2, k3, k4))
+        elif k4:
+            raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
         try:
             return lens.checked()
         except ValueError as error:
@@ -125,6 +128,10 @@ class Transforms:
         if not 0 < angle < math.pi:
             raise ValueError(f"{self.path}: {angle_key} must be between 0 and π, got {angle}")
         return 0.5 * side / math.tan(0.5 * angle)
+
+    def _model(self, frame: dict[str, Any]) -> Any:
+        given = self._given(frame)
+        return FISHEYE if given.get("is_fisheye") else given.get("camera_model", "OPENCV")  # the former: instant-ngp
 
     def _given(self, frame: dict[str, Any]) -> dict[str, Any]:
         return {**self.fields, **frame}
