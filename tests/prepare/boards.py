@@ -1,9 +1,11 @@
 """A tiny synthetic video: textured boards at several depths, a camera that moves past them, and a moving board."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from warpgs.data.lens import Lens
 from warpgs.prepare.cameras import Cameras
@@ -44,6 +46,17 @@ def pose(time: float, travel: float = 1.0) -> np.ndarray:
     return np.hstack([rotation, -rotation @ center[:, None]])
 
 
+def turning_pose(time: float) -> np.ndarray:
+    """[3, 4] the same at one place, turning to and fro and up."""
+    turn = np.array([0.1 * np.sin(5.0 * time), 0.25 * np.sin(6.3 * time), 0.04 * np.sin(3.0 * time)])
+    return np.hstack([cv2.Rodrigues(turn)[0], np.zeros((3, 1))])
+
+
+def still_pose(time: float) -> np.ndarray:
+    """[3, 4] the same on a tripod."""
+    return np.eye(4)[:3]
+
+
 def board_center(time: float) -> tuple[float, float, float]:
     """Centre of the moving board."""
     return (0.7 * np.sin(5.0 * time), 0.1 + 0.4 * np.cos(6.0 * time), 3.0)
@@ -77,14 +90,16 @@ def depth(view: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def record(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """[H, W, 3] RGB images, and [H, W] masks of the moving board."""
+def record(
+    num_frames: int = 24, travel: float = 1.0, moves: bool = True, path: Callable[[float], np.ndarray] | None = None
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """[H, W, 3] RGB images, and [H, W] masks of the moving board, from poses on a path, by default ``pose``."""
     paints = [texture(0, COLORS[0], 512, (20, 60)), *(texture(k, COLORS[k], 128, (5, 14)) for k in (1, 2, 3))]
     red = texture(9, (190, 60, 50), 128, (4, 12))
     images, masks = [], []
     for k in range(num_frames):
         time = k / (num_frames - 1)
-        image, view = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose(time, travel)
+        image, view = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), pose(time, travel) if path is None else path(time)
         for board, paint in sorted(zip(PLANES, paints, strict=True), key=lambda b: -b[0][0][2]):
             _render(image, board, paint, view)
         mask = np.zeros(SIZE[::-1], bool)
@@ -93,6 +108,19 @@ def record(num_frames: int = 24, travel: float = 1.0, moves: bool = True) -> tup
         images.append(image)
         masks.append(mask)
     return images, masks
+
+
+def through_fisheye(num_frames: int, fisheye: Lens) -> list[np.ndarray]:
+    """[H, W, 3] images of the static boards that a fisheye lens takes, of a wide pinhole's."""
+    wide, focal = (900, 700), 160.0
+    x, y = fisheye.unproject(*np.meshgrid(np.arange(fisheye.width) + 0.5, np.arange(fisheye.height) + 0.5))
+    columns, rows = focal * x + wide[0] / 2 - 0.5, focal * y + wide[1] / 2 - 0.5
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tests.prepare.boards.SIZE", wide)
+        patch.setattr("tests.prepare.boards.FOCAL", focal)
+        images = [cv2.GaussianBlur(image, (0, 0), 0.7) for image in record(num_frames, moves=False)[0]]
+    maps = columns.astype(np.float32), rows.astype(np.float32)
+    return [cv2.remap(image, *maps, cv2.INTER_LINEAR) for image in images]
 
 
 def pan(num_frames: int) -> list[np.ndarray]:

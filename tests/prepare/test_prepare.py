@@ -14,7 +14,7 @@ import pytest
 
 from tests.prepare import boards
 from warpgs.data.check import check_capture
-from warpgs.data.lens import undistort
+from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import load_capture
 from warpgs.prepare import pipeline
 from warpgs.prepare.cameras import Cameras, NoCamerasError
@@ -80,6 +80,67 @@ def overlap(capture, count=24) -> float:
 
 def test_the_moving_board_is_masked(made):
     assert overlap(load_capture(made)) > 0.7
+
+
+def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
+    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", lambda *rest: pytest.fail("COLMAP was asked"))
+    images, truth = boards.record(12, path=boards.still_pose)
+    report = prepare(boards.write_folder(tmp_path / "shots", images), tmp_path / "made", camera="still")
+    assert report["notes"][0].startswith("the focal length is assumed, 256 px")
+    assert "the camera stays at one place" in report["notes"][1]
+    assert report["steps"]["depth"] == "none"
+    capture = load_capture(tmp_path / "made")
+    overlaps = []
+    for name in capture.train:
+        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
+        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
+    assert np.mean(overlaps) > 0.85
+    positions = np.array([camera.position.numpy() for camera in capture.cameras.values()])
+    assert np.ptp(positions, axis=0).max() == 0.0
+    distances = np.linalg.norm(capture.points.numpy() - positions[0], axis=1)
+    assert np.allclose(distances, distances[0], rtol=1e-5)
+
+
+def turned_cameras(folder, names, work, settings, quiet) -> Cameras:
+    assert settings.turns
+    poses = np.array([boards.turning_pose(k / (len(names) - 1)) for k in range(len(names))])
+    return Cameras(names, boards.lens(), poses, np.zeros((0, 3)), 0.1, 0.0)
+
+
+def test_what_moves_before_a_camera_that_turns_is_masked_and_depth_places_the_points(tmp_path, monkeypatch):
+    def predict(images, weights, quiet):
+        return [np.full(image.shape[:2], 3.0) + (np.arange(image.shape[1]) < 100) for image in images]
+
+    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", turned_cameras)
+    for module in ("checks", "depth"):
+        monkeypatch.setattr(f"warpgs.prepare.{module}.find_weights", lambda *rest: tmp_path)
+    monkeypatch.setattr("warpgs.prepare.depth_anything.predict", predict)
+    images, truth = boards.record(14, path=boards.turning_pose)
+    shots = boards.write_folder(tmp_path / "shots", images)
+    prepare(shots, tmp_path / "made", camera="turning", depth="anything")
+    capture = load_capture(tmp_path / "made")
+    overlaps = []
+    for name in capture.train:
+        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
+        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
+    assert np.mean(overlaps) > 0.75
+    camera = capture.cameras["frame_000000"]
+    depths = camera.project(capture.points)[2][:200]  # points of the first frame come first
+    assert set(np.round((depths / depths.max()).numpy(), 2).tolist()) == {0.75, 1.0}
+    assert capture.frame("frame_000000").inverse_depth is not None
+    assert check_capture(tmp_path / "made").is_fit
+
+
+def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "warpgs.prepare.masks.find_dynamic", lambda frames, *rest: [i[..., 0] < 256 for i in frames.images]
+    )
+    with pytest.raises(
+        ValueError, match=r"100% of the pixels seem to move: the camera is not still; try another --camera"
+    ):
+        prepare(shots, tmp_path / "made", camera="still")
 
 
 def test_cameras_misled_by_dynamic_objects_are_recovered_without_them(tmp_path):
@@ -187,6 +248,20 @@ def test_a_frame_without_a_camera_is_noted_and_omitted(tmp_path):
     capture = load_capture(tmp_path / "made")
     assert len(capture.train) == 10
     assert "frame_000006" not in capture.cameras
+
+
+def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch):
+    """Those of frames twice as large."""
+
+    def recover(folder, names, work, settings, quiet):
+        assert settings.known == Lens(*boards.SIZE, (230.0, 230.0), (130.0, 96.0))
+        return dataclasses.replace(true_cameras(folder, names), lens=settings.known)
+
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 512 384 460 460 260 192\n")
+    prepare(shots, tmp_path / "made", masks="none", depth="none", intrinsics=tmp_path / "cameras.txt")
+    K = load_capture(tmp_path / "made").cameras["frame_000000"].K
+    assert K[:2].tolist() == [[230.0, 0.0, 130.0], [0.0, 230.0, 96.0]]
 
 
 def test_given_masks_are_used_unchanged(shots, tmp_path):
@@ -308,6 +383,10 @@ def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
         ({"masks": "nowhere"}, "--masks must be motion, sam2, none or a folder of masks; nowhere is not a folder"),
         ({"depth": "lidar"}, "--depth must be one of flow, anything, none, got lidar"),
         ({"selection": Selection(count=1)}, "--count"),
+        ({"camera": "turning", "depth": "flow"}, "--depth flow needs a camera that moves, with --camera turning there"),
+        ({"intrinsics": Path("no.json")}, r"no\.json is missing"),
+        ({"intrinsics": Path("no.json"), "focal": 5.0}, "says all about the lens: leave out --focal and --lens"),
+        ({"intrinsics": Path("no.json"), "lens": "OPENCV"}, "leave out --focal and --lens"),
     ],
 )
 def test_invalid_options_are_refused(options, word, shots, tmp_path):

@@ -1,5 +1,6 @@
 """COLMAP in a process of its own: what it is asked, what it answers, and how it ends."""
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 
 from tests.prepare import boards
+from warpgs.data.lens import Lens
 from warpgs.prepare import colmap, sfm
-from warpgs.prepare.cameras import NoCamerasError
+from warpgs.prepare.cameras import Cameras, NoCamerasError
 from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
 
@@ -131,22 +133,55 @@ def test_a_camera_that_only_turns_is_refused_and_named(turning, tmp_path):
     assert not (tmp_path / "work/model").exists()  # it was refused before mapping
 
 
+def test_directions_and_focal_length_of_a_camera_that_turns_are_found(turning, tmp_path):
+    names = [path.stem for path in sorted(turning.iterdir())]
+    found = recover_cameras(turning, names, tmp_path / "work", Settings(turns=True))
+    assert found.names == names
+    assert abs(found.lens.focal[0] / boards.FOCAL - 1.0) < 0.01
+    assert not found.have_parallax
+    steps = [a.T @ b for a, b in itertools.pairwise(found.poses[:, :, :3])]
+    angles = [np.arccos((np.trace(step) - 1.0) / 2.0) for step in steps]
+    assert np.allclose(angles, 0.6 / 12, atol=0.012)  # and a little up and down
+
+
+FISHEYE = Lens(*boards.SIZE, (112.0, 112.0), (130.0, 95.0), fisheye=(0.04, -0.01, 0.002, 0.0))
+
+
+@pytest.mark.parametrize("known", [FISHEYE, None], ids=["known", "found"])
+def test_cameras_with_a_fisheye_lens_are_found(known, tmp_path):
+    """The lens sees 130° across, and 157° from corner to corner."""
+    frames = boards.write_folder(tmp_path / "shots", boards.through_fisheye(8, FISHEYE))
+    names = [path.stem for path in sorted(frames.iterdir())]
+    settings = Settings(known=known) if known else Settings(lens="OPENCV_FISHEYE")
+    found = recover_cameras(frames, names, tmp_path / "work", settings)
+    assert found.names == names
+    assert found.lens.fisheye is not None
+    assert known is None or found.lens == known
+    u, v = np.meshgrid(np.linspace(20, 236, 9), np.linspace(20, 172, 7))
+    seen, true = found.lens.unproject(u, v), FISHEYE.unproject(u, v)
+    angles = [np.degrees(np.arctan(np.hypot(*rays))) for rays in (seen, true)]
+    assert np.abs(angles[0] - angles[1]).max() < 2.5
+    found.save(tmp_path / "cameras")
+    assert Cameras.load(tmp_path / "cameras").lens == found.lens
+
+
 def test_a_camera_that_passes_a_wall_needs_its_focal_length(tmp_path, monkeypatch):
     """Static surfaces shift as a whole, as in front of a camera of long focal length that turns."""
     size, generator = (640, 480), np.random.default_rng(0)
     firsts = [generator.uniform((0, 0), size, (100, 2)) for _ in range(12)]
     pairs = [(first, first - (2.0 * k, 0.0)) for k, first in enumerate(firsts, 1)]
-    monkeypatch.setattr(colmap, "verified_matches", lambda database: (pairs, size))
+    named = {("a", str(k)): pair for k, pair in enumerate(pairs)}
+    monkeypatch.setattr(colmap, "verified_matches", lambda database: (named, size))
 
     def check(focal: float | None) -> None:
         work = str(tmp_path)
         job = colmap.Job(work, ["a"], work, "PINHOLE", None, False, False, focal, False)
         colmap._check_parallax(job, tmp_path / "features.db")
 
-    with pytest.raises(NoCamerasError, match=r"over flat ground, give its focal length: --focal PX$"):
+    with pytest.raises(NoCamerasError, match=r"over flat ground, give its focal length: --focal PX; masks alone"):
         check(None)
     check(500.0)
-    with pytest.raises(NoCamerasError, match=r"instead of turning on the spot$"):  # it is given already
+    with pytest.raises(NoCamerasError, match=r"instead of turning on the spot; masks alone"):  # it is given already
         check(4000.0)
 
 

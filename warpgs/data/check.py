@@ -218,7 +218,8 @@ def _turning(capture: Capture) -> Iterator[Finding]:
             f"the camera only turns: a rotation explains {searched} of the matches between frames, so depth and "
             "positions are undetermined; move the camera sideways"
         )
-        yield Finding("error", "cameras", text)
+        # Cameras that all stand at one place say so themselves, as those of warpgs prepare --camera turning do.
+        yield Finding("error" if capture.extent > MIN_EXTENT else "warning", "cameras", text)
     else:
         text = (
             f"a rotation explains {searched} of the matches between frames with the best focal length, {known} with "

@@ -5,6 +5,7 @@ COLMAP measures pixels from the corner of the image, as we do, and poses are wor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,11 +21,15 @@ if TYPE_CHECKING:
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 """Where a capture has its model."""
 
-SIMPLE = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+SIMPLE = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models with one focal length."""
 
-FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-"""Models of fisheye lenses, with 1, 2 and 4 coefficients; the first two have one focal length."""
+NUM_PARAMETERS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8,
+}  # fmt: skip
+"""Camera models that can be represented, and the number of their parameters: focal lengths, principal point, and
+k1, k2, p1, p2, k3 as far as the model has them, or k1 to k4 of a fisheye lens."""
 
 
 class ModelImage(NamedTuple):
@@ -72,17 +77,33 @@ def load_model(folder: Path) -> Model:
 
 
 def lens_of(camera: pycolmap.Camera) -> Lens:
-    """The lens of a camera of a model.
+    """The lens of a camera of a model; raises as ``lens_of_parameters``."""
+    return lens_of_parameters(camera.model.name, (camera.width, camera.height), camera.params.tolist())
+
+
+def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
+    """The lens of a camera model, the (width, height) of its images, and its parameters.
 
     Raises:
-        ValueError: If its camera model cannot be represented, or a number is out of range.
+        ValueError: If the camera model cannot be represented, or a number is missing or out of range.
     """
-    model, params = camera.model.name, camera.params.tolist()
-    if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", *SIMPLE, *FISHEYE) or any(params[9:]):
+    if model not in NUM_PARAMETERS or any(params[9:]):
         raise ValueError(f"the camera model {model} is not supported; first run colmap image_undistorter")
-    fx, fy, cx, cy, *bent = (params[0], *params) if model in (*SIMPLE, *FISHEYE[:2]) else params
-    if model in FISHEYE:
-        k1, k2, k3, k4 = [*bent, 0.0, 0.0, 0.0][:4]
-        return Lens(camera.width, camera.height, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked()
-    k1, k2, p1, p2, k3 = [*bent, 0.0, 0.0, 0.0, 0.0, 0.0][:5]  # in this order, as far as the model has them
-    return Lens(camera.width, camera.height, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()
+    if len(params) != NUM_PARAMETERS[model]:
+        raise ValueError(f"{model} has {NUM_PARAMETERS[model]} parameters, got {len(params)}")
+    fx, fy, cx, cy, *bent = (params[0], *params) if model in SIMPLE else params
+    bent = [*bent, *[0.0] * 5]
+    if model.endswith("FISHEYE"):
+        return Lens(*size, (fx, fy), (cx, cy), fisheye=(bent[0], bent[1], bent[2], bent[3])).checked()
+    k1, k2, p1, p2, k3 = bent[:5]
+    return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()
+
+
+def parameters_of_lens(lens: Lens) -> tuple[str, list[float]]:
+    """The camera model that represents a lens, and its parameters."""
+    k1, k2, k3 = lens.radial
+    own = [*lens.focal, *lens.center]
+    if lens.fisheye is not None:
+        return "OPENCV_FISHEYE", [*own, *lens.fisheye]
+    perspective = [*own, k1, k2, *lens.tangential]
+    return ("FULL_OPENCV", [*perspective, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", perspective)

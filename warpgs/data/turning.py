@@ -43,10 +43,12 @@ class Turning:
     Attributes:
         explained: Fraction of the matches that a rotation explains, in the pair at the ``MAX_WORSE_PAIRS`` quantile.
         displacement: Median displacement in the examined pairs, relative to the longer side.
+        focal: Focal length that explains most, or that was known [px].
     """
 
     explained: float
     displacement: float
+    focal: float
 
     @property
     def stands_still(self) -> bool:
@@ -81,7 +83,7 @@ def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float |
     if focal is None:
         coarse = max(FOCALS * longest, key=lambda f: explained(f, wide[::3]))
         focal = max(coarse * FINE_FOCALS, key=lambda f: explained(f, wide[::3]))
-    return Turning(explained(focal, wide), displacement)
+    return Turning(explained(focal, wide), displacement, float(focal))
 
 
 def _displacement(pair: Matches) -> float:
@@ -91,14 +93,27 @@ def _displacement(pair: Matches) -> float:
 def _explained(pair: Matches, focal: float, center: np.ndarray, tolerance: float) -> float:
     """Fraction of the matches that the best rotation explains."""
     a, b = (_unit_rays(positions, focal, center) for positions in pair)
-    weights = np.ones(len(a))
+    _, errors = fit_rotation(a, b, tolerance / focal)
+    return float((errors < tolerance / focal).mean())
+
+
+def fit_rotation(
+    a: Float[np.ndarray, "M 3"], b: Float[np.ndarray, "M 3"], tolerance: float
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " M"]]:
+    """The rotation that takes most unit rays a to b, and the distance of each on the plane z = 1.
+
+    Args:
+        a, b: [M, 3] the same static points in two frames.
+        tolerance: Distance at which the weight of a match is a quarter.
+    """
+    weights, there = np.ones(len(a)), b[:, :2] / np.maximum(b[:, 2:], 1e-6)
     for _ in range(NUM_REWEIGHTINGS):
         u, _, vt = np.linalg.svd((b * weights[:, None]).T @ a)
-        turned = a @ (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
-        expected = focal * turned[:, :2] / np.maximum(turned[:, 2:], 1e-6) + center  # no ray at 90° from the axis
-        errors = np.linalg.norm(expected - pair[1], axis=1)
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        turned = a @ rotation.T
+        errors = np.linalg.norm(turned[:, :2] / np.maximum(turned[:, 2:], 1e-6) - there, axis=1)  # no ray at 90°
         weights = 1.0 / (1.0 + (errors / tolerance) ** 2) ** 2
-    return float((errors < tolerance).mean())
+    return rotation, errors
 
 
 def _unit_rays(positions: np.ndarray, focal: float, center: np.ndarray) -> np.ndarray:

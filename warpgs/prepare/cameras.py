@@ -48,7 +48,12 @@ class Cameras:
     @property
     def centers(self) -> Float[np.ndarray, "F 3"]:
         """[F, 3] centres of the cameras in the world."""
-        return -np.einsum("fji,fj->fi", self.poses[:, :, :3], self.poses[:, :, 3])
+        return camera_centers(self.poses)
+
+    @property
+    def have_parallax(self) -> bool:
+        """Whether they are at different places."""
+        return bool(np.ptp(self.centers, axis=0).any())
 
     def undistorted(self) -> "Cameras":
         """The cameras of the undistorted frames."""
@@ -61,6 +66,7 @@ class Cameras:
             f"{path}.npz",
             names=np.array(self.names),
             lens=np.array([lens.width, lens.height, *lens.focal, *lens.center, *lens.radial, *lens.tangential]),
+            fisheye=np.array(lens.fisheye or ()),
             poses=self.poses,
             points=self.points,
             quality=np.array([self.error, self.angle]),
@@ -78,7 +84,7 @@ class Cameras:
         data = io.BytesIO(read_bounded(file, MAX_BYTES))
         try:
             found = Cameras._parse(data)
-        except (BadZipFile, KeyError, TypeError, EOFError, OSError) as error:
+        except (BadZipFile, KeyError, TypeError, IndexError, EOFError, OSError) as error:
             raise ValueError(f"{file} is damaged: {error}") from error
         numbers = (found.poses, found.points, found.lens.focal, found.lens.center)
         if found.poses.shape != (len(found.names), 3, 4) or not all(np.isfinite(n).all() for n in numbers):
@@ -90,9 +96,16 @@ class Cameras:
         with np.load(data) as z:
             v = z["lens"].tolist()
             lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
+            if len(bent := z["fisheye"].tolist()):
+                lens = dataclasses.replace(lens, fisheye=(bent[0], bent[1], bent[2], bent[3]))
             error, angle = z["quality"].tolist()
             weak = bool(z["weak_features"])
             return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)
+
+
+def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"]:
+    """[F, 3] centres of cameras of world-to-camera poses."""
+    return -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
 
 
 def pinhole_lens(lens: Lens) -> Lens:

@@ -7,6 +7,7 @@ from warpgs.data.writer import check_holdout, held_out
 
 from .depth import DEPTHS
 from .frames import check_selection
+from .intrinsics import read_intrinsics
 from .masks import MASKERS
 from .options import Options
 from .weights import find_weights
@@ -25,14 +26,24 @@ def check_options(source: Path, root: Path, options: Options) -> None:
     check_selection(options.selection)
     if options.focal is not None and not 0.0 < options.focal < math.inf:
         raise ValueError(f"--focal must be positive, got {options.focal}")
+    if options.intrinsics is not None:
+        if options.focal is not None or options.lens != Options().lens:
+            raise ValueError("--intrinsics says all about the lens: leave out --focal and --lens")
+        read_intrinsics(options.intrinsics)
     check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
         raise ValueError(f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder")
-    if options.depth not in DEPTHS:
+    if options.depth_method not in DEPTHS:
         raise ValueError(f"--depth must be one of {', '.join(DEPTHS)}, got {options.depth}")
+    if options.camera != "moving" and options.depth == "flow":
+        raise ValueError(
+            f"--depth flow needs a camera that moves, with --camera {options.camera} there is no parallax: use --depth "
+            "anything (a network) or none"
+        )
     _check_networks(options)
     inputs = [("source", source)]
     inputs += [("masks", Path(options.masks))] if options.masks not in MASKERS else []
+    inputs += [("intrinsics", options.intrinsics)] if options.intrinsics is not None else []
     inputs += [("weights", options.weights)] if options.weights is not None else []
     for name, path in inputs:
         if root.resolve() in (path.resolve(), *path.resolve().parents):
@@ -40,7 +51,7 @@ def check_options(source: Path, root: Path, options: Options) -> None:
 
 
 def _check_networks(options: Options) -> None:
-    methods = MASKERS.get(options.masks), DEPTHS[options.depth]
+    methods = MASKERS.get(options.masks), DEPTHS[options.depth_method]
     networks = [method.network for method in methods if method is not None and method.network is not None]
     if options.weights is not None and not networks:
         known = [method.network.option for method in (*MASKERS.values(), *DEPTHS.values()) if method and method.network]

@@ -16,13 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2  # noqa: F401  pycolmap before OpenCV breaks OpenCV's PNG files: both bring a zlib (seen with 5.0 and 4.2)
+import numpy as np
 import pycolmap
+from jaxtyping import Float
 
+from warpgs.data.colmap import lens_of_parameters
+from warpgs.data.lens import Lens
 from warpgs.data.turning import find_turning
 
-from .cameras import MISLED, NoCamerasError
+from .cameras import MISLED, Cameras, NoCamerasError
 from .matches import all_pairs, keep_static, revisit_pairs, sequence_pairs, verified_matches
 from .model import cameras_of_model
+from .rotations import find_directions
 
 FALLBACK_FRAMES = 250
 """Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
@@ -38,6 +43,9 @@ MIN_FEATURES = 60
 
 ENOUGH = 0.9
 """Fraction of the frames with cameras below which another way to find them is tried."""
+
+FISHEYE, FISHEYE_FOCAL = "OPENCV_FISHEYE", 0.5
+"""The model of fisheye lenses, and the focal length over the longer side that it starts from: 115° across."""
 
 CHUNK = 16
 """Number of frames whose features are extracted, or that are matched with others, between two reports."""
@@ -64,6 +72,8 @@ class Job:
         names: Names of the frames.
         work: Folder for the database and the reconstruction.
         lens: COLMAP's lens model.
+        params: Its known parameters, which are kept; None to find them.
+        turns: Whether the camera only turns.
         masks: Folder of masks <name>.png.png, 0 = dynamic.
         thorough: Whether to match frames far apart in time that see the same points, and to refine with them.
         weak_features: Whether to use features of low contrast.
@@ -81,6 +91,8 @@ class Job:
     weak_features: bool
     focal: float | None
     refine: bool
+    params: list[float] | None = None
+    turns: bool = False
 
     @property
     def database(self) -> Path:
@@ -88,13 +100,18 @@ class Job:
         return Path(self.work) / ("weak.db" if self.weak_features else "features.db")
 
     @property
+    def finds_focal(self) -> bool:
+        """Whether the focal length is unknown."""
+        return self.focal is None and self.params is None
+
+    @property
     def files(self) -> list[str]:
         """Names of the images."""
         return [f"{name}.png" for name in self.names]
 
 
-def run(job: Job, report: Report) -> Any:
-    """COLMAP's reconstruction of the frames.
+def run(job: Job, report: Report) -> Cameras:
+    """The cameras of the frames.
 
     Raises:
         NoCamerasError: If the frames are not suitable; the message says why and what to try.
@@ -103,6 +120,9 @@ def run(job: Job, report: Report) -> Any:
     pycolmap.set_random_seed(0)
     _extract_and_match(job, report)
     database = _static_database(job)
+    if job.turns:
+        report("directions", 0, 1)
+        return _find_directions(job, database)
     model_folder = work / "model"
     model = pycolmap.Reconstruction(model_folder) if job.refine else None
     if model is not None:
@@ -123,7 +143,7 @@ def run(job: Job, report: Report) -> Any:
     if not job.refine:
         model_folder.mkdir(exist_ok=True)
         model.write(model_folder)
-    return model
+    return cameras_of_model(model, job.names, job.weak_features)
 
 
 def _extract_and_match(job: Job, report: Report) -> None:
@@ -134,10 +154,8 @@ def _extract_and_match(job: Job, report: Report) -> None:
     job.database.unlink(missing_ok=True)
     reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reading.camera_model = job.lens
-    if job.focal is not None:
-        first = pycolmap.Bitmap.read(Path(job.folder) / job.files[0], False)
-        camera = pycolmap.Camera.create_from_model_name(1, job.lens, job.focal, first.width, first.height)
-        reading.camera_params = camera.params_to_string()
+    if (params := _starting_parameters(job)) is not None:
+        reading.camera_params = ",".join(map(str, params))
     extraction.sift.max_num_features = MAX_FEATURES
     extraction.sift.max_num_orientations = 1
     if job.weak_features:
@@ -150,6 +168,15 @@ def _extract_and_match(job: Job, report: Report) -> None:
         reading.existing_camera_id = 1
     _match(job, sequence_pairs(len(files)), report)
     finished.touch()
+
+
+def _starting_parameters(job: Job) -> list[float] | None:
+    """Parameters of the lens that are known, or that a fisheye lens starts from; None for COLMAP's own guess."""
+    if job.params is not None or (job.focal is None and job.lens != FISHEYE):
+        return job.params
+    first = pycolmap.Bitmap.read(Path(job.folder) / job.files[0], False)
+    focal = job.focal or FISHEYE_FOCAL * max(first.width, first.height)
+    return list(pycolmap.Camera.create_from_model_name(1, job.lens, focal, first.width, first.height).params)
 
 
 def _match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
@@ -179,13 +206,18 @@ def _static_database(job: Job) -> Path:
 
 
 def _check_parallax(job: Job, database: Path) -> None:
-    turning = find_turning(*verified_matches(database), job.focal)
+    matches, size = verified_matches(database)
+    pairs, focal = [*matches.values()], job.focal
+    if job.params is not None:
+        lens = lens_of_parameters(job.lens, size, job.params)
+        pairs, focal = [(_straight(a, lens), _straight(b, lens)) for a, b in pairs], lens.focal[0]
+    turning = find_turning(pairs, size, focal)
     if turning is None:
         return
     if turning.stands_still:
         raise NoCamerasError(
             f"the camera stands still: static surfaces move by {turning.displacement:.1%} of the image at most; depth "
-            "is undetermined; move the camera sideways"
+            "is undetermined; move the camera sideways, or find masks alone with --camera still"
         )
     if turning.only_turns:
         # Before a plane, moving sideways looks like turning with a long focal length.
@@ -193,8 +225,28 @@ def _check_parallax(job: Job, database: Path) -> None:
         raise NoCamerasError(
             f"the camera only turns: a rotation explains {turning.explained:.0%} of the matches between frames, so "
             "depth is undetermined; walk around the scene or move the camera sideways instead of turning on the spot"
-            + (known if job.focal is None else "")
+            + (known if job.finds_focal else "")
+            + "; masks alone are found with --camera turning"
         )
+
+
+def _straight(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.ndarray, "M 2"]:
+    """Positions as a pinhole camera with the lens' focal length and its axis in the middle sees them."""
+    rays = np.stack(lens.unproject(positions[:, 0], positions[:, 1]), 1)
+    return lens.focal[0] * rays + np.array([lens.width, lens.height]) / 2.0
+
+
+def _find_directions(job: Job, database: Path) -> Cameras:
+    """The cameras of a camera that only turns."""
+    matches, (width, height) = verified_matches(database)
+    index = {file: k for k, file in enumerate(job.files)}
+    pairs = {(index[a], index[b]): m for (a, b), m in matches.items() if a in index and b in index}
+    focal = job.focal or 1.0  # found unless it is known
+    lens = Lens(width, height, (focal, focal), (width / 2.0, height / 2.0))
+    if job.params is not None:
+        lens = lens_of_parameters(job.lens, (width, height), job.params)
+    bends = job.params is None and "PINHOLE" not in job.lens
+    return find_directions(job.names, pairs, lens, finds_focal=job.finds_focal, finds_distortion=bends)
 
 
 def _map(job: Job, database: Path, report: Report) -> Any:
@@ -215,7 +267,8 @@ def _size(model: Any) -> int:
 def _mapping_options(job: Job) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
-    options.ba_refine_focal_length = job.focal is None
+    options.ba_refine_focal_length = job.finds_focal
+    options.ba_refine_extra_params = job.params is None
     return options
 
 
@@ -223,7 +276,8 @@ def _map_globally(job: Job, database: Path, report: Report) -> Any:
     report("cameras", 0, len(job.names))
     options = pycolmap.GlobalPipelineOptions()
     options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS
-    options.mapper.bundle_adjustment.refine_focal_length = job.focal is None
+    options.mapper.bundle_adjustment.refine_focal_length = job.finds_focal
+    options.mapper.bundle_adjustment.refine_extra_params = job.params is None
     try:
         models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"), options)
     except (RuntimeError, ValueError):  # it raises if it finds no geometry
@@ -265,7 +319,8 @@ def _refine(job: Job, model: Any, report: Report) -> Any:
     )
     adjustment = pycolmap.BundleAdjustmentOptions()
     adjustment.print_summary = False
-    adjustment.refine_focal_length = job.focal is None
+    adjustment.refine_focal_length = job.finds_focal
+    adjustment.refine_extra_params = job.params is None
     for _ in range(2):
         pycolmap.bundle_adjustment(model, adjustment)
         pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_TRIANGULATION_ANGLE)
@@ -291,8 +346,8 @@ def main() -> None:
         sys.stdout.flush()
 
     try:
-        model = run(job, lambda label, done, total: write(label=label, done=done, total=total))
-        cameras_of_model(model, job.names, job.weak_features).save(Path(job.work) / "cameras")
+        cameras = run(job, lambda label, done, total: write(label=label, done=done, total=total))
+        cameras.save(Path(job.work) / "cameras")
     except NoCamerasError as error:
         write(error=str(error), unsuitable=True)
     except (RuntimeError, IndexError, ValueError, OSError) as error:

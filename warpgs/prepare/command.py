@@ -11,7 +11,7 @@ from typing import Annotated
 
 import tyro
 
-from .options import LensModel, Options, Selection
+from .options import CameraMotion, LensModel, Options, Selection
 
 USED_BY_ADD = ("source", "add", "masks", "depth", "weights", "quiet")
 """Options that mean something with ``--add``."""
@@ -45,11 +45,16 @@ class Prepare:
     """COLMAP's lens model."""
     focal: float | None = None
     """Known focal length [px of the source's frames]; found by default."""
+    intrinsics: Path | None = None
+    """File of the known lens: COLMAP's cameras.txt, or JSON, YAML or XML of OpenCV; instead of --lens and --focal."""
+    camera: CameraMotion = "moving"
+    """moving, turning (on the spot) or still (on a tripod). The last two give no depth, and no views from elsewhere."""
     masks: str = "motion"
     """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
     named like the source's files or like the capture's frames."""
-    depth: str = "flow"
-    """How to estimate depth: flow (static surfaces, by optical flow), anything (all pixels, by a network) or none."""
+    depth: str | None = None
+    """How to estimate depth: flow (static surfaces, by optical flow; the default of a moving camera), anything (all
+    pixels, by a network) or none."""
     holdout: int = 0
     """Keep every N-th frame for evaluation (val_ids); 0 keeps none."""
     weights: Path | None = None
@@ -65,14 +70,15 @@ class Prepare:
             from .add import AddOptions, add_parts
 
             self._check_alone()
-            add_parts(self.source, AddOptions(self.add.split(","), self.masks, self.depth, self.weights), log)
+            add_parts(self.source, AddOptions(self.add.split(","), self.masks, self.depth or "flow", self.weights), log)
             return
         if self.capture is None:
             raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
         from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
 
         selection = Selection(self.fps, self.count, self.longest_side, self.start, self.end)
-        options = Options(selection, self.lens, self.focal, self.masks, self.depth, self.holdout, self.weights)
+        names = (field.name for field in fields(Options) if field.name != "selection")
+        options = Options(selection, **{name: getattr(self, name) for name in names})
         try:
             with _terminable():
                 prepare(self.source, self.capture, options, force=self.force, log=log)

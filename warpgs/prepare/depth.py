@@ -1,5 +1,6 @@
 """Inverse depth of every frame of a capture: the methods that estimate it, and its files."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from .contact_sheet import choose_evenly, colored_depth, contact_sheet
 from .flow_depth import static_depth
 from .methods import DepthMethod, Planes
 from .posed_frames import PosedFrames, load_posed_frames
+from .scene import write_world
+from .sphere import points_around
 from .weights import DEPTH_ANYTHING, find_weights
 
 MAX_SIDE = 512
@@ -70,6 +73,8 @@ def add_depth(
     planes = method.estimate(frames, dynamic, folder, quiet)
     for name, plane in zip(cameras.names, planes, strict=True):
         write_depth(root, name, as_half(plane))
+    if not cameras.have_parallax:
+        _place_points(root, cameras, planes)
     chosen = choose_evenly(len(planes))
     sheet = contact_sheet([colored_depth(planes[k]) for k in chosen], [cameras.names[k] for k in chosen])
     write_png(root / "depth.png", sheet)
@@ -77,6 +82,13 @@ def add_depth(
     unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
     notes = [f"depth is unknown everywhere in {', '.join(unknown)}"] if unknown else []
     return f"known on {np.mean(known):.0%} of the pixels", notes
+
+
+def _place_points(root: Path, cameras: Cameras, planes: Planes) -> None:
+    """Writes the points of a camera that stays at one place as far away as its depth says."""
+    pinhole = cameras.undistorted()
+    masks = list(_dynamic_masks(root, cameras, (cameras.lens.width, cameras.lens.height)))
+    write_world(root, dataclasses.replace(pinhole, points=points_around(pinhole, masks, planes)))
 
 
 def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:

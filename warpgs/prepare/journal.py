@@ -19,7 +19,7 @@ OUTPUTS = (
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
-VERSION = 3
+VERSION = 4
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
 
 STATE = "state.json"

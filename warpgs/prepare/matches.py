@@ -1,6 +1,5 @@
 """Pairs of frames to match, and COLMAP's matches: those in static regions, and those that show parallax."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,22 +106,22 @@ def _static(opened: Any, image: Any, masks: Path | None, is_wanted: bool) -> Boo
     return mask[row, column] > 0
 
 
-def verified_matches(database: Path) -> tuple[list[Matches], tuple[int, int]]:
-    """Positions of the matches of every verified pair, and (width, height) of the images."""
+def verified_matches(database: Path) -> tuple[dict[tuple[str, str], Matches], tuple[int, int]]:
+    """Positions of the matches of every verified pair of images by their names, and (width, height) of the images."""
     opened = pycolmap.Database.open(database)
     try:
         camera = opened.read_all_cameras()[0]
-        positions = {i.image_id: _positions(opened, i.image_id) for i in opened.read_all_images()}
-        geometries = zip(*opened.read_two_view_geometries(), strict=True)
-        return [_matched(positions, key, g) for key, g in geometries], (camera.width, camera.height)
+        images = opened.read_all_images()
+        names = {i.image_id: i.name for i in images}
+        positions = {i.image_id: _positions(opened, i.image_id) for i in images}
+        found = {}
+        for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(key)
+            matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+            found[names[a], names[b]] = positions[a][matches[:, 0]], positions[b][matches[:, 1]]
+        return found, (camera.width, camera.height)
     finally:
         opened.close()
-
-
-def _matched(positions: Mapping[int, np.ndarray], key: int, geometry: Any) -> Matches:
-    a, b = pycolmap.pair_id_to_image_pair(key)
-    matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
-    return positions[a][matches[:, 0]], positions[b][matches[:, 1]]
 
 
 def _positions(opened: Any, image: int) -> Float[np.ndarray, "K 2"]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.data.lens import Lens
+from warpgs.data.colmap import lens_of
 
 from .cameras import Cameras, NoCamerasError
 
@@ -41,10 +41,14 @@ def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Camer
             "video, or masks of what moves (--masks FOLDER)"
         )
     poses = np.array([i.cam_from_world().matrix() for i in images])
+    try:
+        lens = lens_of(images[0].camera)
+    except ValueError as error:
+        raise NoCamerasError(f"the lens that was found is wrong ({error}): give it (--focal, --intrinsics)") from error
     points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= MAX_ERROR]
     found = Cameras(
         [Path(i.name).stem for i in images],
-        _lens(images[0].camera),
+        lens,
         poses,
         np.array([p.xyz for p in points]).reshape(-1, 3),
         float(model.compute_mean_reprojection_error()),
@@ -69,17 +73,3 @@ def _angle(model: Any, points: list[Any]) -> float:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         largest.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
     return float(np.median(largest)) if largest else 0.0
-
-
-def _lens(camera: Any) -> Lens:
-    """COLMAP's camera as a lens; both measure from the corner of the image."""
-    v: dict[str, float] = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
-    focal = v.get("fx", v.get("f", 0.0))
-    return Lens(
-        camera.width,
-        camera.height,
-        (focal, v.get("fy", focal)),
-        (v["cx"], v["cy"]),
-        (v.get("k1", v.get("k", 0.0)), v.get("k2", 0.0), 0.0),
-        (v.get("p1", 0.0), v.get("p2", 0.0)),
-    )

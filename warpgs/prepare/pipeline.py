@@ -54,7 +54,7 @@ def prepare(
     report = journal.report()
     for note in report["notes"] if was_finished else []:  # the steps have logged them otherwise
         journal.log(f"note: {note}")
-    sheets = "masks.png" if options.depth == "none" else "masks.png and depth.png"
+    sheets = "masks.png" if options.depth_method == "none" else "masks.png and depth.png"
     done = f"{root} is finished: look at {sheets} in it, then run warpgs check {root}"
     journal.log(f"{root} was finished before; --force makes it again" if was_finished else done)
     return report
@@ -89,6 +89,13 @@ def _repair(first: Cameras, masks: Masks, steps: Steps) -> tuple[Cameras, Masks]
     Raises:
         ValueError: If nearly everything still looks dynamic.
     """
+    if steps.options.camera != "moving":
+        if masks.dynamic_fraction > MAX_DYNAMIC_FRACTION:
+            raise ValueError(
+                f"{masks.dynamic_fraction:.0%} of the pixels seem to move: the camera is not {steps.options.camera}; "
+                "try another --camera"
+            )
+        return first, masks
     worst = steps.find_masks("masks, worst only", first, half_size=True)
     try:
         first = steps.recover("cameras, without the worst", first.names, worst, thorough=False)

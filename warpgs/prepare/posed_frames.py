@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from warpgs.data.lens import Lens
 
-from .cameras import Cameras
+from .cameras import Cameras, camera_centers
 from .flow import Flows
 from .images import read_images, resize_to_side
 from .triangulation import MIN_RELATIVE_DEPTH, Observation
@@ -20,6 +20,10 @@ PARALLAX = (4.0, 8.0, 16.0)
 
 WINDOW = 16
 """Number of frames in each temporal direction that neighbours are chosen from."""
+
+
+OFFSETS = (2, 4, 8)
+"""Neighbours in each temporal direction of a camera that stays at one place [frames]."""
 
 
 class PosedFrames:
@@ -74,8 +78,11 @@ class PosedFrames:
     def _neighbours(self, frame: int) -> list[int]:
         """Up to three frames in each temporal direction, the nearest with enough parallax.
 
-        Where the camera hardly moves within the window, the last frame of the window is used.
+        Where the camera hardly moves within the window, the last frame of the window is used. A camera that stays at
+        one place has ``OFFSETS``: what is static is where its rotation takes it.
         """
+        if not np.ptp(camera_centers(self.poses), axis=0).any():
+            return [k for o in OFFSETS for k in (frame - o, frame + o) if 0 <= k < len(self.poses)]
         chosen = []
         for step in (-1, 1):
             offset = 0

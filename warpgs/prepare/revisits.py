@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from .cameras import camera_centers
 from .flow import Flows
 from .posed_frames import PosedFrames
 from .triangulation import Observation, errors, fill_unknown, triangulate
@@ -31,6 +32,9 @@ MIN_SPACING = 3
 
 TOLERANCE = 2.0
 """Error of a static surface in a far frame [px]."""
+
+TIE_BREAK = 1e-7
+"""Cost of a far frame next to another one [radians]; only a camera on a tripod has viewpoints so equal."""
 
 PATCH = 9
 """Side of the patches that are compared [px]."""
@@ -69,7 +73,7 @@ class Revisits:
     def __init__(self, frames: PosedFrames, flows: Flows) -> None:
         self._frames, self._flows = frames, flows
         self._grey = [cv2.GaussianBlur(plane, (0, 0), 1.0).astype(np.float32) for plane in flows.grey]
-        self._centers = -np.einsum("fji,fj->fi", frames.poses[:, :, :3], frames.poses[:, :, 3])
+        self._centers = camera_centers(frames.poses)
 
     def far_frames(self, frame: int, inverse_depth: float) -> list[int]:
         """Frames far away in time that view a scene of this inverse depth from similar viewpoints, best first."""
@@ -82,7 +86,9 @@ class Revisits:
         chosen: list[int] = []
         while len(chosen) < NUM_FAR and np.isfinite(cost).any():
             chosen.append(int(cost.argmin()))
-            cost[np.abs(indices - chosen[-1]) < MIN_SPACING] = np.inf
+            apart = np.abs(indices - chosen[-1])
+            cost += TIE_BREAK * np.exp(-apart / len(poses))  # of equal viewpoints, the farthest in time
+            cost[apart < MIN_SPACING] = np.inf
         return chosen
 
     def evidence(self, frame: int) -> Evidence:

@@ -18,6 +18,7 @@ from .contact_sheet import choose_evenly, contact_sheet, overlay_mask
 from .frames import Frames
 from .images import brighten, read_images
 from .masks import Masks
+from .sphere import points_around
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks; training uses the second with ``--factor 2``."""
@@ -26,6 +27,11 @@ MAX_DYNAMIC_VIEWS = 0.5
 """Fraction of a point's views in dynamic regions above which the point is omitted."""
 
 MIN_STATIC_POINTS = 50
+
+NO_PARALLAX = (
+    "the camera stays at one place: nothing tells how far away surfaces are, so the points lie on a sphere around it "
+    "(unless a network estimates depth), and views from elsewhere are guesses"
+)
 
 DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
@@ -57,7 +63,7 @@ def write_capture(
         OSError: If a file cannot be written; the message names it.
     """
     dynamic = masks.read_dynamic(cameras)
-    cameras = _with_static_points(cameras, dynamic)
+    cameras = _with_static_points(cameras, dynamic, notes)
     writer.held_out(cameras.names, holdout)  # fails before anything is written
     omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
     if omitted:
@@ -72,7 +78,10 @@ def write_capture(
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
 
 
-def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
+def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], notes: list[str]) -> Cameras:
+    if not cameras.have_parallax:
+        notes.append(NO_PARALLAX)
+        return dataclasses.replace(cameras, points=points_around(cameras.undistorted(), dynamic))
     keep = static_points(cameras.undistorted(), dynamic)
     if keep.sum() < MIN_STATIC_POINTS:
         raise ValueError(
@@ -153,9 +162,18 @@ def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: in
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    units, poses = scene_units(cameras.points, cameras.centers), cameras.poses
-    depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
-    writer.write_scene(root, units, cameras.points, *depth_range(depths * units.scale))
+    write_world(root, cameras)
     first = times[cameras.names[0]]
     time_ids = {name: times[name] - first for name in cameras.names}
     writer.write_index(root, time_ids, writer.held_out(cameras.names, holdout))
+
+
+def write_world(root: Path, cameras: Cameras) -> None:
+    """Writes points.npy, and scene.json with the units around them.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    units, poses = scene_units(cameras.points, cameras.centers), cameras.poses
+    depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
+    writer.write_scene(root, units, cameras.points, *depth_range(depths * units.scale))

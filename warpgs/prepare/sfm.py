@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpgs.data.colmap import parameters_of_lens
+from warpgs.data.lens import Lens
 from warpgs.progress import progress_of_steps
 
 from .cameras import Cameras, NoCamerasError
@@ -37,6 +39,8 @@ class Settings:
         weak_features: Whether to use features of low contrast too: more on plain surfaces, but less exact.
         focal: Known focal length [px]; None to find it.
         refine: Whether to refine the cameras that were recovered last in the work folder instead of starting anew.
+        known: The lens of the frames, which is kept; None to find it.
+        turns: Whether the camera only turns.
     """
 
     lens: LensModel = "SIMPLE_RADIAL"
@@ -45,6 +49,8 @@ class Settings:
     weak_features: bool = False
     focal: float | None = None
     refine: bool = False
+    known: Lens | None = None
+    turns: bool = False
 
 
 def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settings, quiet: bool = True) -> Cameras:
@@ -63,11 +69,14 @@ def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settin
         OSError: If the disk is full.
     """
     work.mkdir(parents=True, exist_ok=True)
+    model, params = (settings.lens, None) if settings.known is None else parameters_of_lens(settings.known)
     job = {
         "folder": str(folder.resolve()),
         "names": names,
         "work": str(work.resolve()),
-        "lens": settings.lens,
+        "lens": model,
+        "params": params,
+        "turns": settings.turns,
         "masks": None if settings.masks is None else str(settings.masks.resolve()),
         "thorough": settings.thorough,
         "weak_features": settings.weak_features,

@@ -5,11 +5,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from warpgs.data.lens import Lens
+
 from .cameras import Cameras, NoCamerasError
 from .checks import check_count
 from .depth import DEPTHS, add_depth
 from .frames import Frames, take_frames
 from .given_masks import find_given_masks, read_dynamic
+from .intrinsics import read_intrinsics
 from .journal import Journal
 from .masks import MASKERS, Masks, find_masks, write_masks
 from .options import Options
@@ -24,6 +29,9 @@ CAPTURE_BYTES = 16
 
 FEATURE_BYTES, MASK_BYTES, IMAGE_BYTES, DEPTH_BYTES = 5, 1, 5, 2
 """The same for single steps."""
+
+STILL_FOCAL = 1.0
+"""Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""
 
 
 def take(source: Path, options: Options, journal: Journal) -> Frames:
@@ -64,9 +72,19 @@ class Steps:
         weak_features: bool = False,
     ) -> Cameras:
         """The cameras of the named frames, from features outside of the masks."""
-        settings = Settings(self.options.lens, masks.folder if masks else None, thorough, weak_features, self._focal)
+        settings = Settings(
+            self.options.lens,
+            masks.folder if masks else None,
+            thorough,
+            weak_features,
+            self._focal,
+            known=self._known_lens,
+            turns=self.options.camera == "turning",
+        )
 
         def make(path: Path) -> str:
+            if self.options.camera == "still":
+                return _save(self._still(names), path, names)
             return _save(self._reconstruct(names, settings), path, names)
 
         return self.journal.result(name, Cameras.load, make)
@@ -80,9 +98,13 @@ class Steps:
             weak_features=first.weak_features,
             focal=self._focal,
             refine=True,
+            known=self._known_lens,
+            turns=self.options.camera == "turning",
         )
 
         def make(path: Path) -> str:
+            if self.options.camera == "still":
+                return _save(first, path, first.names)
             try:
                 found = self._reconstruct(first.names, settings)
                 if len(found.names) == len(first.names):
@@ -97,10 +119,29 @@ class Steps:
 
         return self.journal.result(name, Cameras.load, make)
 
+    def _still(self, names: list[str]) -> Cameras:
+        """The cameras of a tripod: all the same."""
+        width, height = self.frames.width, self.frames.height
+        focal = self._focal or STILL_FOCAL * max(width, height)
+        lens = self._known_lens or Lens(width, height, (focal, focal), (width / 2.0, height / 2.0))
+        if self._known_lens is None and self._focal is None:
+            self.journal.notes.append(f"the focal length is assumed, {focal:.0f} px: frames of a tripod do not tell it")
+        poses = np.tile(np.eye(4)[:3], (len(names), 1, 1))
+        return Cameras(names, lens, poses, np.zeros((0, 3)), 0.0, 0.0)
+
     @property
     def _focal(self) -> float | None:
         """Known focal length of the frames [px]."""
         return None if self.options.focal is None else self.options.focal * self.frames.factor
+
+    @property
+    def _known_lens(self) -> Lens | None:
+        """Known lens of the frames."""
+        if self.options.intrinsics is None:
+            return None
+        width, height = self.frames.width, self.frames.height
+        source = round(width / self.frames.factor), round(height / self.frames.factor)
+        return read_intrinsics(self.options.intrinsics, source).resized(width, height)
 
     def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
         """The masks of the cameras' frames."""
@@ -139,7 +180,7 @@ class Steps:
 
     def add_depth(self, name: str, cameras: Cameras) -> None:
         """Adds depth to the capture."""
-        method = DEPTHS[self.options.depth]
+        method = DEPTHS[self.options.depth_method]
 
         def make() -> str:
             if method is None:

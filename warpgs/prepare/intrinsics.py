@@ -1,0 +1,142 @@
+"""Known intrinsics of a lens, from a file of COLMAP (text), OpenCV or ROS (YAML, XML, JSON).
+
+COLMAP's cameras.txt has one line per camera: its id, model, width, height and parameters. OpenCV and ROS write
+``camera_matrix`` and ``distortion_coefficients`` (k1, k2, p1, p2, k3), ``image_width`` and ``image_height``; a fisheye
+lens (k1 to k4) has ``fisheye_model: 1`` in OpenCV's calibration tool, ``distortion_model: equidistant`` in ROS. OpenCV
+measures pixels from the centre of the first one, half a pixel from the corner, where COLMAP and we begin.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from warpgs.data.colmap import lens_of_parameters
+from warpgs.data.lens import Lens
+from warpgs.files import read_bounded, read_json, read_numbers
+
+MAX_BYTES = 1 << 20
+"""Maximum size of a file [bytes]."""
+
+MAX_DIFFERENCE = 0.01
+"""Maximum difference of the aspect ratios of the file's images and the frames: sides are rounded."""
+
+MATRIX, DISTORTION = "camera_matrix", "distortion_coefficients"
+
+KEYS = (MATRIX, DISTORTION, "image_width", "image_height", "distortion_model", "fisheye_model")
+"""Fields that are read; others are ignored."""
+
+SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".xml")
+
+
+def read_intrinsics(path: Path, size: tuple[int, int] | None = None) -> Lens:
+    """The lens that a file describes, in pixels of the source's frames.
+
+    Args:
+        path: cameras.txt of COLMAP, or JSON, YAML or XML of OpenCV.
+        size: (width, height) of the source's frames; None if unknown. The lens is scaled to it if the file is of images
+            of another size and the same aspect ratio.
+
+    Raises:
+        ValueError: If the file is missing or damaged, its camera model cannot be represented, or it is of images of
+            another aspect ratio.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: intrinsics are read from files that end with {', '.join(SUFFIXES)}")
+    if suffix == ".txt":
+        lens = _of_colmap(path)
+    else:
+        lens = _of_opencv(path, read_json(path, max_bytes=MAX_BYTES) if suffix == ".json" else _stored(path), size)
+    if size is None:
+        return lens
+    width, height = size
+    if abs(lens.width * height / (lens.height * width) - 1.0) > MAX_DIFFERENCE:
+        raise ValueError(
+            f"{path} is of images of {lens.width}×{lens.height}, the source's frames are {width}×{height}: "
+            "another aspect ratio, so it cannot be scaled to them"
+        )
+    return lens.resized(width, height)
+
+
+def _of_colmap(path: Path) -> Lens:
+    text = read_bounded(path, MAX_BYTES).decode("utf-8", "replace")
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    if len(lines) != 1 or len(lines[0]) < 5:
+        raise ValueError(f"{path} must have one line with a camera's id, model, width, height and parameters")
+    _, model, width, height, *params = lines[0]
+    try:
+        return lens_of_parameters(model, (int(width), int(height)), [float(p) for p in params])
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """The fields of a YAML or XML file, by OpenCV."""
+    text = read_bounded(path, MAX_BYTES).decode("utf-8", "replace")
+    if path.suffix.lower() != ".xml" and not text.startswith("%YAML"):
+        text = "%YAML:1.0\n---\n" + text.removeprefix("---")  # ROS leaves out the first line
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        nodes = {key: storage.getNode(key) for key in KEYS}
+        return {key: _plain(node) for key, node in nodes.items() if not node.empty()}
+    except (cv2.error, SystemError) as error:
+        raise ValueError(f"{path} is not a file of OpenCV: {str(error).splitlines()[0]}") from error
+
+
+def _plain(node: Any) -> Any:
+    """A number, a string, or the numbers of a sequence or a matrix."""
+    if node.isMap():
+        node = node.getNode("data")
+    if node.isSeq():
+        return [node.at(k).real() for k in range(node.size())]
+    return node.string() if node.isString() else node.real()
+
+
+def _of_opencv(path: Path, fields: dict[str, Any], size: tuple[int, int] | None) -> Lens:
+    matrix = _numbers(path, fields, MATRIX)
+    if len(matrix) != 9:
+        raise ValueError(f"{path}: {MATRIX} must hold 9 numbers, got {len(matrix)}")
+    fx, skew, cx, _, fy, cy, *_ = matrix.tolist()
+    if skew:
+        raise ValueError(f"{path}: cameras must have no skew, got {skew}")
+    is_fisheye = fields.get("distortion_model") in ("equidistant", "fisheye") or bool(fields.get("fisheye_model"))
+    most, meaning = (4, "k1 to k4") if is_fisheye else (5, "k1, k2, p1, p2, k3")
+    bent = _numbers(path, {DISTORTION: [], **fields}, DISTORTION)
+    if bent[most:].any():
+        raise ValueError(f"{path}: {DISTORTION} may have {meaning}, got {bent.tolist()}")
+    k1, k2, a, b, k3 = [*bent[:most].tolist(), *[0.0] * 5][:5]
+    if "image_width" in fields or "image_height" in fields:
+        size = round(_number(path, fields, "image_width")), round(_number(path, fields, "image_height"))
+    width, height = size or (round(2.0 * cx) + 1, round(2.0 * cy) + 1)  # only to check the file: no frames yet
+    plain = Lens(width, height, (fx, fy), (cx + 0.5, cy + 0.5))
+    bent_lens = replace(plain, radial=(k1, k2, k3), tangential=(a, b))
+    try:
+        return (replace(plain, fisheye=(k1, k2, a, b)) if is_fisheye else bent_lens).checked()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _number(path: Path, fields: dict[str, Any], key: str) -> float:
+    return float(read_numbers(path, fields, key, ()))
+
+
+def _numbers(path: Path, fields: dict[str, Any], key: str) -> Float[np.ndarray, " N"]:
+    """The numbers of a matrix, as OpenCV or ROS writes it, or as nested lists."""
+    if key not in fields:
+        raise ValueError(f"{path} has no {key}")
+    given = fields[key]["data"] if isinstance(fields[key], dict) and "data" in fields[key] else fields[key]
+    flat = list(_flat(given))
+    return read_numbers(path, {key: flat}, key, (len(flat),)) if flat else np.zeros(0)
+
+
+def _flat(given: Any) -> Iterator[Any]:
+    """The entries of lists in lists, three deep at most, which is what matrices need."""
+    rows = given if isinstance(given, list) else [given]
+    for row in rows:
+        for entry in row if isinstance(row, list) else [row]:
+            yield from entry if isinstance(entry, list) else [entry]

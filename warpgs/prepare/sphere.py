@@ -1,0 +1,49 @@
+"""Points of a capture whose camera stays at one place: on a sphere around it, or as far away as a network says."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .cameras import Cameras
+from .methods import Planes
+
+MAX_FRAMES, GRID = 40, 24
+"""Number of frames that points are taken from, and of points across each of them."""
+
+MAX_DISTANCE = 5.0
+"""Distance of the farthest points, over the median: inverse depth of a network reaches 0."""
+
+
+def points_around(
+    cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], planes: Planes | None = None
+) -> Float[np.ndarray, "P 3"]:
+    """[P, 3] points in static regions, evenly spread over the frames.
+
+    Args:
+        cameras: Cameras at the origin, with a pinhole lens.
+        dynamic: [H, W] dynamic mask of each.
+        planes: [h, w] inverse depth of each frame, in any size; each frame's median is at distance 1. Without any, all
+            points are at distance 1, which is as good as any other: nothing tells it.
+    """
+    lens, points = cameras.lens, []
+    across, down = GRID, max(2, round(GRID * lens.height / lens.width))
+    u, v = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
+    x, y = lens.unproject(u * lens.width, v * lens.height)
+    rays = np.stack([x, y, np.ones_like(x)], -1)
+    chosen = np.linspace(0, len(cameras.names) - 1, min(MAX_FRAMES, len(cameras.names))).round().astype(int)
+    for k in np.unique(chosen):
+        static = ~_at(dynamic[k], u, v)
+        if planes is None:
+            placed = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        else:
+            relative = _at(planes[k], u, v) / np.nanmedian(planes[k])
+            placed = rays / np.maximum(relative, 1.0 / MAX_DISTANCE)[..., None]
+            static &= np.isfinite(relative)
+        points.append(placed[static] @ cameras.poses[k, :, :3])
+    return np.concatenate(points).astype(np.float64)
+
+
+def _at(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The values of a plane at positions relative to its size."""
+    return plane[(v * plane.shape[0]).astype(int), (u * plane.shape[1]).astype(int)]
