@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.export import scenes
+from warpgs.data.ply import read_ply
 from warpgs.export.compressed import read_compressed, write_compressed
-from warpgs.export.ply import read_ply, write_ply
+from warpgs.export.ply import write_ply
 from warpgs.model.gaussians import SH_C0
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from tests.export import scenes
+from warpgs.data.ply import read_ply
 from warpgs.export import compressed, ply, standard
 
 TABLE = np.array([(1.5, 7, 255), (-2.0, 8, 0)], [("x", "<f4"), ("word", "<u4"), ("byte", "u1")])
-READERS = [ply.read_ply, standard.read_standard, compressed.read_compressed]
+READERS = [read_ply, standard.read_standard, compressed.read_compressed]
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ BINARY = "format binary_little_endian 1.0"
 
 def test_tables_are_read_back_exactly(path):
     size = ply.write_ply(path, {"vertex": TABLE, "other": TABLE[:1]})
-    back = ply.read_ply(path)
+    back = read_ply(path)
     assert list(back) == ["vertex", "other"]
     assert (back["vertex"] == TABLE).all()
     assert (back["other"] == TABLE[:1]).all()
@@ -35,12 +36,12 @@ def test_tables_are_read_back_exactly(path):
 
 def test_an_empty_table_is_read_back(path):
     ply.write_ply(path, {"vertex": TABLE[:0]})
-    assert len(ply.read_ply(path)["vertex"]) == 0
+    assert len(read_ply(path)["vertex"]) == 0
 
 
 def test_comments_and_both_names_of_types_are_read(path):
     write(path, [BINARY, "comment any text", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?")
-    assert ply.read_ply(path)["vertex"]["x"].tolist() == [1.0]
+    assert read_ply(path)["vertex"]["x"].tolist() == [1.0]
 
 
 @pytest.mark.parametrize(
@@ -82,18 +83,33 @@ def test_an_invalid_file_is_refused_in_one_line(path, header, data, message, rea
 def test_files_of_other_types_are_refused(path, data):
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"a\.ply is not a PLY file"):
-        ply.read_ply(path)
+        read_ply(path)
 
 
 def test_a_header_without_an_end_is_refused(path):
     path.write_bytes(b"ply\n" + b"comment x\n" * 20_000)
     with pytest.raises(ValueError, match="has no PLY header"):
-        ply.read_ply(path)
+        read_ply(path)
+
+
+def test_a_header_of_windows_lines_is_read(path):
+    path.write_bytes(
+        b"ply\r\n" + BINARY.encode() + b"\r\nelement vertex 1\r\nproperty float x\r\nend_header\r\n\0\0\x80?"
+    )
+    assert read_ply(path)["vertex"]["x"].tolist() == [1.0]
+
+
+def test_lists_of_faces_are_left_out_where_only_vertices_are_read(path):
+    faces = ["element face 3", "property list uchar int vertex_indices"]
+    write(path, [BINARY, "element vertex 1", "property float x", *faces], b"\0\0\x80?" + bytes(39))
+    assert read_ply(path, first_only=True)["vertex"]["x"].tolist() == [1.0]
+    with pytest.raises(ValueError, match="header line that is not supported: 'property list"):
+        read_ply(path)
 
 
 def test_a_missing_file_is_refused(path):
     with pytest.raises(ValueError, match="is missing"):
-        ply.read_ply(path)
+        read_ply(path)
 
 
 @pytest.mark.parametrize("count", [10**9, 10**15 - 1])
@@ -101,7 +117,7 @@ def test_a_huge_count_allocates_no_memory(path, count):
     write(path, [BINARY, f"element vertex {count}", "property double x"], bytes(64))
     tracemalloc.start()
     with pytest.raises(ValueError, match="is truncated"):
-        ply.read_ply(path)
+        read_ply(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1 << 20

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from tests.export import scenes
+from warpgs.data.ply import read_ply
 from warpgs.export.compressed import write_compressed
-from warpgs.export.ply import read_ply, write_ply
+from warpgs.export.ply import write_ply
 from warpgs.export.standard import columns, read_standard, write_standard
 
 COLUMNS = columns(15)

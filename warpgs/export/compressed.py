@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.data.ply import read_ply
 from warpgs.model.gaussians import SH_C0
 
 from .cloud import Cloud, logit, sigmoid
 from .packing import dequantise, pack, pack_rotations, quantise, unpack, unpack_rotations
-from .ply import column, read_ply, write_ply
+from .ply import column, write_ply
 from .standard import num_rest, render_mode
 
 CHUNK = 256
