@@ -84,15 +84,20 @@ def triangulate(observations: Sequence[Observation], focal: float) -> LocalGeome
     shape = observations[0].visible.shape
     rho = np.full(shape, 1e-3, np.float32)
     weights = [o.visible.astype(np.float32) for o in observations]
+    # The squares and products of an observation's two equations, without the weights and depths that change.
+    squares, products = [], []
+    for o in observations:
+        slopes = [o.position[axis] * o.translation[2] - o.translation[axis] for axis in (0, 1)]
+        sides = [o.rotated[axis] - o.position[axis] * o.rotated[2] for axis in (0, 1)]
+        squares.append(slopes[0] * slopes[0] + slopes[1] * slopes[1])
+        products.append(slopes[0] * sides[0] + slopes[1] * sides[1])
     for _ in range(NUM_REWEIGHTINGS):
         top, bottom = np.zeros(shape, np.float32), np.full(shape, 1e-12, np.float32)
-        for o, weight in zip(observations, weights, strict=True):
+        for o, weight, square, product in zip(observations, weights, squares, products, strict=True):
             depth = np.maximum(o.rotated[2] + rho * o.translation[2], MIN_RELATIVE_DEPTH)
-            weight = weight / depth**2
-            for axis in range(2):
-                slope = o.position[axis] * o.translation[2] - o.translation[axis]
-                top += weight * slope * (o.rotated[axis] - o.position[axis] * o.rotated[2])
-                bottom += weight * slope * slope
+            weight = weight / (depth * depth)
+            top += weight * product
+            bottom += weight * square
         rho = np.maximum(top / bottom, 1e-6)
         distances = [errors(o, rho, focal) for o in observations]
         weights = [o.visible / np.maximum(e, FLOW_NOISE) for o, e in zip(observations, distances, strict=True)]
