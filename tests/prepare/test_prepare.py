@@ -21,6 +21,7 @@ from warpgs.prepare.cameras import Cameras, NoCamerasError
 from warpgs.prepare.given_masks import read_dynamic
 from warpgs.prepare.journal import Journal
 from warpgs.prepare.options import Options, Selection
+from warpgs.prepare.sphere import points_around
 
 
 def prepare(source, root, force=False, **options):
@@ -131,6 +132,24 @@ def test_what_moves_before_a_camera_that_turns_is_masked_and_depth_places_the_po
     assert set(np.round((depths / depths.max()).numpy(), 2).tolist()) == {0.75, 1.0}
     assert capture.frame("frame_000000").inverse_depth is not None
     assert check_capture(tmp_path / "made").is_fit
+
+
+def test_depth_that_says_nothing_places_no_points():
+    cameras = Cameras(["a", "b", "c"], boards.lens(), np.tile(np.eye(4)[:3], (3, 1, 1)), np.zeros((0, 3)), 0.0, 0.0)
+    masks = [np.zeros(boards.SIZE[::-1], bool)] * 3
+    planes = [np.full((6, 8), np.nan), np.zeros((6, 8)), np.full((6, 8), 2.0)]
+    count = len(points_around(cameras, masks))
+    assert len(points_around(cameras, masks, planes)) == count // 3
+    assert len(points_around(cameras, masks, planes[:2] * 2)) == 0
+    assert len(points_around(cameras, [~mask for mask in masks])) == 0
+
+
+def test_masks_of_everything_leave_no_points_around_a_tripod(shots, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for path in shots.iterdir():
+        cv2.imwrite(str(tmp_path / "masks" / path.name), np.zeros(boards.SIZE[::-1], np.uint8))
+    with pytest.raises(ValueError, match=r"only 0 static points are left: nearly everything moves"):
+        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), camera="still")
 
 
 def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):

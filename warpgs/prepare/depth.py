@@ -85,10 +85,12 @@ def add_depth(
 
 
 def _place_points(root: Path, cameras: Cameras, planes: Planes) -> None:
-    """Writes the points of a camera that stays at one place as far away as its depth says."""
+    """Writes the points of a camera that stays at one place as far away as its depth says, if it says anything."""
     pinhole = cameras.undistorted()
     masks = list(_dynamic_masks(root, cameras, (cameras.lens.width, cameras.lens.height)))
-    write_world(root, dataclasses.replace(pinhole, points=points_around(pinhole, masks, planes)))
+    points = points_around(pinhole, masks, planes)
+    if len(points):
+        write_world(root, dataclasses.replace(pinhole, points=points))
 
 
 def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:

@@ -81,14 +81,15 @@ def write_capture(
 def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], notes: list[str]) -> Cameras:
     if not cameras.have_parallax:
         notes.append(NO_PARALLAX)
-        return dataclasses.replace(cameras, points=points_around(cameras.undistorted(), dynamic))
-    keep = static_points(cameras.undistorted(), dynamic)
-    if keep.sum() < MIN_STATIC_POINTS:
+        points = points_around(cameras.undistorted(), dynamic)
+    else:
+        points = cameras.points[static_points(cameras.undistorted(), dynamic)]
+    if len(points) < MIN_STATIC_POINTS:
         raise ValueError(
-            f"only {int(keep.sum())} static points are left: nearly everything moves, or the masks are inverted "
+            f"only {len(points)} static points are left: nearly everything moves, or the masks are inverted "
             "(0 = dynamic)"
         )
-    return dataclasses.replace(cameras, points=cameras.points[keep])
+    return dataclasses.replace(cameras, points=points)
 
 
 def static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, " P"]:

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .cameras import Cameras
-from .methods import Planes
 
 MAX_FRAMES, GRID = 40, 24
 """Number of frames that points are taken from, and of points across each of them."""
@@ -16,15 +15,17 @@ MAX_DISTANCE = 5.0
 
 
 def points_around(
-    cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], planes: Planes | None = None
+    cameras: Cameras,
+    dynamic: Sequence[Bool[np.ndarray, "H W"]],
+    planes: Sequence[Float[np.ndarray, "h w"]] | None = None,
 ) -> Float[np.ndarray, "P 3"]:
     """[P, 3] points in static regions, evenly spread over the frames.
 
     Args:
         cameras: Cameras at the origin, with a pinhole lens.
         dynamic: [H, W] dynamic mask of each.
-        planes: [h, w] inverse depth of each frame, in any size; each frame's median is at distance 1. Without any, all
-            points are at distance 1, which is as good as any other: nothing tells it.
+        planes: [h, w] inverse depth of each frame, in any size; each frame's median is at distance 1, and frames
+            without any give no points. If None, all points are at distance 1: nothing tells another one.
     """
     lens, points = cameras.lens, []
     across, down = GRID, max(2, round(GRID * lens.height / lens.width))
@@ -37,11 +38,14 @@ def points_around(
         if planes is None:
             placed = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         else:
-            relative = _at(planes[k], u, v) / np.nanmedian(planes[k])
+            known = planes[k][np.isfinite(planes[k])]
+            if not len(known) or not np.median(known) > 0.0:
+                continue
+            relative = _at(planes[k], u, v) / np.median(known)
             placed = rays / np.maximum(relative, 1.0 / MAX_DISTANCE)[..., None]
             static &= np.isfinite(relative)
         points.append(placed[static] @ cameras.poses[k, :, :3])
-    return np.concatenate(points).astype(np.float64)
+    return np.concatenate([np.zeros((0, 3)), *points])
 
 
 def _at(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
