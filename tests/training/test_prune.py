@@ -225,3 +225,9 @@ def test_a_fraction_of_zero_removes_what_contributes_nothing():
     weights[5] = 0.0
     assert prune_weakest(scene, optimizer, weights, 0.0) == 1
     assert len(scene.static) == 59
+
+
+def test_if_no_gaussian_contributes_all_stay():
+    scene, optimizer = make_scene_and_optimizer(random_gaussians())
+    assert prune_weakest(scene, optimizer, torch.zeros(60), 0.02) == 0
+    assert len(scene.static) == 60

@@ -116,6 +116,8 @@ def blend_weights(scene: SplitScene, views: Views, phase: Phase, antialias: bool
 def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], fraction: float) -> int:
     """Removes the Gaussians with the smallest weights, which hold at most a fraction of all; returns their number.
 
+    If none has any weight, all stay: what no view shows may still be shown later.
+
     Args:
         scene: Changed in place, together with the optimizer's moments.
         optimizer: From ``optimizer.make_optimizer``.
@@ -124,7 +126,8 @@ def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N
     """
     ascending, order = weights.double().sort()
     kept = torch.ones_like(weights, dtype=torch.bool)
-    kept[order[ascending.cumsum(0) <= fraction * ascending.sum()]] = False
+    total = ascending.sum()
+    kept[order[(ascending.cumsum(0) <= fraction * total) & (total > 0)]] = False
     branches = (scene.static, scene.dynamic)
     for gaussians, keeps in zip(branches, kept.split([len(gaussians) for gaussians in branches]), strict=True):
         indices = keeps.nonzero()[:, 0]
