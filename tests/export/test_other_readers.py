@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from tests.export import node, scenes
+from warpgs.data.ply import read_ply
 from warpgs.export import orientation
 from warpgs.export.cloud import Cloud, logit, sigmoid
 from warpgs.export.compressed import write_compressed
 from warpgs.export.gltf import write_glb
-from warpgs.export.ply import read_ply
 from warpgs.export.sog import write_sog
 from warpgs.export.spz import write_spz, write_spz_gzip
 from warpgs.export.standard import read_standard, write_standard
