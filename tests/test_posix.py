@@ -53,6 +53,7 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     monkeypatch.delattr(posix.ctypes, "CDLL")
     posix.lower_priority(10)
     posix.unblock_interrupts()
+    posix.share_free_memory()
     posix.release_free_memory()
     assert posix.end_with_parent(os.getppid())
     assert not posix.end_with_parent(-1)
@@ -61,12 +62,12 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     assert child.returncode == -signal.SIGTERM
 
 
-def test_free_memory_is_returned_only_by_the_c_library_that_can(monkeypatch):
+def test_free_memory_is_shared_and_returned_only_by_the_c_library_that_can(monkeypatch):
     calls = []
+    glibc = SimpleNamespace(malloc_trim=calls.append, mallopt=lambda *option: calls.append(option))
     monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setattr(posix.ctypes, "CDLL", lambda name: SimpleNamespace(malloc_trim=calls.append))
-    posix.release_free_memory()
-    assert calls == [0]
-    monkeypatch.setattr(posix.ctypes, "CDLL", lambda name: SimpleNamespace())  # musl
-    posix.release_free_memory()
-    assert calls == [0]
+    for library in (glibc, SimpleNamespace()):  # the second is musl
+        monkeypatch.setattr(posix.ctypes, "CDLL", lambda name, library=library: library)
+        posix.share_free_memory()
+        posix.release_free_memory()
+    assert calls == [(posix.M_ARENA_MAX, 1), 0]

@@ -8,9 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+from typing import Any
 
 PR_SET_PDEATHSIG = 1
 """From <linux/prctl.h>: the signal that a process gets when its parent dies."""
+
+
+M_ARENA_MAX = -8
+"""From <malloc.h> of glibc: the option that limits its number of pools of memory."""
 
 
 def lower_priority(niceness: int) -> None:
@@ -33,13 +38,19 @@ def end_with_parent(parent: int) -> bool:
     return os.getppid() == parent
 
 
+def share_free_memory() -> None:
+    """Lets all threads take memory from one pool, with glibc; by default each may keep free memory of its own."""
+    if sys.platform == "linux" and (option := getattr(ctypes.CDLL(None), "mallopt", None)):
+        option(M_ARENA_MAX, 1)
+
+
 def release_free_memory() -> None:
     """Returns memory that the C library keeps for every thread after it ended to the system, with glibc."""
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
         trim(0)
 
 
-def interrupt(process: subprocess.Popen[bytes]) -> None:
+def interrupt(process: subprocess.Popen[Any]) -> None:
     """Asks a child process to stop, as Ctrl-C does; on Windows, which cannot, it is ended."""
     if sys.platform == "win32":
         process.terminate()

@@ -95,7 +95,7 @@ def _elements(path: Path, header: bytes, formats: Collection[str]) -> tuple[str,
     """Byte order, and the elements that a header declares."""
     elements: dict[str, _Element] = {}
     format_name = ""
-    for line in header.decode("latin-1").splitlines()[1:]:
+    for line in header.decode("latin-1").split("\n")[1:]:
         last = elements[next(reversed(elements))] if elements else None
         match line.split():
             case ["format", name, "1.0"]:

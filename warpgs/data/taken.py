@@ -39,7 +39,7 @@ def taken_frame(frame: Frame, lens: Lens) -> TakenFrame:
 
 
 def taken_reader(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens]) -> Callable[[str], TakenFrame] | None:
-    """Reads frames as they were taken; None if no lens distorts, or one is a fisheye.
+    """Reads frames as they were taken; None if no lens distorts. Fisheye frames raise a ValueError.
 
     A pinhole camera that sees what a fisheye sees would be far larger than the frame.
 
@@ -47,9 +47,15 @@ def taken_reader(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens])
         read: Reads a frame, undistorted as for a lens.
         lenses: The lens of each frame.
     """
-    if all(lens.is_pinhole for lens in lenses.values()) or any(lens.fisheye for lens in lenses.values()):
+    if all(lens.is_pinhole for lens in lenses.values()):
         return None
-    return lambda name: taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
+
+    def read_taken(name: str) -> TakenFrame:
+        if lenses[name].fisheye:
+            raise ValueError(f"frame {name} was taken by a fisheye lens: it can only be evaluated undistorted")
+        return taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
+
+    return read_taken
 
 
 @lru_cache(maxsize=4)

@@ -23,6 +23,11 @@ class NoCamerasError(ValueError):
     """The cameras cannot be recovered from the frames."""
 
 
+def are_apart(centers: Float[np.ndarray, "F 3"]) -> bool:
+    """Whether cameras are at different places, by more than the rounding of their files."""
+    return bool(np.ptp(centers, axis=0).max() > 1e-6 * (1.0 + np.abs(centers).max()))
+
+
 @dataclass(frozen=True)
 class Cameras:
     """Posed frames of one lens, and sparse points.
@@ -53,7 +58,7 @@ class Cameras:
     @property
     def have_parallax(self) -> bool:
         """Whether they are at different places."""
-        return bool(np.ptp(self.centers, axis=0).any())
+        return are_apart(self.centers)
 
     def undistorted(self) -> "Cameras":
         """The cameras of the undistorted frames."""

@@ -28,8 +28,12 @@ def check_options(source: Path, root: Path, options: Options) -> None:
         raise ValueError(f"--focal must be positive, got {options.focal}")
     if options.intrinsics is not None:
         if options.focal is not None or options.lens != Options().lens:
-            raise ValueError("--intrinsics says all about the lens: leave out --focal and --lens")
+            raise ValueError("--intrinsics says all about the lens: omit --focal and --lens")
         read_intrinsics(options.intrinsics)
+    if options.camera != "moving" and options.lens != Options().lens:
+        raise ValueError(
+            f"--lens {options.lens} needs a camera that moves: with --camera {options.camera}, use --intrinsics"
+        )
     check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
         raise ValueError(f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder")

@@ -6,6 +6,7 @@ lens (k1 to k4) has ``fisheye_model: 1`` in OpenCV's calibration tool, ``distort
 measures pixels from the centre of the first one, half a pixel from the corner, where COLMAP and we begin.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,9 @@ from warpgs.files import read_bounded, read_json, read_numbers
 
 MAX_BYTES = 1 << 20
 """Maximum size of a file [bytes]."""
+
+MAX_NESTING = 40
+"""Maximum depth of what a YAML or XML file nests."""
 
 MAX_DIFFERENCE = 0.01
 """Maximum difference of the aspect ratios of the file's images and the frames: sides are rounded."""
@@ -77,9 +81,10 @@ def _of_colmap(path: Path) -> Lens:
 
 def _stored(path: Path) -> dict[str, Any]:
     """The fields of a YAML or XML file, by OpenCV."""
-    text = read_bounded(path, MAX_BYTES).decode("utf-8", "replace")
+    text = read_bounded(path, MAX_BYTES).decode("utf-8-sig", "replace")
+    _check_nesting(path, text)
     if path.suffix.lower() != ".xml" and not text.startswith("%YAML"):
-        text = "%YAML:1.0\n---\n" + text.removeprefix("---")  # ROS leaves out the first line
+        text = "%YAML:1.0\n---\n" + text.removeprefix("---")  # ROS omits the first line
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {key: storage.getNode(key) for key in KEYS}
@@ -88,12 +93,23 @@ def _stored(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not a file of OpenCV: {str(error).splitlines()[0]}") from error
 
 
+def _check_nesting(path: Path, text: str) -> None:
+    """Refuses what is nested so deep that OpenCV's parser, which is recursive, would use up the stack."""
+    depth = deepest = 0
+    for opened, closed in re.findall(r"([\[{]|<[^/?!][^>]*(?<!/)>)|([\]}]|</)", text):
+        depth += bool(opened) - bool(closed)
+        deepest = max(deepest, depth)
+    steps = (len(found) for found in re.findall(r"^(?: |- ?|\? )+", text, re.MULTILINE))
+    if max(deepest, max(steps, default=0) // 2) > MAX_NESTING:
+        raise ValueError(f"{path} is nested deeper than {MAX_NESTING} levels")
+
+
 def _plain(node: Any) -> Any:
     """A number, a string, or the numbers of a sequence or a matrix."""
     if node.isMap():
         node = node.getNode("data")
     if node.isSeq():
-        return [node.at(k).real() for k in range(node.size())]
+        return [_plain(node.at(k)) for k in range(node.size())]
     return node.string() if node.isString() else node.real()
 
 

@@ -77,6 +77,7 @@ class Journal:
             ) from error
         if state.get("version") != VERSION and "finished" not in done:
             return {}, []  # the intermediate files of an earlier version differ
+        begun = {"camera": "moving", **begun}  # the only one before there was the option
         changed = [key for key in self._options if begun.get(key) != self._options[key]]
         if changed and "capture" in done:
             raise ValueError(

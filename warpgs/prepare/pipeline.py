@@ -46,8 +46,8 @@ def prepare(
     """
     options = options or Options()
     check_options(source, root, options)
-    plain = json.loads(json.dumps({"source": source, **asdict(options)}, default=lambda path: str(path.resolve())))
-    journal = Journal(root, plain, force, log)
+    chosen = {"source": source, **asdict(options), "depth": options.depth_method}
+    journal = Journal(root, json.loads(json.dumps(chosen, default=lambda p: str(p.resolve()))), force, log)
     if not (was_finished := journal.is_finished):
         with journal.explain_full_disk():
             _run_steps(source, options, journal)

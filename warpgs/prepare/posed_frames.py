@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from warpgs.data.lens import Lens
 
-from .cameras import Cameras, camera_centers
+from .cameras import Cameras, are_apart, camera_centers
 from .flow import Flows
 from .images import read_images, resize_to_side
 from .triangulation import MIN_RELATIVE_DEPTH, Observation
@@ -81,7 +81,7 @@ class PosedFrames:
         Where the camera hardly moves within the window, the last frame of the window is used. A camera that stays at
         one place has ``OFFSETS``: what is static is where its rotation takes it.
         """
-        if not np.ptp(camera_centers(self.poses), axis=0).any():
+        if not are_apart(camera_centers(self.poses)):
             return [k for o in OFFSETS for k in (frame - o, frame + o) if 0 <= k < len(self.poses)]
         chosen = []
         for step in (-1, 1):

@@ -69,9 +69,10 @@ def write(folder: Path, scene: TrainedScene, state: State) -> None:
 
 
 def remove(folder: Path) -> None:
-    """Removes what ``write`` and ``request`` leave."""
+    """Removes what ``write`` and ``request`` leave, as far as the disk allows it."""
     for name in (REQUEST, SCENE, STATE):
-        (folder / name).unlink(missing_ok=True)
+        with suppress(OSError):
+            (folder / name).unlink()
 
 
 def read_state(folder: Path) -> State | None:

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.posix import share_free_memory
+
 
 @dataclass(frozen=True)
 class View:
@@ -26,6 +28,7 @@ class View:
 
     def run(self) -> None:
         """Serves until Ctrl-C; raises as ``serve``."""
+        share_free_memory()  # before there are threads, of which every visit has some of its own
         from .serve import serve
 
         serve(self, report=partial(print, flush=True), warn=partial(print, file=sys.stderr))

@@ -1,6 +1,5 @@
 """The keyframes that one browser collects: added, edited, previewed, saved, loaded and rendered."""
 
-import signal
 import subprocess
 import sys
 import threading
@@ -14,6 +13,7 @@ import viser
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.errors import one_line
+from warpgs.posix import interrupt
 from warpgs.runs.run import Run
 from warpgs.video import keyframes
 
@@ -90,7 +90,7 @@ class PathEditor:
             if self._preview_ended is not None:
                 self._preview_ended.set()
         if self._child is not None:
-            self._child.send_signal(signal.SIGINT)  # as Ctrl-C: it removes what it has written of the video
+            interrupt(self._child)  # as Ctrl-C: it removes what it has written of the video
 
     # Keyframes --------------------------------------------------------------------------------------------------------
 

@@ -261,17 +261,17 @@ class Session:
 
     def _run(self) -> None:
         while not self._stopped.is_set():
-            if self._wants_screenshot.is_set():
-                self._wants_screenshot.clear()
-                self._send_screenshot()
             try:
+                if self._wants_screenshot.is_set():
+                    self._wants_screenshot.clear()
+                    self._send_screenshot()
                 wait = self._update_image()
             except (ValueError, RuntimeError) as error:  # out of memory is a RuntimeError
                 self._problem, wait = str(error), IDLE_SECONDS
             self._update_status()
             if wait and self._wake.wait(wait):
                 self._wake.clear()
-        release_free_memory()  # every visit has threads of its own
+        release_free_memory()
 
     def _update_image(self) -> float:
         """Renders an image if it would be better than the one shown; returns how long to wait for the next [s]."""
