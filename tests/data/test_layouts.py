@@ -230,7 +230,8 @@ def test_fisheye_images_of_nerfstudio_are_undistorted(edited, fields):
     name = layouts.NAMES[2]
     assert np.array_equal(capture.frame(name).image.numpy(), undistort(layouts.image(2), lens))
     assert not np.array_equal(capture.frame(name).image.numpy(), layouts.image(2))
-    assert capture.read_taken is None
+    with pytest.raises(ValueError, match=f"frame {name} was taken by a fisheye lens: it can only be evaluated undist"):
+        capture.read_taken(name)
 
 
 @pytest.mark.parametrize(

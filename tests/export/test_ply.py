@@ -40,7 +40,9 @@ def test_an_empty_table_is_read_back(path):
 
 
 def test_comments_and_both_names_of_types_are_read(path):
-    write(path, [BINARY, "comment any text", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?")
+    write(
+        path, [BINARY, "comment any text by Åsa", "obj_info x", "element vertex 1", "property float32 x"], b"\0\0\x80?"
+    )
     assert read_ply(path)["vertex"]["x"].tolist() == [1.0]
 
 

@@ -194,6 +194,16 @@ def test_a_finished_capture_is_not_changed(made, shots):
     assert (made / "dataset.json").stat().st_mtime_ns == before
 
 
+def test_a_capture_finished_before_there_was_an_option_stays_finished(made, shots):
+    path = made / ".prepare" / "state.json"
+    state = json.loads(path.read_text())
+    del state["options"]["camera"]
+    copy = path.read_text()
+    path.write_text(json.dumps(state))
+    prepare(shots, made, holdout=8)
+    path.write_text(copy)
+
+
 def test_other_options_require_force(made, shots):
     with pytest.raises(ValueError, match=r"other options \(holdout\).*--force"):
         prepare(shots, made, holdout=4)
@@ -403,9 +413,10 @@ def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
         ({"depth": "lidar"}, "--depth must be one of flow, anything, none, got lidar"),
         ({"selection": Selection(count=1)}, "--count"),
         ({"camera": "turning", "depth": "flow"}, "--depth flow needs a camera that moves, with --camera turning there"),
+        ({"camera": "turning", "lens": "OPENCV_FISHEYE"}, "--lens OPENCV_FISHEYE needs a camera that moves"),
         ({"intrinsics": Path("no.json")}, r"no\.json is missing"),
-        ({"intrinsics": Path("no.json"), "focal": 5.0}, "says all about the lens: leave out --focal and --lens"),
-        ({"intrinsics": Path("no.json"), "lens": "OPENCV"}, "leave out --focal and --lens"),
+        ({"intrinsics": Path("no.json"), "focal": 5.0}, "says all about the lens: omit --focal and --lens"),
+        ({"intrinsics": Path("no.json"), "lens": "OPENCV"}, "omit --focal and --lens"),
     ],
 )
 def test_invalid_options_are_refused(options, word, shots, tmp_path):
