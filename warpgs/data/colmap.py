@@ -91,11 +91,13 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
         raise ValueError(f"the camera model {model} is not supported; first run colmap image_undistorter")
     if len(params) != NUM_PARAMETERS[model]:
         raise ValueError(f"{model} has {NUM_PARAMETERS[model]} parameters, got {len(params)}")
-    fx, fy, cx, cy, *bent = (params[0], *params) if model in SIMPLE else params
-    bent = [*bent, *[0.0] * 5]
+    fx, fy, cx, cy, *distortion = (params[0], *params) if model in SIMPLE else params
+    distortion = [*distortion, *[0.0] * 5]
     if model.endswith("FISHEYE"):
-        return Lens(*size, (fx, fy), (cx, cy), fisheye=(bent[0], bent[1], bent[2], bent[3])).checked()
-    k1, k2, p1, p2, k3 = bent[:5]
+        return Lens(
+            *size, (fx, fy), (cx, cy), fisheye=(distortion[0], distortion[1], distortion[2], distortion[3])
+        ).checked()
+    k1, k2, p1, p2, k3 = distortion[:5]
     return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()
 
 

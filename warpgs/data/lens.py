@@ -93,7 +93,7 @@ class Lens:
         if self.fisheye is not None:
             r = np.hypot(x, y)
             theta = np.arctan(r)
-            d = np.where(r > 0.0, _bent(theta, self.fisheye) / np.where(r > 0.0, r, 1.0), 1.0)
+            d = np.where(r > 0.0, _image_radius(theta, self.fisheye) / np.where(r > 0.0, r, 1.0), 1.0)
             return np.stack([self.focal[0] * x * d + self.center[0], self.focal[1] * y * d + self.center[1]])
         k1, k2, k3 = self.radial
         p1, p2 = self.tangential
@@ -109,12 +109,14 @@ class Lens:
         """x, y on the plane z = 1 that the lens sees at u, v: the inverse of ``image``, up to ``MAX_ANGLE``."""
         x, y = self.rays(1.0, u, v)
         if self.fisheye is not None:
-            bent = np.hypot(x, y)
-            theta = np.minimum(bent, MAX_ANGLE)
+            radius = np.hypot(x, y)
+            theta = np.minimum(radius, MAX_ANGLE)
             for _ in range(NUM_NEWTON_STEPS):
-                theta = theta - (_bent(theta, self.fisheye) - bent) / np.maximum(_slope(theta, self.fisheye), 0.1)
+                theta = theta - (_image_radius(theta, self.fisheye) - radius) / np.maximum(
+                    _slope(theta, self.fisheye), 0.1
+                )
                 theta = np.clip(theta, 0.0, MAX_ANGLE)
-            scale = np.where(bent > 0.0, np.tan(theta) / np.where(bent > 0.0, bent, 1.0), 1.0)
+            scale = np.where(radius > 0.0, np.tan(theta) / np.where(radius > 0.0, radius, 1.0), 1.0)
             return x * scale, y * scale
         if not self.is_pinhole:
             coefficients = np.array([*self.radial[:2], *self.tangential, self.radial[2]])
@@ -148,14 +150,14 @@ class Lens:
         return bool(inside.all() and increasing.all())
 
 
-def _bent(theta: Float[np.ndarray, "..."], k: Sequence[float]) -> Float[np.ndarray, "..."]:
+def _image_radius(theta: Float[np.ndarray, "..."], k: Sequence[float]) -> Float[np.ndarray, "..."]:
     """Distance from the principal point, over the focal length, that a fisheye lens gives to an angle."""
     t = theta * theta
     return theta * (1.0 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))))
 
 
 def _slope(theta: Float[np.ndarray, "..."], k: Sequence[float]) -> Float[np.ndarray, "..."]:
-    """Derivative of ``_bent``."""
+    """Derivative of ``_image_radius``."""
     t = theta * theta
     return 1.0 + t * (3.0 * k[0] + t * (5.0 * k[1] + t * (7.0 * k[2] + t * 9.0 * k[3])))
 

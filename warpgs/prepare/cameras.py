@@ -101,8 +101,8 @@ class Cameras:
         with np.load(data) as z:
             v = z["lens"].tolist()
             lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
-            if len(bent := z["fisheye"].tolist()):
-                lens = dataclasses.replace(lens, fisheye=(bent[0], bent[1], bent[2], bent[3]))
+            if len(fisheye := z["fisheye"].tolist()):
+                lens = dataclasses.replace(lens, fisheye=(fisheye[0], fisheye[1], fisheye[2], fisheye[3]))
             error, angle = z["quality"].tolist()
             weak = bool(z["weak_features"])
             return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)

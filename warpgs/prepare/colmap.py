@@ -210,7 +210,7 @@ def _check_parallax(job: Job, database: Path) -> None:
     pairs, focal = [*matches.values()], job.focal
     if job.params is not None:
         lens = lens_of_parameters(job.lens, size, job.params)
-        pairs, focal = [(_straight(a, lens), _straight(b, lens)) for a, b in pairs], lens.focal[0]
+        pairs, focal = [(_undistorted(a, lens), _undistorted(b, lens)) for a, b in pairs], lens.focal[0]
     turning = find_turning(pairs, size, focal)
     if turning is None:
         return
@@ -230,7 +230,7 @@ def _check_parallax(job: Job, database: Path) -> None:
         )
 
 
-def _straight(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.ndarray, "M 2"]:
+def _undistorted(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.ndarray, "M 2"]:
     """Positions as a pinhole camera with the lens' focal length and its axis in the middle sees them."""
     rays = np.stack(lens.unproject(positions[:, 0], positions[:, 1]), 1)
     return lens.focal[0] * rays + np.array([lens.width, lens.height]) / 2.0
@@ -245,8 +245,8 @@ def _find_directions(job: Job, database: Path) -> Cameras:
     lens = Lens(width, height, (focal, focal), (width / 2.0, height / 2.0))
     if job.params is not None:
         lens = lens_of_parameters(job.lens, (width, height), job.params)
-    bends = job.params is None and "PINHOLE" not in job.lens
-    return find_directions(job.names, pairs, lens, finds_focal=job.finds_focal, finds_distortion=bends)
+    finds_distortion = job.params is None and "PINHOLE" not in job.lens
+    return find_directions(job.names, pairs, lens, finds_focal=job.finds_focal, finds_distortion=finds_distortion)
 
 
 def _map(job: Job, database: Path, report: Report) -> Any:

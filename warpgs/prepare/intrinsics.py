@@ -121,18 +121,18 @@ def _of_opencv(path: Path, fields: dict[str, Any], size: tuple[int, int] | None)
     if skew:
         raise ValueError(f"{path}: cameras must have no skew, got {skew}")
     is_fisheye = fields.get("distortion_model") in ("equidistant", "fisheye") or bool(fields.get("fisheye_model"))
-    most, meaning = (4, "k1 to k4") if is_fisheye else (5, "k1, k2, p1, p2, k3")
-    bent = _numbers(path, {DISTORTION: [], **fields}, DISTORTION)
-    if bent[most:].any():
-        raise ValueError(f"{path}: {DISTORTION} may have {meaning}, got {bent.tolist()}")
-    k1, k2, a, b, k3 = [*bent[:most].tolist(), *[0.0] * 5][:5]
+    max_count, meaning = (4, "k1 to k4") if is_fisheye else (5, "k1, k2, p1, p2, k3")
+    distortion = _numbers(path, {DISTORTION: [], **fields}, DISTORTION)
+    if distortion[max_count:].any():
+        raise ValueError(f"{path}: {DISTORTION} may have {meaning}, got {distortion.tolist()}")
+    k1, k2, a, b, k3 = [*distortion[:max_count].tolist(), *[0.0] * 5][:5]
     if "image_width" in fields or "image_height" in fields:
         size = round(_number(path, fields, "image_width")), round(_number(path, fields, "image_height"))
     width, height = size or (round(2.0 * cx) + 1, round(2.0 * cy) + 1)  # only to check the file: no frames yet
     plain = Lens(width, height, (fx, fy), (cx + 0.5, cy + 0.5))
-    bent_lens = replace(plain, radial=(k1, k2, k3), tangential=(a, b))
+    perspective = replace(plain, radial=(k1, k2, k3), tangential=(a, b))
     try:
-        return (replace(plain, fisheye=(k1, k2, a, b)) if is_fisheye else bent_lens).checked()
+        return (replace(plain, fisheye=(k1, k2, a, b)) if is_fisheye else perspective).checked()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
