@@ -118,6 +118,15 @@ def test_depth_and_points_are_those_of_the_scene(root):
         assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.03
 
 
+@pytest.mark.parametrize("part", ["depth", "points"])
+def test_a_camera_that_stays_at_one_place_gives_no_depth_by_optical_flow(root, part):
+    (root / "points.npy").unlink()
+    for path in (root / "camera").iterdir():
+        edit_json(path, position=[0.1, 0.2, 0.3])
+    with pytest.raises(ValueError, match="all cameras are at one place"):
+        add_parts(root, AddOptions([part]))
+
+
 @pytest.mark.usefixtures("red")
 def test_a_hypernerf_capture_stays_one(tmp_path):
     root = captures.write_capture(tmp_path / "toy", "hypernerf")

@@ -24,6 +24,7 @@ from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import read_json, write_json, write_png
 from warpgs.progress import progress
 
+from .cameras import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION
 from .contact_sheet import choose_evenly, colored_depth, contact_sheet, overlay_mask
 from .depth import DEPTHS, MAX_SIDE, as_half
@@ -184,6 +185,8 @@ class _Job:
         assert method is not None
         folder = find_weights(method.network, self.options.weights) if method.network is not None else None
         frames = self._posed(names, MAX_SIDE, max_factor=1.0)
+        if name == "flow" and not are_apart(camera_centers(frames.poses)):
+            raise ValueError(f"{self.root}: all cameras are at one place, where optical flow says nothing about depth")
         dynamic = [~static for static in self._static(names, frames.lens)]
         self.estimated[name] = frames, method.estimate(frames, dynamic, folder, self.log is None)
         return self.estimated[name]
