@@ -92,15 +92,20 @@ def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
     assert "the camera stays at one place" in report["notes"][1]
     assert report["steps"]["depth"] == "none"
     capture = load_capture(tmp_path / "made")
-    overlaps = []
-    for name in capture.train:
-        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
-        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
-    assert np.mean(overlaps) > 0.85
+    assert mean_overlap(capture, truth) > 0.85
     positions = np.array([camera.position.numpy() for camera in capture.cameras.values()])
     assert np.ptp(positions, axis=0).max() == 0.0
     distances = np.linalg.norm(capture.points.numpy() - positions[0], axis=1)
     assert np.allclose(distances, distances[0], rtol=1e-5)
+
+
+def mean_overlap(capture, truth) -> float:
+    """Mean intersection over union of the dynamic regions of the training frames and the true ones."""
+    overlaps = []
+    for name in capture.train:
+        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
+        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
+    return float(np.mean(overlaps))
 
 
 def turned_cameras(folder, names, work, settings, quiet) -> Cameras:
@@ -122,11 +127,7 @@ def test_what_moves_before_a_camera_that_turns_is_masked_and_depth_places_the_po
     shots = boards.write_folder(tmp_path / "shots", images)
     prepare(shots, tmp_path / "made", camera="turning", depth="anything")
     capture = load_capture(tmp_path / "made")
-    overlaps = []
-    for name in capture.train:
-        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
-        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
-    assert np.mean(overlaps) > 0.75
+    assert mean_overlap(capture, truth) > 0.75
     camera = capture.cameras["frame_000000"]
     depths = camera.project(capture.points)[2][:200]  # points of the first frame come first
     assert set(np.round((depths / depths.max()).numpy(), 2).tolist()) == {0.75, 1.0}

@@ -19,7 +19,7 @@ from .capture import MIN_EXTENT, Capture, Frame
 from .depth_alignment import DepthProblem, align_to_points, alignment_problem, is_unusable, relative_errors
 from .loaders import load_capture, recognize
 from .motion_check import are_comparable, motion_between
-from .sampling import evenly_spaced
+from .sampling import evenly_spaced_indices
 from .turning_check import turning_of
 
 Level = Literal["error", "warning", "note"]
@@ -124,7 +124,7 @@ def quick_findings(capture: Capture) -> list[Finding]:
 
 
 def _sampled(names: Sequence[str], count: int) -> list[str]:
-    return [names[k] for k in evenly_spaced(len(names), count)]
+    return [names[k] for k in evenly_spaced_indices(len(names), count)]
 
 
 def _counts(capture: Capture) -> Iterator[Finding]:
@@ -319,4 +319,4 @@ def _pairs(capture: Capture) -> list[tuple[str, str]]:
     cameras = capture.cameras
     names = sorted(capture.train, key=lambda name: cameras[name].time)
     pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
-    return [pairs[k] for k in evenly_spaced(len(pairs), SAMPLES)]
+    return [pairs[k] for k in evenly_spaced_indices(len(pairs), SAMPLES)]

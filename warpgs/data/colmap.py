@@ -94,9 +94,8 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
     fx, fy, cx, cy, *distortion = (params[0], *params) if model in SIMPLE else params
     distortion = [*distortion, *[0.0] * 5]
     if model.endswith("FISHEYE"):
-        return Lens(
-            *size, (fx, fy), (cx, cy), fisheye=(distortion[0], distortion[1], distortion[2], distortion[3])
-        ).checked()
+        k1, k2, k3, k4 = distortion[:4]
+        return Lens(*size, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked()
     k1, k2, p1, p2, k3 = distortion[:5]
     return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()
 

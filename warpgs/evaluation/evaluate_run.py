@@ -10,12 +10,12 @@ import torch
 from warpgs import visualize
 from warpgs.config import NetName
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import write_json, write_png
 from warpgs.progress import progress
 from warpgs.rendering import Rendering
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
-from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.video.writer import Video
 
 from .evaluate import OnView, evaluate, write_views

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
 
 from .cloud import Cloud
@@ -49,7 +50,7 @@ def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
     """Training cameras, evenly spaced in the order of time; without a capture, default cameras from four sides."""
     if capture is not None:
         names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
-        chosen = camera_paths.evenly_spaced_indices(len(names), NUM_SAMPLES)
+        chosen = evenly_spaced_indices(len(names), NUM_SAMPLES)
         return [capture.cameras[names[k]] for k in chosen]
     times = camera_paths.evenly_spaced(NUM_SAMPLES)
     scene = camera_paths.BoundingSphere.around(_means(clouds.at(0.5)))

@@ -19,7 +19,7 @@ from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, load_capture, recognize
 from warpgs.data.loaders.nerfies import NerfiesLoader
-from warpgs.data.sampling import evenly_spaced
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import read_json, write_json, write_png
 from warpgs.progress import progress
@@ -168,7 +168,7 @@ class _Job:
         fx, fy, (cx, cy) = *frames.lens.focal, frames.lens.center
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         static = self._static(names, frames.lens)
-        chosen = evenly_spaced(len(names), MAX_POINT_FRAMES)
+        chosen = evenly_spaced_indices(len(names), MAX_POINT_FRAMES)
         views = [DepthView(frames.images[k], planes[k], static[k], K, frames.poses[k]) for k in chosen]
         points, colors = points_of_views(views)
         if len(points) == 0:

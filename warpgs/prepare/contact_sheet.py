@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from warpgs.data.sampling import evenly_spaced
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.depth_colors import depth_image
 
 MAX_THUMBNAILS = 30
@@ -24,7 +24,7 @@ def contact_sheet(images: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequen
 
 def choose_evenly(count: int) -> list[int]:
     """At most 30 indices, evenly spaced over ``count``."""
-    return evenly_spaced(count, MAX_THUMBNAILS)
+    return evenly_spaced_indices(count, MAX_THUMBNAILS)
 
 
 def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:

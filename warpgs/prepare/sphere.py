@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from warpgs.data.sampling import evenly_spaced_indices
+
 from .cameras import Cameras
 
 MAX_FRAMES, GRID = 40, 24
@@ -32,8 +34,7 @@ def points_around(
     u, v = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
     x, y = lens.unproject(u * lens.width, v * lens.height)
     rays = np.stack([x, y, np.ones_like(x)], -1)
-    chosen = np.linspace(0, len(cameras.names) - 1, min(MAX_FRAMES, len(cameras.names))).round().astype(int)
-    for k in np.unique(chosen):
+    for k in evenly_spaced_indices(len(cameras.names), MAX_FRAMES):
         static = ~_at(dynamic[k], u, v)
         if planes is None:
             placed = rays / np.linalg.norm(rays, axis=-1, keepdims=True)

@@ -70,7 +70,8 @@ def write(folder: Path, scene: TrainedScene, state: State) -> None:
 
 def remove(folder: Path) -> None:
     """Removes what ``write`` and ``request`` leave, as far as the disk allows it."""
-    for name in (REQUEST, SCENE, STATE):
+    withdraw(folder)
+    for name in (SCENE, STATE):
         with suppress(OSError):
             (folder / name).unlink()
 

@@ -29,8 +29,8 @@ def _import_ray(address: str | None) -> Any:
     """Ray, which reads these variables when it is imported."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address is None and "ray" not in sys.modules:
-        # Whoever reaches a Ray can run code: one of this machine alone listens on 127.0.0.1. So Ray does on macOS and
-        # Windows; on Linux it does if it is told so by the variable that was meant for these two.
+        # Anyone who can connect to Ray can run code, so a local instance listens on 127.0.0.1 only. That is Ray's
+        # default on macOS and Windows; this variable, meant for these two, selects it on Linux as well.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray

@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 
 from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.errors import one_line
 from warpgs.evaluation.metrics import psnr
 from warpgs.runs import preview
 from warpgs.runs.trained import TrainedScene
-from warpgs.video.camera_paths import evenly_spaced_indices
 from warpgs.visualize import reduced, to_bytes
 
 from .logger import Status, TrainingLogger

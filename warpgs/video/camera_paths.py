@@ -128,11 +128,6 @@ def evenly_spaced(frames: int) -> list[float]:
     return [k / max(1, frames - 1) for k in range(frames)]
 
 
-def evenly_spaced_indices(count: int, max_count: int) -> list[int]:
-    """At most ``max_count`` of the indices 0 to ``count`` - 1, evenly spaced, with the first and the last."""
-    return [round(fraction * (count - 1)) for fraction in evenly_spaced(min(count, max_count))]
-
-
 def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list[Camera]:
     """The training cameras in the order of their times, smoothed, with time running over [0, 1].
 

@@ -11,6 +11,7 @@ from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.depth_colors import depth_bounds, depth_image
 from warpgs.progress import progress
 from warpgs.rendering import Layer, render
@@ -55,7 +56,7 @@ def depth_range(scene: TrainedScene, cameras: list[Camera]) -> tuple[float, floa
 
     They are percentiles over the pixels of sampled cameras.
     """
-    chosen = camera_paths.evenly_spaced_indices(len(cameras), NUM_SAMPLES)
+    chosen = evenly_spaced_indices(len(cameras), NUM_SAMPLES)
     inverse = np.concatenate([_inverse_depth(scene, cameras[k]).ravel() for k in chosen])
     return depth_bounds(inverse[np.isfinite(inverse)])
 

@@ -8,7 +8,8 @@ from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
-from warpgs.video.camera_paths import evenly_spaced_indices, focus, upward
+from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.video.camera_paths import focus, upward
 from warpgs.visualize import reduced
 
 from .pose import Pose, pose_of

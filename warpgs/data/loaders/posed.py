@@ -20,7 +20,7 @@ from warpgs.data.capture import Assumption, Capture, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
-from warpgs.data.sampling import evenly_spaced
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, scene_units
 
@@ -205,7 +205,7 @@ def points_of_depth(frames: Sequence[PosedFrame]) -> tuple[Float[np.ndarray, "P 
         ValueError: If a file of a frame is missing or damaged.
     """
     known = [frame for frame in frames if frame.inverse_depth is not None]
-    return points_of_views([_depth_view(known[k]) for k in evenly_spaced(len(known), MAX_DEPTH_FRAMES)])
+    return points_of_views([_depth_view(known[k]) for k in evenly_spaced_indices(len(known), MAX_DEPTH_FRAMES)])
 
 
 def _depth_view(frame: PosedFrame) -> DepthView:
