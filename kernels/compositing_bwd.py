@@ -41,7 +41,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
-from .rows import GEOMETRY_PARTS, NUM_MOMENTS, NUM_SECOND, SecondNorm, row_load
+from .rows import GEOMETRY_PARTS, NUM_MOMENTS, NUM_OFFSET_SUMS, OffsetGradient, row_load
 from .tiles import DYNAMIC
 
 
@@ -66,13 +66,13 @@ def read_gradient(
 
 @functools.cache
 def make_composite_bwd(
-    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], second: SecondNorm
+    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], offset_gradient: OffsetGradient
 ) -> wp.Kernel:
     """Backward kernel, launched with as many threads as the forward kernel.
 
     Args:
         num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
-        second: Which second gradient of the means is accumulated, too.
+        offset_gradient: Which other gradient of the means on screen is accumulated, too; none if None.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which is initially zero. Each image has its own arrays of
     gradients; a missing array stands for zeros, and bit m of ``images_with_gradient`` is set if image m has any
@@ -88,9 +88,9 @@ def make_composite_bwd(
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
-    absolute, of_images = second == "absolute", second == "images"
+    absolute, of_images = offset_gradient == "absolute", offset_gradient == "images"
     scalars, integers, colors, features_vector = state_types(C, P)
-    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_SECOND if second else 0))
+    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_OFFSET_SUMS if offset_gradient else 0))
 
     # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))

@@ -2,7 +2,7 @@
 
 With the camera's rotation W and translation, t = W mean + translation, depth z = t_z, u = t_x / z, v = t_y / z:
 
-    mean2d = (f_x u + c_x, f_y v + c_y)
+    mean2d = (f_x u + c_x, f_y v + c_y) + offset · (width, height) / 2
     J      = [[f_x / z, 0, -f_x ū / z], [0, f_y / z, -f_y v̄ / z]],  ū, v̄ = u, v clamped to a margin around the image
     B      = J W R(q) diag(s),   cov2d = B Bᵀ = [[a', b], [b, c']],   a = a' + LOW_PASS, c = c' + LOW_PASS
     conic  = cov2d⁻¹ = [c, -b, a] / det,   det = a c - b²
@@ -27,8 +27,7 @@ import math
 import warp as wp
 
 from .constants import ALPHA_MIN, FAR, FIELD_OF_VIEW_MARGIN, LOW_PASS
-from .covariance import scaled_rotation
-from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd
+from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd, scaled_rotation
 
 CAMERA_GRADIENTS = 16
 """Length of a row of ``v_cameras``: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
@@ -105,12 +104,14 @@ def project_fwd(
     height: int,
     near: float,
     compensate: int,
+    screen_offsets: wp.array[wp.vec2],
     means2d: wp.array[wp.vec2],
     conics: wp.array[wp.vec3],
     depths: wp.array[float],
-    radii: wp.array[wp.vec2i],
     splat_opacities: wp.array[float],
+    radii: wp.array[wp.vec2i],
 ):
+    """Writes one splat per thread; ``screen_offsets`` may be missing (an empty array)."""
     i = first + wp.tid()
     means2d[i] = wp.vec2(0.0)
     conics[i] = wp.vec3(0.0)
@@ -149,6 +150,9 @@ def project_fwd(
     radius_x = wp.ceil(reach * wp.sqrt(a))
     radius_y = wp.ceil(reach * wp.sqrt(c))
     mean2d = wp.vec2(fx * u + cx, fy * v + cy)
+    if screen_offsets.shape[0] > 0:
+        offset = screen_offsets[i]
+        mean2d += wp.vec2(0.5 * float(width) * offset[0], 0.5 * float(height) * offset[1])
     if not (
         mean2d[0] + radius_x > 0.0
         and mean2d[0] - radius_x < float(width)
@@ -188,7 +192,12 @@ def project_bwd(
     v_scales: wp.array[wp.vec3],
     v_opacities: wp.array[float],
     v_cameras: wp.array2d[float],
+    v_means_of_colors: wp.array[wp.vec3],
 ):
+    """Gradients of one Gaussian per thread; missing gradients of splats (empty arrays) are zero.
+
+    ``v_means_of_colors`` is added to ``v_means``; both may be the same array, and it may be missing.
+    """
     i = first + wp.tid()
     if radii[i][0] <= 0:
         for part in range(v_cameras.shape[1]):
@@ -215,7 +224,6 @@ def project_bwd(
     shape = orientation * wp.diag(s)
     spread = to_image * shape
 
-    # Outputs without a gradient have an empty array.
     conic = conics[i]
     v_conic = wp.vec3(0.0)
     if v_conics.shape[0] > 0:
@@ -284,7 +292,10 @@ def project_bwd(
     if v_depths.shape[0] > 0:
         v_z += v_depths[i]
     v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
-    v_means[i] = wp.transpose(rotation) * v_t
+    v_mean = wp.transpose(rotation) * v_t
+    if v_means_of_colors.shape[0] > 0:
+        v_mean = v_means_of_colors[i] + v_mean
+    v_means[i] = v_mean
     if v_cameras.shape[1] > 0:
         v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
         v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])

@@ -31,6 +31,12 @@ def quaternion_to_rotation(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
+def scaled_rotation(q: wp.vec4, s: wp.vec3) -> wp.mat33:
+    """M = R(q) diag(s), so that the covariance is M Mᵀ (3DGS, Eq. 6)."""
+    return quaternion_to_rotation(q) * wp.diag(s)
+
+
+@wp.func
 def quaternion_to_rotation_bwd(q: wp.vec4, v: wp.mat33) -> wp.vec4:
     """Gradient of the quaternion from the gradient ``v`` of its rotation matrix."""
     inverse_length = 1.0 / wp.length(q)

@@ -27,11 +27,11 @@ GEOMETRY_PARTS = wp.constant(2)
 NUM_MOMENTS = 6
 """Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy²."""
 
-SecondNorm = Literal["absolute", "images"] | None
-"""A second gradient of the mean whose length is reported: with absolute values per pixel, or that of the images alone,
-without depth."""
+OffsetGradient = Literal["absolute", "images"] | None
+"""What is reported as the gradient of the mean on screen instead of the gradient itself (None): the sum of its absolute
+values over the pixels, or the part of the images alone, without depth."""
 
-NUM_SECOND = 2
+NUM_OFFSET_SUMS = 2
 """Σ |s (conic d)_x| and Σ |s (conic d)_y|, or Σ s' (conic d)_x and Σ s' (conic d)_y with s' of the images alone."""
 
 
@@ -60,106 +60,79 @@ def row_parts(num_channels: int) -> int:
 
 
 def gradient_stride(num_channels: int) -> int:
-    """Number of floats in a Gaussian's gradient row: features, moments, second gradient, padded to 16 bytes."""
-    return (num_channels + NUM_MOMENTS + NUM_SECOND + 3) // 4 * 4
-
-
-@wp.func
-def length(x: float, y: float) -> float:
-    """As ``wp.length`` of (x, y), but finite where the squares would overflow; scaling by a power of two is exact."""
-    scale = wp.where(wp.max(wp.abs(x), wp.abs(y)) > 1.0e18, wp.static(1.0 / 2.0**64), 1.0)
-    return wp.length(wp.vec2(x * scale, y * scale)) / scale
-
-
-@wp.kernel(enable_backward=False)
-def pack(
-    first: int,
-    means2d: wp.array[wp.vec2],
-    conics: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    depths: wp.array[float],
-    radii: wp.array[wp.vec2i],
-    rows: wp.array2d[wp.vec4],
-    depth_keys: wp.array[int],
-    gaussian_from_rank: wp.array[int],
-    norms: wp.array[wp.vec2],
-):
-    """Writes the geometry part of the rows, one thread for each splat.
-
-    It also writes the input of the depth sort, a key and the splat's own index, and sets ``norms`` to zero and the
-    radii of splats that are skipped.
-    """
-    i = first + wp.tid()
-    mean = means2d[i]
-    conic = conics[i]
-    opacity = opacities[i]
-    radius = radii[i]
-    depth = depths[i]
-    # A sum is finite only if all of its terms are, and a comparison with NaN fails.
-    total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
-    visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
-    visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
-    key = CULLED_DEPTH
-    row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
-    row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
-    if not (visible and wp.isfinite(total)):
-        if radius[0] != 0 or radius[1] != 0:
-            radii[i] = wp.vec2i(0, 0)
-    else:
-        key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
-        row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
-        row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
-    row_store(rows, i, 0, row0)
-    row_store(rows, i, 1, row1)
-    depth_keys[i] = key
-    gaussian_from_rank[i] = i
-    norms[i] = wp.vec2(0.0)
+    """Number of floats in a Gaussian's gradient row: features, moments, ``NUM_OFFSET_SUMS``, padded to 16 bytes."""
+    return (num_channels + NUM_MOMENTS + NUM_OFFSET_SUMS + 3) // 4 * 4
 
 
 @functools.cache
-def make_pack_features(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the features of the rows, one thread for each splat; depth is an optional last channel.
+def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that writes the rows, one thread for each splat; depth is an optional last channel.
 
-    A splat with a feature that is not finite is marked as culled, and its radii are set to 0.
+    It also writes the input of the depth sort, a key and the splat's own index, and sets the radii of splats that are
+    skipped to zero.
     """
     num_channels = num_features + int(with_depth)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def pack_features(
+    def pack(
         first: int,
-        features: wp.array2d[float],
+        means2d: wp.array[wp.vec2],
+        conics: wp.array[wp.vec3],
         depths: wp.array[float],
-        rows: wp.array2d[wp.vec4],
+        opacities: wp.array[float],
         radii: wp.array[wp.vec2i],
+        features: wp.array2d[float],
+        rows: wp.array2d[wp.vec4],
+        depth_keys: wp.array[int],
+        gaussian_from_rank: wp.array[int],
     ):
         i = first + wp.tid()
-        total = float(0.0)
+        mean = means2d[i]
+        conic = conics[i]
+        opacity = opacities[i]
+        radius = radii[i]
+        depth = depths[i]
+        # A sum is finite only if all of its terms are, and a comparison with NaN fails.
+        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
         for part in range(wp.static((num_channels + 3) // 4)):
             value = wp.vec4(0.0)
             for k in range(4):
                 if part * 4 + k < wp.static(num_features):
                     value[k] = features[i, part * 4 + k]
                 elif part * 4 + k < wp.static(num_channels):
-                    value[k] = depths[i]
+                    value[k] = depth
             total += value[0] + value[1] + value[2] + value[3]
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
-        if not wp.isfinite(total):
-            row_store(rows, i, 1, wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0))
-            radii[i] = wp.vec2i(0, 0)
+        visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
+        visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+        key = CULLED_DEPTH
+        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
+        row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
+        if not (visible and wp.isfinite(total)):
+            if radius[0] != 0 or radius[1] != 0:
+                radii[i] = wp.vec2i(0, 0)
+        else:
+            key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
+            row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
+            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+        row_store(rows, i, 0, row0)
+        row_store(rows, i, 1, row1)
+        depth_keys[i] = key
+        gaussian_from_rank[i] = i
 
-    return pack_features
+    return pack
 
 
-sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_SECOND, dtype=float)
+sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)
 
 
 @functools.cache
 def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
     """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat.
 
-    ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``norms`` receives the length of
-    the gradient of the mean and of the second one (``SecondNorm``), both scaled per axis by ``half_width`` and
-    ``half_height``.
+    ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``v_screen_offsets``, which may be
+    missing, is the gradient of the mean in halves of the image size: the plain one if ``offset_sign`` is 0, otherwise
+    the sums of ``OffsetGradient`` times ``offset_sign``.
     """
     num_channels = num_features + int(with_depth)
 
@@ -172,12 +145,13 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
         gradients: wp.array3d[float],
         half_width: float,
         half_height: float,
+        offset_sign: float,
         v_means2d: wp.array[wp.vec2],
         v_conics: wp.array[wp.vec3],
+        v_depths: wp.array[float],
         v_opacities: wp.array[float],
         v_features: wp.array2d[float],
-        v_depths: wp.array[float],
-        norms: wp.array[wp.vec2],
+        v_screen_offsets: wp.array[wp.vec2],
     ):
         i = first + wp.tid()
         for k in range(wp.static(num_channels)):
@@ -189,25 +163,26 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
             else:
                 v_depths[i] = total
         s = sums_vector()
-        for k in range(wp.static(NUM_MOMENTS + NUM_SECOND)):
+        for k in range(wp.static(NUM_MOMENTS + NUM_OFFSET_SUMS)):
             total = float(0.0)
             for shard in range(gradients.shape[0]):
                 total += gradients[shard, i, wp.static(num_channels) + k]
             s[k] = total
+        v_offset = wp.vec2(0.0)
         if rows[i, 1][1] == CULLED_LOG2_OPACITY:
             v_means2d[i] = wp.vec2(0.0)
             v_conics[i] = wp.vec3(0.0)
             v_opacities[i] = 0.0
-            norms[i] = wp.vec2(0.0)
         else:
             conic = conics[i]
             v_mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
             v_means2d[i] = v_mean
             v_conics[i] = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
             v_opacities[i] = s[0] / opacities[i]
-            norms[i] = wp.vec2(
-                length(v_mean[0] * half_width, v_mean[1] * half_height),
-                length(s[6] * half_width, s[7] * half_height),
-            )
+            v_offset = v_mean
+            if offset_sign != 0.0:
+                v_offset = offset_sign * wp.vec2(s[6], s[7])
+        if v_screen_offsets.shape[0] > 0:
+            v_screen_offsets[i] = wp.vec2(v_offset[0] * half_width, v_offset[1] * half_height)
 
     return unpack

@@ -7,7 +7,7 @@ import jaxtyping
 import pytest
 import torch
 
-from warpgs.ops.covariance import covariance
+from warpgs.ops.sh import spherical_harmonics
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
@@ -106,7 +106,7 @@ def test_no_function_is_long(path):
 
 def test_annotated_shapes_are_checked_while_tests_run():
     with pytest.raises(jaxtyping.TypeCheckError):
-        covariance(torch.ones(5, 3), torch.ones(5, 3))
+        spherical_harmonics(torch.ones(5, 3), torch.ones(4, 1, 3), torch.eye(4))
 
 
 def defines_kernels(path: Path) -> bool:

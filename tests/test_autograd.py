@@ -1,18 +1,21 @@
 """A render as an autograd node: repeated backward passes, in-place changes, freed memory."""
 
+import dataclasses
 import gc
 import weakref
 
 import pytest
 import torch
+from torch.utils.checkpoint import checkpoint
 
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
+from warpgs import rendering
 from warpgs.config import RenderSettings
+from warpgs.ops import rows as rows_op
 from warpgs.ops.mlp import perceptron
 from warpgs.ops.projection import Geometry, View, project
 from warpgs.ops.sh import spherical_harmonics
 from warpgs.rendering import render
-from warpgs.runtime import tape
 
 CAMERA = make_camera()
 
@@ -112,17 +115,56 @@ def test_gradients_continue_to_the_inputs_of_the_parameters():
     assert (raw.grad - leaf.scales.grad * leaf.scales.detach()).norm() <= 1e-5 * raw.grad.norm()
 
 
+@pytest.mark.parametrize("name_with_gradient", ["means", "quats", "scales", "opacities", "sh"])
+def test_gradients_flow_only_to_tensors_that_require_them(name_with_gradient):
+    everything, one = as_leaves(make_splats()), as_leaves(make_splats())
+    for name, tensor in float_tensors(one).items():
+        tensor.requires_grad_(name == name_with_gradient)
+    for splats in (everything, one):
+        render(splats, make_camera()).joint.image.sum().backward()
+    for name, gradient in gradients(one).items():
+        if name == name_with_gradient:
+            assert torch.equal(gradient, gradients(everything)[name])
+        else:
+            assert gradient is None
+
+
+def test_without_inputs_that_require_gradients_nothing_is_recorded():
+    assert not render(make_splats(), make_camera()).joint.image.requires_grad
+
+
+@pytest.mark.parametrize("use_reentrant", [False, True])
+def test_a_checkpointed_render_has_the_same_gradients(use_reentrant):
+    settings = RenderSettings(branches=True, depth=True, imagegrad=True)
+
+    def loss(means, sh, background, offsets):
+        splats = dataclasses.replace(make_splats(), means=means, sh=sh)
+        rendering = render(splats, CAMERA, background, settings, offsets)
+        return rendering.joint.image.square().sum() + rendering.dynamic.depth.sum()
+
+    found = []
+    for checkpointed in (False, True):
+        splats = as_leaves(make_splats())
+        inputs = (splats.means, splats.sh, torch.full((3,), 0.5).requires_grad_(), torch.zeros(60, 2).requires_grad_())
+        value = checkpoint(loss, *inputs, use_reentrant=use_reentrant) if checkpointed else loss(*inputs)
+        value.backward()
+        found.append([t.grad for t in inputs])
+    for expected, actual in zip(*found, strict=True):
+        assert expected.any()
+        assert torch.equal(actual, expected)
+
+
 @pytest.fixture
-def contexts(monkeypatch):
-    """Weak references to every ``OpContext``, while only reference counts free memory."""
+def backward_passes(monkeypatch):
+    """Weak references to what every render keeps for its backward pass, while only reference counts free memory."""
     references = []
-    make = tape.OpContext.__init__
+    make = rendering._Backward.__init__
 
-    def made(self, *args, **options):
+    def made(self, *args):
         references.append(weakref.ref(self))
-        make(self, *args, **options)
+        make(self, *args)
 
-    monkeypatch.setattr(tape.OpContext, "__init__", made)
+    monkeypatch.setattr(rendering._Backward, "__init__", made)
     gc.collect()
     gc.disable()
     yield references
@@ -130,20 +172,36 @@ def contexts(monkeypatch):
 
 
 @pytest.mark.parametrize("backward", [False, True])
-def test_a_render_is_freed_with_its_images(contexts, backward):
+def test_a_render_is_freed_with_its_images(backward_passes, backward):
     splats = as_leaves(make_splats())
     for _ in range(3):
-        image = render(splats, CAMERA).joint.image
+        image = render(splats, CAMERA, torch.zeros(3, requires_grad=True), RenderSettings(depth=True)).joint.image
         if backward:
             image.sum().backward()
         freed = weakref.ref(image)
         del image
         assert freed() is None
-    assert len(contexts) == 3
-    assert [reference() for reference in contexts] == [None] * 3
+    assert len(backward_passes) == 3
+    assert [reference() for reference in backward_passes] == [None] * 3
 
 
-def test_a_render_without_gradients_is_freed_at_once(contexts):
+def test_a_render_without_gradients_is_freed_at_once(backward_passes):
     with torch.no_grad():
         render(make_splats(), CAMERA)
-    assert [reference() for reference in contexts] == [None]
+    assert [reference() for reference in backward_passes] == [None]
+
+
+def test_a_checkpointed_render_keeps_nothing_of_its_gaussians(monkeypatch):
+    kept = []
+
+    def pack(*args):
+        rows, order = rows_op.pack(*args)
+        kept.append(weakref.ref(rows.packed))
+        return rows, order
+
+    monkeypatch.setattr(rendering, "pack", pack)
+    splats = as_leaves(make_splats())
+    image = checkpoint(lambda means: render(splats, CAMERA).joint.image, splats.means, use_reentrant=False)
+    assert [reference() for reference in kept] == [None]
+    image.sum().backward()
+    assert len(kept) == 2

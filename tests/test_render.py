@@ -194,9 +194,8 @@ def test_depth_and_gradients_of_any_subset_of_outputs_equal_the_reference(branch
             assert relative_error(gradients(splats)[name], wanted) < 1e-5, name
 
 
-@pytest.mark.parametrize("settings", [RenderSettings(absgrad=True), RenderSettings(absgrad=True, branches=True)])
-def test_gradient_norms_equal_those_of_the_screen_space_means(settings, monkeypatch):
-    splats = as_leaves(make_splats())
+@pytest.mark.parametrize("branches", [False, True])
+def test_the_gradient_of_the_offsets_is_that_of_the_means_on_screen(branches, monkeypatch):
     kept = []
     project = reference_projection.project
 
@@ -207,40 +206,73 @@ def test_gradient_norms_equal_those_of_the_screen_space_means(settings, monkeypa
         return means2d, *rest
 
     monkeypatch.setattr(reference_projection, "project", project_and_keep)
-    result = render(splats, CAMERA, background(), settings)
-    assert not result.gradient_norms.any()
-    _, expected, _ = reference_outputs(splats, background().double(), branches=settings.branches)
+    _, expected, _ = reference_outputs(as_leaves(make_splats()), background().double(), branches=branches)
     v_outputs = random_like(expected)
-    weighted_sum(outputs(result), v_outputs).backward()
     weighted_sum(expected, v_outputs).backward()
     means2d_gradient = sum(m.grad for m in kept) * torch.tensor([WIDTH / 2, HEIGHT / 2])
-    plain, absolute = result.gradient_norms.unbind(-1)
-    assert relative_error(plain, means2d_gradient.norm(dim=-1)) < 1e-5
+    gradient_of = {}
+    for absgrad in (False, True):
+        offsets = torch.zeros(60, 2, requires_grad=True)
+        settings = RenderSettings(branches=branches, absgrad=absgrad)
+        result = render(make_splats(), CAMERA, background(), settings, offsets)
+        weighted_sum(outputs(result), v_outputs).backward()
+        gradient_of[absgrad] = offsets.grad
+    assert relative_error(gradient_of[False], means2d_gradient) < 1e-5
+    plain, absolute = gradient_of[False].norm(dim=-1), gradient_of[True].norm(dim=-1)
+    assert (gradient_of[True] >= 0).all()
     assert (absolute >= plain * (1 - 1e-5)).all()
     assert absolute.sum() > 1.1 * plain.sum()
 
 
+def test_offsets_shift_gaussians_on_screen():
+    offsets = torch.zeros(60, 2)
+    plain = render(make_splats(), CAMERA, background()).joint.image
+    assert torch.equal(render(make_splats(), CAMERA, background(), screen_offsets=offsets).joint.image, plain)
+    offsets[:] = torch.tensor([2.0 / WIDTH, -4.0 / HEIGHT])  # one pixel to the right and two up
+    shifted = render(make_splats(), CAMERA, background(), screen_offsets=offsets).joint.image
+    assert error(shifted[:-2, 1:], plain[2:, :-1]) < 1e-5
+
+
+def test_offsets_of_another_number_of_gaussians_are_refused():
+    with pytest.raises(ValueError, match=r"screen_offsets must have shape \[N, 2\] with N = 60, got \[59, 2\]"):
+        render(make_splats(), CAMERA, screen_offsets=torch.zeros(59, 2))
+
+
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("dynamic", ["some", "none"])  # with none, one traversal serves the joint and the static image
-def test_gradient_norms_of_the_images_are_those_without_a_loss_of_depth(dynamic, depth):
-    settings = RenderSettings(branches=True, depth=depth, imagegrad=True)
-
-    def norms(with_depth_loss):
-        splats = make_splats()
+def test_gradients_of_the_images_alone_are_those_without_a_loss_of_depth(dynamic, depth):
+    def v_offsets(imagegrad, with_depth_loss):
+        splats, offsets = make_splats(), torch.zeros(60, 2, requires_grad=True)
         if dynamic == "none":
             splats = dataclasses.replace(splats, is_dynamic=torch.zeros(60, dtype=torch.bool))
-        result = render(as_leaves(splats), CAMERA, background(), settings)
+        settings = RenderSettings(branches=True, depth=depth, imagegrad=imagegrad)
+        result = render(as_leaves(splats), CAMERA, background(), settings, offsets)
         layers = (result.joint, result.static, result.dynamic)
         depths = [layer.depth * layer.alpha.detach() for layer in layers if depth]
         loss = weighted_sum(outputs(result), random_like(outputs(result)))
         (loss + with_depth_loss * weighted_sum(depths, random_like(depths))).backward()
-        return result.gradient_norms.unbind(-1)
+        return offsets.grad
 
-    (everything, images), (expected, same) = norms(with_depth_loss=1.0), norms(with_depth_loss=0.0)
-    assert expected.count_nonzero() > 30
-    assert relative_error(images, expected) < 1e-6
-    assert relative_error(same, expected) < 1e-6
-    assert (relative_error(everything, expected) > 0.1) == depth
+    expected = v_offsets(imagegrad=False, with_depth_loss=0.0)
+    assert expected.count_nonzero() > 60
+    assert relative_error(v_offsets(imagegrad=True, with_depth_loss=1.0), expected) < 1e-6
+    assert relative_error(v_offsets(imagegrad=True, with_depth_loss=0.0), expected) < 1e-6
+    assert (relative_error(v_offsets(imagegrad=False, with_depth_loss=1.0), expected) > 0.1) == depth
+
+
+@pytest.mark.parametrize("max_intersections", [1, 100_000])
+def test_the_number_of_intersections_can_be_bounded(max_intersections):
+    expected = render(make_splats(), CAMERA)
+    assert expected.num_intersections is None
+    bounded = render(make_splats(), CAMERA, settings=RenderSettings(max_intersections=max_intersections))
+    assert torch.equal(bounded.joint.image, expected.joint.image)
+    assert 60 < int(bounded.num_intersections) < 60 * 12
+
+
+@pytest.mark.parametrize("bound", [0, -1, 1 << 30])
+def test_a_bound_of_the_intersections_must_be_positive_and_an_int32(bound):
+    with pytest.raises(ValueError, match="max_intersections must be between 1 and"):
+        RenderSettings(max_intersections=bound)
 
 
 def test_gradients_of_images_and_absolute_ones_exclude_each_other():
@@ -305,7 +337,7 @@ def test_splats_of_one_branch_leave_the_other_image_background(dynamic):
 def test_statistics_do_not_require_gradients():
     rendering = render(as_leaves(make_splats()), CAMERA, background(), EVERYTHING)
     assert rendering.joint.image.requires_grad
-    assert not rendering.gradient_norms.requires_grad
+    assert not rendering.contributed.requires_grad
     assert not rendering.weights.requires_grad
 
 

@@ -48,13 +48,11 @@ class RenderSettings:
         branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
         depth: Also render depth, as one more channel.
         statistics: Also compute whether and how much each Gaussian contributed to the joint image.
-        absgrad: In the backward pass, also sum the absolute values of the pixels' screen-space gradients (AbsGS).
-        imagegrad: In the backward pass, also sum the screen-space gradients without those of depth; not with absgrad.
+        absgrad: The gradient of ``screen_offsets`` is the sum of its absolute values over the pixels (AbsGS).
+        imagegrad: The gradient of ``screen_offsets`` is that of the images alone, without depth; not with absgrad.
         antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
         near: Near plane [scene units].
-        replay: On CUDA, replay small renders of the main thread from CUDA graphs: the same results with less launch
-            overhead, at the memory of a few renders. Recording a graph synchronizes the GPU, and no other thread may
-            synchronize it meanwhile (``runtime/replay.py``).
+        max_intersections: Size of the buffers for intersections of Gaussians with tiles; learned if None.
     """
 
     branches: bool = False
@@ -64,13 +62,15 @@ class RenderSettings:
     imagegrad: bool = False
     antialias: bool = False
     near: float = 0.01
-    replay: bool = True
+    max_intersections: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.near < math.inf:
             raise ValueError(f"near must be positive and finite, got {self.near}")
         if self.absgrad and self.imagegrad:
-            raise ValueError("expected absgrad or imagegrad, got both: they fill the same column of gradient_norms")
+            raise ValueError("expected absgrad or imagegrad, got both: both are the gradient of screen_offsets")
+        if self.max_intersections is not None and not 0 < self.max_intersections < 1 << 30:
+            raise ValueError(f"max_intersections must be between 1 and 2^30, got {self.max_intersections}")
 
 
 @dataclass(frozen=True)

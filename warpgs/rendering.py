@@ -5,21 +5,26 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from .cameras import Camera
 from .config import RenderSettings
 from .model.splats import Splats
-from .ops.compositing import NUM_BRANCH_IMAGES, Composite, SecondNorm, record_composite
-from .ops.projection import Geometry, View, record_projection
-from .ops.rows import Rows
-from .ops.sh import degree_of, record_sh
-from .ops.tiles import record_tiles
+from .ops.compositing import (
+    NUM_BRANCH_IMAGES,
+    Composite,
+    Traversal,
+    background_bwd,
+    composite_bwd,
+    composite_fwd,
+)
+from .ops.projection import Geometry, View, project_bwd, project_fwd
+from .ops.rows import OffsetGradient, Rows, pack, unpack
+from .ops.sh import degree_of, sh_bwd, sh_fwd
+from .ops.tiles import bin_splats
 from .runtime.checks import check_same_device, check_tensor
-from .runtime.replay import differentiable_with_replay
-from .runtime.streams import join
-from .runtime.tape import OpContext, differentiable
+from .runtime.tape import Gradients, Recorded, Tape, differentiable
 
 DEFAULTS = RenderSettings()
 
@@ -47,29 +52,52 @@ class Rendering:
         joint: All Gaussians.
         static, dynamic: The Gaussians of one branch alone; None unless requested.
         radii: [N, 2] half sizes on screen [px]; 0 = culled.
-        gradient_norms: [N, 2] after the backward pass: length of the screen-space gradient of each mean, plain and (if
-            requested) with absolute values per pixel or of the images alone, in normalised device coordinates as in the
-            densification of 3DGS.
         contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless requested.
         weights: [N] sum of its blend weights over the joint image, not differentiable; None unless requested.
+        num_intersections: [1] int64 number of intersections of Gaussians with tiles, on the device; None unless
+            ``RenderSettings.max_intersections`` is set. If it is larger, the images are the same, but rendered slowly.
     """
 
     joint: Layer
     static: Layer | None
     dynamic: Layer | None
     radii: Int32[Tensor, "N 2"]
-    gradient_norms: Float[Tensor, "N 2"]
     contributed: Bool[Tensor, " N"] | None
     weights: Float[Tensor, " N"] | None
+    num_intersections: Int64[Tensor, "1"] | None
 
 
 class _Request(NamedTuple):
-    """Everything but tensors that a render depends on; requests that are equal can share a recording."""
+    """Everything but tensors that a render depends on."""
 
     size: tuple[int, int]
-    num_channels: int
     settings: RenderSettings
     sh_degree: int | None
+
+
+class _Inputs(NamedTuple):
+    """All tensors that a render depends on, or their gradients."""
+
+    means: Any
+    quats: Any
+    scales: Any
+    opacities: Any
+    appearance: Any
+    viewmat: Any
+    K: Any
+    background: Any
+    screen_offsets: Any
+    branch: Any = None
+
+
+class _Saved(NamedTuple):
+    """Those tensors of the forward pass that the backward pass reads besides its inputs."""
+
+    conics: Tensor
+    opacities: Tensor
+    radii: Tensor
+    features: Tensor
+    packed: Tensor
 
 
 def render(
@@ -77,6 +105,7 @@ def render(
     camera: Camera,
     background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
     settings: RenderSettings | None = None,
+    screen_offsets: Float[Tensor, "N 2"] | None = None,
 ) -> Rendering:
     """Renders splats through a camera; differentiable, once, in the splats, the camera and the background.
 
@@ -90,74 +119,189 @@ def render(
         background: [C] colour behind everything, black by default; with branches also [3, C], one for each of the
             joint, the static and the dynamic image.
         settings: What to compute besides the joint image.
+        screen_offsets: [N, 2] offsets of the Gaussians' means on screen in normalised device coordinates (halves of the
+            image size), as a rule zeros. The length of their gradient is the densification statistic of 3DGS.
 
     Raises:
         TypeError: If the camera is something else, such as a list of cameras.
-        ValueError: If the background does not fit the splats, devices differ, or branches are requested for splats
-            without ``is_dynamic``.
+        ValueError: If the background or the offsets do not fit the splats, devices differ, or branches are requested
+            for splats without ``is_dynamic``.
+        RuntimeError: If a CUDA graph captures the first render of an image size without
+            ``RenderSettings.max_intersections``.
     """
     settings = settings or DEFAULTS
-    _check_inputs(splats, camera, background, settings)
-    outputs = _render(splats, camera, background, settings)
+    _check_inputs(splats, camera, background, settings, screen_offsets)
+    inputs = _inputs(splats, camera, background, settings, screen_offsets)
+    outputs = differentiable(partial(_forward, _request(splats, camera, settings)), *inputs)
+    return _rendering(outputs, settings)
+
+
+def _request(splats: Splats, camera: Camera, settings: RenderSettings) -> _Request:
+    degree = None
+    if splats.sh is not None:
+        degree = degree_of(splats.sh.shape[1]) if splats.sh_degree is None else splats.sh_degree
+    return _Request(camera.size, settings, degree)
+
+
+def _inputs(
+    splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings, screen_offsets: Tensor | None
+) -> _Inputs:
+    return _Inputs(
+        *(splats.means, splats.quats, splats.scales, splats.opacities),
+        appearance=splats.colors if splats.sh is None else splats.sh,
+        viewmat=camera.viewmat,
+        K=camera.K,
+        background=background,
+        screen_offsets=screen_offsets,
+        branch=splats.is_dynamic.view(torch.uint8) if settings.branches and splats.is_dynamic is not None else None,
+    )
+
+
+def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Rendering:
+    """Gives names to the outputs of ``_forward``."""
     num_images = NUM_BRANCH_IMAGES if settings.branches else 1
-    composite = Composite.from_flat(outputs[1:], num_images, settings.depth)
+    num_layers = num_images * (2 + int(settings.depth))
+    radii, *statistics = outputs[num_layers:]
+    num_intersections = None if settings.max_intersections is None else statistics.pop()
+    composite = Composite.from_flat((*outputs[:num_layers], *statistics), num_images, settings.depth)
     depths = composite.depths or (None,) * num_images
     layers = [Layer(*parts) for parts in zip(composite.images, composite.alphas, depths, strict=True)]
     return Rendering(
         joint=layers[0],
         static=layers[1] if settings.branches else None,
         dynamic=layers[2] if settings.branches else None,
-        radii=outputs[0],
-        gradient_norms=composite.gradient_norms,
+        radii=radii,
         contributed=composite.contributed,
         weights=composite.weights,
+        num_intersections=num_intersections,
     )
 
 
-def _check_inputs(splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings) -> None:
+def _check_inputs(
+    splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings, screen_offsets: Tensor | None
+) -> None:
     if not isinstance(camera, Camera):
         raise TypeError(f"camera must be one Camera, got {type(camera).__name__}: call render once per camera")
     C = splats.num_channels
     if background is not None:
         is_per_image = settings.branches and isinstance(background, Tensor) and background.ndim == 2
         check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_per_image else (C,), {})
-    check_same_device({"splats": splats.means, "camera": camera.viewmat, "background": background})
+    if screen_offsets is not None:
+        check_tensor("screen_offsets", screen_offsets, ("N", 2), {"N": len(splats.means)})
+    tensors = {"background": background, "screen_offsets": screen_offsets}
+    check_same_device({"splats": splats.means, "camera": camera.viewmat, **tensors})
     if settings.branches and splats.is_dynamic is None:
         raise ValueError("branches were requested, but splats.is_dynamic is None")
 
 
-def _render(splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings) -> tuple[Tensor, ...]:
-    """Radii and a flat ``Composite``, differentiable, from a recording if possible."""
-    degree = None if splats.sh is None else splats.sh_degree
-    if degree is None and splats.sh is not None:
-        degree = degree_of(splats.sh.shape[1])
-    request = _Request(camera.size, splats.num_channels, settings, degree)
-    branch = None if splats.is_dynamic is None or not settings.branches else splats.is_dynamic.view(torch.uint8)
-    appearance = splats.colors if splats.sh is None else splats.sh
-    geometry = (splats.means, splats.quats, splats.scales, splats.opacities)
-    tensors = (*geometry, appearance, background, camera.viewmat, camera.K, branch)
-    op = partial(_record, request, splats.sh_stream)
-    is_empty = 0 in (splats.means.shape[0], *camera.size)
-    if settings.replay and splats.sh_stream is None and not is_empty:
-        return differentiable_with_replay(request, op, *tensors)
-    return differentiable(op, *tensors)
+def _forward(request: _Request, *tensors: Any) -> Recorded:
+    """project → bin → composite; every differentiable step records its backward function on one tape."""
+    inputs, (size, settings, sh_degree) = _Inputs(*tensors), request
+    back, tape = _Backward(request), Tape()
 
-
-def _record(
-    request: _Request, sh_stream: torch.cuda.Stream | None, ctx: OpContext, *tensors: Any
-) -> tuple[Tensor, ...]:
-    """The render as one op: project → bin → composite; it depends on nothing but its arguments."""
-    means, quats, scales, opacities, appearance, background, viewmat, K, branch = tensors
-    size, num_channels, settings, sh_degree = request
-    geometry, view = Geometry(means, quats, scales, opacities), View(viewmat, K, *size)
-    projection = record_projection(ctx, geometry, view, settings.near, settings.antialias)
-    rows = Rows(ctx, projection, num_channels, settings.depth, size)
-    tiles = record_tiles(ctx, rows, size, branch)
-    join(sh_stream)
-    features = appearance
+    view = View(inputs.viewmat, inputs.K, *size)
+    splats = project_fwd(Geometry(*inputs[:4]), view, settings.near, settings.antialias, inputs.screen_offsets)
+    tape.record_func(back.unproject, [])
+    features = inputs.appearance
     if sh_degree is not None:
-        features = record_sh(ctx, means, appearance, viewmat, projection.radii, sh_degree)
-    rows.add_features(ctx, features)
-    second_norm: SecondNorm = "absolute" if settings.absgrad else "images" if settings.imagegrad else None
-    composite = record_composite(ctx, rows, tiles, size, background, settings.statistics, second_norm)
-    return (projection.radii, *composite.flat())
+        features = sh_fwd(inputs.means, inputs.appearance, inputs.viewmat, splats.radii, sh_degree)
+        tape.record_func(back.color, [])
+    rows, order = pack(splats, features, settings.depth)
+    tape.record_func(back.unpack, [])
+    tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
+    composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, settings.statistics)
+    tape.record_func(back.composite, [])
+
+    saved = _Saved(splats.conics, splats.opacities, splats.radii, features, rows.packed)
+    alphas = composite.alphas if _has_gradient(inputs.background) else ()
+    num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
+    return Recorded(
+        outputs=composite.layers,
+        backward=partial(_backward, back, tape),
+        saved=(*inputs, *saved, *composite.depths, *alphas),
+        constants=(splats.radii, *composite.statistics, *num_intersections),
+    )
+
+
+def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
+    """composite → unproject: plays the tape in reverse."""
+    back.begin(saved, v_layers)
+    tape.backward()
+    return back.end()
+
+
+class _Backward:
+    """The backward pass of one render: the tape calls the methods from ``composite`` to ``unproject``, in this order.
+
+    Attributes:
+        request: Of the render.
+        traversal: Of the forward pass.
+        inputs, saved, layers: What was saved for the backward pass; during it only.
+        v_layers: Gradients of the images, alphas and depths.
+        v_rows, v_splats: Gradients that one method leaves to the next.
+        v: Gradients of the inputs so far, by name.
+    """
+
+    traversal: Traversal
+
+    def __init__(self, request: _Request) -> None:
+        self.request = request
+
+    def begin(self, saved: tuple[Any, ...], v_layers: Gradients) -> None:
+        """Receives the saved tensors and the gradients of the layers."""
+        first, second = len(_Inputs._fields), len(_Inputs._fields) + len(_Saved._fields)
+        self.inputs, self.saved, self.layers = _Inputs(*saved[:first]), _Saved(*saved[first:second]), saved[second:]
+        self.v_layers, self.v = v_layers, dict[str, Tensor | None]()
+
+    def composite(self) -> None:
+        background, traversal = self.inputs.background, self.traversal
+        self.v_rows = composite_bwd(self._rows(), background, traversal, self.v_layers, self._offset_gradient())
+        if _has_gradient(background):
+            alphas = self.layers[-traversal.num_images :]
+            self.v["background"] = background_bwd(background, alphas, self.v_layers[: traversal.num_images])
+
+    def unpack(self) -> None:
+        splats, with_offsets = (self.saved.conics, self.saved.opacities), _has_gradient(self.inputs.screen_offsets)
+        size, offset_gradient = self.request.size, self._offset_gradient()
+        self.v_splats = unpack(splats, self._rows(), self.v_rows, size, with_offsets, offset_gradient)
+        self.v["appearance"], self.v["screen_offsets"] = self.v_splats.features, self.v_splats.screen_offsets
+
+    def color(self) -> None:
+        means, sh, viewmat = self.inputs.means, self.inputs.appearance, self.inputs.viewmat
+        degree, features = self.request.sh_degree, self.saved.features
+        assert degree is not None
+        v_means, v_sh, v_viewmat = sh_bwd(
+            (means, sh, viewmat, self.saved.radii), degree, features, self.v_splats.features
+        )
+        self.v |= {"means": v_means, "appearance": v_sh, "viewmat": v_viewmat}
+
+    def unproject(self) -> None:
+        view = View(self.inputs.viewmat, self.inputs.K, *self.request.size)
+        splats, antialias = (self.saved.conics, self.saved.radii), self.request.settings.antialias
+        v_geometry, v_viewmat, self.v["K"] = project_bwd(
+            Geometry(*self.inputs[:4]), view, antialias, splats, self.v_splats[:4], self.v.get("means")
+        )
+        self.v |= v_geometry._asdict()
+        v_colors = self.v.get("viewmat")
+        self.v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
+
+    def end(self) -> Gradients:
+        """Frees everything but the gradients of the inputs, and returns these."""
+        gradients = [self.v.get(name) for name in _Inputs._fields]
+        del self.inputs, self.saved, self.layers, self.v_layers, self.v_rows, self.v_splats, self.v
+        return gradients
+
+    def _rows(self) -> Rows:
+        features = self.saved.features.shape[1]
+        return Rows(self.saved.packed, features, self.request.settings.depth)
+
+    def _offset_gradient(self) -> OffsetGradient:
+        """Which gradient ``screen_offsets`` get."""
+        if not _has_gradient(self.inputs.screen_offsets):
+            return None
+        settings = self.request.settings
+        return "absolute" if settings.absgrad else "images" if settings.imagegrad else None
+
+
+def _has_gradient(tensor: Tensor | None) -> bool:
+    return tensor is not None and tensor.requires_grad

@@ -3,15 +3,13 @@
 import warnings
 
 import pytest
-import torch
 
 from tests.reference.covariance import covariance
 from tests.scenes import error, make_camera, make_splats, relative_error
 from warpgs.ops import tiles
 from warpgs.ops.projection import Geometry, View, project
-from warpgs.ops.rows import Rows
+from warpgs.ops.rows import pack
 from warpgs.ops.sh import spherical_harmonics
-from warpgs.runtime.tape import OpContext
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of gsplat itself, on import
@@ -62,9 +60,8 @@ def test_spherical_harmonics_agree(degree):
 
 
 def test_tiles_are_those_of_the_box_that_the_ellipse_intersects():
-    _, ours, _ = splats_and_theirs()
-    ctx = OpContext(torch.device("cpu"), [])
-    result = tiles.record_tiles(ctx, Rows(ctx, ours, 3, False, CAMERA.size), CAMERA.size)
+    splats, ours, _ = splats_and_theirs()
+    result = tiles.bin_splats(*pack(ours, splats.means, with_depth=False), CAMERA.size)
     columns, rows = tiles.num_tiles(*CAMERA.size)
     _, isect_ids, gaussians = theirs._isect_tiles(
         ours.means2d[None], ours.radii[None], ours.depths[None], 16, columns, rows

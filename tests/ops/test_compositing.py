@@ -5,10 +5,12 @@ import torch
 
 from tests.reference.compositing import composite as reference
 from tests.scenes import error, generator, random_like, relative_error, weighted_sum
-from warpgs.ops.compositing import composite
+from warpgs.ops.compositing import composite, composite_bwd, composite_fwd
 from warpgs.ops.projection import Projection
+from warpgs.ops.rows import pack, unpack
+from warpgs.ops.tiles import bin_splats
+from warpgs.runtime import launch
 from warpgs.runtime.launch import command_for
-from warpgs.runtime.tape import OpContext
 
 SIZE = (50, 37)
 INPUTS = ("means2d", "conics", "opacities", "features", "background")
@@ -189,16 +191,16 @@ def test_every_image_equals_that_of_its_splats_rendered_alone(make, seed, monkey
     inputs[2] *= torch.rand(60, generator=generator(seed))
     dynamic = torch.rand(60, generator=generator(seed)) < (0.1, 0.5, 0.9, 0.5)[seed]
     alone = [ours([t if t.shape[0] != 60 else t[selected] for t in inputs], size) for selected in (~dynamic, dynamic)]
-    launch = OpContext._launch
+    launch_on_cpu = launch.launch_on_cpu
     for backwards in (False, True):  # as on a GPU, where a branch's image may begin before the joint one ends
 
-        def run_kernel(run, kernel, dim, arguments, block_dim, work, backwards=backwards):
+        def run_kernel(kernel, dim, arguments, work, backwards=backwards):
             if not backwards or kernel.func.__name__ != "composite_fwd":
-                return launch(run, kernel, dim, arguments, block_dim, work)
+                return launch_on_cpu(kernel, dim, arguments, work)
             for thread in reversed(range(dim)):
-                command_for(kernel, run.device, 1)(1, thread, arguments, None, 0)
+                command_for(kernel, torch.device("cpu"), 1)(1, thread, arguments, None, 0)
 
-        monkeypatch.setattr(OpContext, "_launch", run_kernel)
+        monkeypatch.setattr(launch, "launch_on_cpu", run_kernel)
         result = ours(inputs, size, is_dynamic=dynamic)
         for k, expected in enumerate([ours(inputs, size), *alone]):
             assert torch.equal(result.images[k], expected.images[0])
@@ -230,22 +232,29 @@ FEW = make_inputs(8, size=(20, 17))
         (make_walled_inputs(16, (20, 17)), torch.arange(16) >= 12),
     ],
 )
-def test_absolute_gradient_norms_sum_absolute_values_over_pixels(inputs, dynamic):
+def test_absolute_gradients_on_screen_sum_absolute_values_over_pixels(inputs, dynamic):
     size = (20, 17)
-    single, double = leaves(inputs), leaves(inputs, torch.float64)
-    result = ours(single, size, second_norm="absolute", is_dynamic=dynamic)
+    double = leaves(inputs, torch.float64)
     images = [
         theirs(double, size, selected)[0] for selected in ([None] if dynamic is None else [None, ~dynamic, dynamic])
     ]
     v_outputs = random_like(images)
-    weighted_sum(result.images, v_outputs).backward()
     per_pixel = torch.cat([(i * c).sum(-1).flatten() for i, c in zip(images, v_outputs, strict=True)])
     one_hot = torch.eye(len(per_pixel), dtype=per_pixel.dtype)
     options = {"retain_graph": True, "is_grads_batched": True}
     gradients = torch.cat([torch.autograd.grad(per_pixel, double[0], part, **options)[0] for part in one_hot.split(64)])
-    half_size = torch.tensor([size[0] / 2, size[1] / 2])
-    assert relative_error(result.gradient_norms[:, 0], (gradients.sum(0) * half_size).norm(dim=-1)) < 1e-5
-    assert relative_error(result.gradient_norms[:, 1], (gradients.abs().sum(0) * half_size).norm(dim=-1)) < 1e-5
+
+    means2d, conics, opacities, features, background, depths = inputs
+    radii = torch.full(means2d.shape, 1000, dtype=torch.int32)
+    rows, order = pack(Projection(means2d, conics, depths, opacities, radii), features, with_depth=False)
+    tiles = bin_splats(rows, order, size, None if dynamic is None else dynamic.view(torch.uint8))
+    _, traversal = composite_fwd(rows, tiles, size, background, statistics=False)
+    v_layers = [*v_outputs, *[None] * len(images)]
+    for kind, per_gaussian in ((None, gradients), ("absolute", gradients.abs())):
+        v_rows = composite_bwd(rows, background, traversal, v_layers, kind)
+        v_splats = unpack((conics, opacities), rows, v_rows, size, with_offsets=True, offset_gradient=kind)
+        expected = per_gaussian.sum(0) * torch.tensor(size) / 2
+        assert relative_error(v_splats.screen_offsets, expected) < 1e-5
 
 
 @pytest.mark.parametrize(

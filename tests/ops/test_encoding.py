@@ -9,7 +9,7 @@ from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
 from warpgs.kernels.encoding import CUDA_LANES_LOG2, make_encode
 from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
-from warpgs.runtime.tape import OpContext
+from warpgs.runtime.launch import launch
 
 TIME = torch.tensor([0.3])
 BOX = (torch.zeros(3), torch.ones(3))
@@ -77,9 +77,8 @@ def test_several_threads_per_row_write_the_same_as_one(raw):
     means = random_means(5)
     expected = encode_unit_box(means, 10, 3, offset=8, raw=raw)
     encoding = torch.empty_like(expected)
-    ctx = OpContext(means.device, [])
     threads = 5 * 4 << CUDA_LANES_LOG2
-    ctx.launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, int(raw), CUDA_LANES_LOG2, encoding)
+    launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, int(raw), CUDA_LANES_LOG2, encoding)
     assert torch.equal(encoding[:, 8:], expected[:, 8:])
 
 

@@ -9,9 +9,8 @@ from warpgs.kernels import tiles as kernels
 from warpgs.ops import tiles
 from warpgs.ops.compositing import composite
 from warpgs.ops.projection import Geometry, Projection, View, project
-from warpgs.ops.rows import Rows
+from warpgs.ops.rows import pack
 from warpgs.rendering import render
-from warpgs.runtime.tape import OpContext
 
 NUM = 120
 
@@ -22,13 +21,12 @@ def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
     return project(geometry, View(camera.viewmat, camera.K, *camera.size))
 
 
-def binned(splats: Projection, width=WIDTH, height=HEIGHT) -> tuple[list[list[int]], int]:
+def binned(splats: Projection, width=WIDTH, height=HEIGHT, max_intersections=None) -> tuple[list[list[int]], int]:
     """The list of each tile, and the number of intersections."""
-    ctx = OpContext(torch.device("cpu"), [])
-    rows = Rows(ctx, splats, 3, False, (width, height))
-    result = tiles.record_tiles(ctx, rows, (width, height))
+    packed = pack(splats, torch.rand(len(splats.depths), 3), with_depth=False)
+    result = tiles.bin_splats(*packed, (width, height), max_intersections=max_intersections)
     isects = result.gaussian_from_isect.tolist()
-    return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.demand.item())
+    return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.num_isects)
 
 
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (16, 16), (1, 1), (130, 7)])
@@ -75,9 +73,11 @@ def test_equal_depths_keep_the_order_of_the_input():
         assert listed == sorted(listed)
 
 
-def test_the_demand_is_the_length_of_all_lists():
-    lists, demand = binned(projected())
-    assert sum(map(len, lists)) == demand
+@pytest.mark.parametrize("max_intersections", [None, 10_000])
+def test_the_number_of_intersections_is_the_length_of_all_lists(max_intersections):
+    lists, number = binned(projected(), max_intersections=max_intersections)
+    assert sum(map(len, lists)) == number
+    assert lists == binned(projected())[0]
 
 
 def test_culled_gaussians_are_in_no_list():
@@ -103,35 +103,16 @@ def test_a_gaussian_in_a_corner_leaves_the_other_tiles_empty():
 
 
 def test_no_gaussians_make_empty_lists():
-    lists, demand = binned(Projection(*(t[:0] for t in projected())))
+    lists, number = binned(Projection(*(t[:0] for t in projected())))
     assert lists == [[]] * 12
-    assert demand == 0
+    assert number == 0
 
 
 def test_all_gaussians_culled_make_empty_lists():
     splats = projected()
-    lists, demand = binned(splats._replace(radii=torch.zeros_like(splats.radii)))
+    lists, number = binned(splats._replace(radii=torch.zeros_like(splats.radii)))
     assert lists == [[]] * 12
-    assert demand == 0
-
-
-class _IgnoresDemand(torch.Tensor):
-    """A counter that ignores the demand."""
-
-    def copy_(self, *_):
-        return self
-
-
-@pytest.fixture
-def too_small(monkeypatch):
-    """Buffers hold only one intersection for each Gaussian."""
-
-    def budget(device, _width, _height):
-        result = tiles._Budget(device)
-        result.demand = result.demand.as_subclass(_IgnoresDemand)
-        return result
-
-    monkeypatch.setattr(tiles, "_budget", budget)
+    assert number == 0
 
 
 def images_and_gradients(is_dynamic):
@@ -144,45 +125,32 @@ def images_and_gradients(is_dynamic):
 
 
 @pytest.mark.parametrize("is_dynamic", [None, torch.arange(NUM) % 3 == 0])
-def test_buffer_overflow_renders_the_same_image(is_dynamic, request):
-    _, demand = binned(projected())
-    assert demand > NUM
+def test_more_intersections_than_expected_give_the_same_image(is_dynamic, monkeypatch):
     expected = images_and_gradients(is_dynamic)
-    request.getfixturevalue("too_small")
+    capacity = tiles._capacity
+    monkeypatch.setattr(tiles, "_capacity", lambda end_of_rank, size, _: capacity(end_of_rank, size, 1))
     actual = images_and_gradients(is_dynamic)
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)
 
 
-def test_with_buffer_overflow_every_tile_lists_all_gaussians_in_depth_order(too_small):
+def test_with_too_many_intersections_every_tile_lists_all_gaussians_in_depth_order():
     splats = projected()
-    lists, demand = binned(splats)
-    assert demand > NUM
+    lists, number = binned(splats, max_intersections=1)
+    assert number == binned(splats)[1] > NUM
     keys = torch.where(splats.radii[:, 0] > 0, splats.depths, torch.inf)
     assert lists == [keys.argsort(stable=True).tolist()] * 12
 
 
-def test_the_next_budget_covers_the_demand_and_little_more():
-    budget = tiles._Budget(torch.device("cpu"))
-    for demand in (0, 5_000, 123_457, 40):
-        budget.demand.fill_(demand)
-        capacity = budget.capacity(3_000)
-        wanted = max(demand * tiles.HEADROOM, 3_000)
-        assert capacity >= wanted
-        assert demand == 40 or capacity <= 1.13 * wanted
-
-
-def test_a_budget_reports_whether_buffers_fit():
-    budget = tiles._Budget(torch.device("cpu"))
+def test_the_next_budget_covers_the_number_of_intersections_and_little_more():
+    budget = tiles._Budget()
     assert budget.recent_max is None
-    assert budget.capacity(3_000) < 4_000
-    assert budget.recent_max == 0.0  # a frame without visible Gaussians
-    budget.demand.fill_(100_000)
-    capacity = budget.capacity(3_000)
-    assert budget.fits(capacity, 3_000)
-    assert budget.fits(100_000, 3_000)
-    assert not budget.fits(99_999, 3_000)
-    assert not budget.fits(3 * capacity, 3_000)
+    for number in (0, 5_000, 123_457, 40):
+        budget.num_isects.fill_(number)
+        capacity = budget.capacity(3_000)
+        wanted = max(number * tiles.HEADROOM, 3_000)
+        assert capacity >= wanted
+        assert number == 40 or capacity <= 1.13 * wanted
 
 
 def test_a_budget_learned_in_inference_mode_works_outside_of_it():
@@ -207,9 +175,8 @@ def test_removing_gaussians_only_removes_them_from_the_lists():
 def test_the_lists_of_tiles_are_split_by_branch_in_order(fraction):
     splats = projected()
     is_dynamic = torch.rand(NUM, generator=generator()) < fraction
-    ctx = OpContext(torch.device("cpu"), [])
-    rows = Rows(ctx, splats, 3, False, (WIDTH, HEIGHT))
-    result = tiles.record_tiles(ctx, rows, (WIDTH, HEIGHT), is_dynamic.view(torch.uint8))
+    packed = pack(splats, torch.rand(NUM, 3), with_depth=False)
+    result = tiles.bin_splats(*packed, (WIDTH, HEIGHT), is_dynamic.view(torch.uint8))
     joint, _ = binned(splats)
     assert len(joint) == len(result.ranges)
     for listed, (begin, end), (num_static, num_dynamic) in zip(

@@ -14,6 +14,7 @@ from warpgs.rendering import render
 from warpgs.runs.checkpoint import Metadata
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
+from warpgs.runtime.profiling import profile
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -86,7 +87,7 @@ def test_a_frame_is_captured_on_whatever_thread_plays_it_first(data, tmp_path):
 
 @pytest.mark.parametrize("opacity", [False, True])
 @pytest.mark.parametrize("captured", [False, True])
-def test_render_waits_for_late_colours(data, tmp_path, opacity, captured):
+def test_concurrent_networks_compute_the_same_as_one_after_the_other(data, tmp_path, opacity, captured):
     model = dataclasses.replace(tiny.MODEL, appearance_opacity=opacity)
     trainer = trainer_on_cuda(data, tmp_path / "run", model=model)
     tiny.train(trainer)
@@ -94,15 +95,14 @@ def test_render_waits_for_late_colours(data, tmp_path, opacity, captured):
     scene.requires_grad_(True)
     time = torch.tensor([camera.time], device="cuda")
 
-    def image_and_gradients(late):
-        image = render(scene.splats(time, late_sh=late), camera).joint.image
+    def image_and_gradients():
+        image = render(scene.splats(time), camera).joint.image
         return (image.detach(), *torch.autograd.grad(image.square().sum(), list(scene.parameters())))
 
-    def with_late_colours():
-        return image_and_gradients(late=True)
-
-    late = capture(with_late_colours)() if captured else with_late_colours()
-    for actual, expected in zip(late, image_and_gradients(late=False), strict=True):
+    concurrent = capture(image_and_gradients)() if captured else image_and_gradients()
+    with profile():  # which turns concurrency off
+        serial = image_and_gradients()
+    for actual, expected in zip(concurrent, serial, strict=True):
         assert relative_error(actual, expected) < 1e-4
 
 

@@ -224,14 +224,16 @@ def test_the_mean_gradient_is_over_the_views_with_the_gaussian_visible():
     statistics = GradientStatistics(3, torch.device("cpu"))
     norms = torch.tensor([1.0, 5.0, 2.0])
     for scale, seen in ((1.0, [1, 0, 1]), (3.0, [1, 0, 0]), (8.0, [1, 0, 1])):
-        statistics.observe(scale * norms, torch.tensor(seen, dtype=torch.int32)[:, None].repeat(1, 2))
+        statistics.screen_offsets.grad = scale * norms[:, None] * torch.tensor([0.6, -0.8])
+        statistics.observe(torch.tensor(seen, dtype=torch.int32)[:, None].repeat(1, 2))
     assert error(statistics.mean(), torch.tensor([(1 + 3 + 8) / 3, 0.0, (2 + 16) / 2])) < 1e-6
 
 
 def test_gradients_of_culled_gaussians_do_not_count_even_if_not_finite():
     statistics = GradientStatistics(2, torch.device("cpu"))
     radii = torch.tensor([[0, 0], [3, 4]], dtype=torch.int32)
-    statistics.observe(torch.tensor([math.nan, 2.0]), radii)
+    statistics.screen_offsets.grad = torch.tensor([[math.nan, 1.0], [0.0, 2.0]])
+    statistics.observe(radii)
     assert statistics.mean().tolist() == [0.0, 2.0]
 
 

@@ -12,29 +12,27 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.ops.projection import Geometry, View, record_projection
-from warpgs.ops.rows import Rows
+from warpgs.ops.projection import Geometry, View, project_fwd
+from warpgs.ops.rows import pack
 from warpgs.ops.ssim import ssim
-from warpgs.ops.tiles import record_tiles
+from warpgs.ops.tiles import bin_splats
 from warpgs.runtime.graphs import capture
 from warpgs.runtime.profiling import KernelTime, profile
-from warpgs.runtime.replay import EAGER_CALLS
-from warpgs.runtime.tape import OpContext
 
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
 from .workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
 
-WARM_UPS = {"cuda": 50 + EAGER_CALLS, "cpu": 1}
-"""Runs before the first measured one. On CUDA they record replays and bring clock rates and threads to a steady state;
-on CPU, where runs take long, one run compiles the kernels."""
+WARM_UPS = {"cuda": 50, "cpu": 1}
+"""Runs before the first measured one. On CUDA they bring clock rates and threads to a steady state; on CPU, where runs
+take long, one run compiles the kernels."""
 
 VISIBLE_DIFFERENCE = 1e-3
 """A pixel that differs by more than this in any channel counts as visibly different."""
 
 STAGES = {
-    "project": ("project_fwd", "sh_fwd", "pack", "pack_features"),
+    "project": ("project_fwd", "sh_fwd", "pack"),
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
@@ -142,12 +140,11 @@ def peak_memory(workload: Workload) -> Measurements:
 @torch.no_grad()
 def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings) -> int:
     """Number of pairs of a Gaussian and a tile that it intersects."""
-    ctx = OpContext(splats.means.device, [])
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     view = View(camera.viewmat, camera.K, *camera.size)
-    projection = record_projection(ctx, geometry, view, settings.near, settings.antialias)
-    rows = Rows(ctx, projection, splats.num_channels, settings.depth, camera.size)
-    begins, ends = record_tiles(ctx, rows, camera.size).ranges.unbind(-1)
+    projection = project_fwd(geometry, view, settings.near, settings.antialias)
+    features = splats.means  # any will do
+    begins, ends = bin_splats(*pack(projection, features, with_depth=False), camera.size).ranges.unbind(-1)
     return int((ends - begins).sum())
 
 

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
 from warpgs.ops.activation import Changes, activate, join_sh
-from warpgs.runtime.streams import join, on_side_stream
+from warpgs.runtime.streams import concurrently
 
 from .appearance import AppearanceField
 from .fields import make_deformation
@@ -59,7 +59,6 @@ class SplitScene(nn.Module):
         use_appearance: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, "1"] | None = None,
-        late_sh: bool = False,
     ) -> Splats:
         """The activated Gaussians at a time, static ones first.
 
@@ -69,25 +68,21 @@ class SplitScene(nn.Module):
             use_appearance: Whether the appearance network changes the static ones (paper Eq. 8).
             sh_degree: Maximum degree of spherical harmonics to use; all if None.
             time_noise: Added to the time that the deformation network sees (annealed smoothing of Deformable-3DGS).
-            late_sh: Whether ``sh`` may still be computed on ``sh_stream``, for which ``render`` waits; ``time`` must
-                stay alive until then.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = None
-        with on_side_stream(device) as stream:
-            if use_appearance and len(static):
-                residuals, logit_residuals = self.appearance(static.means, time)
-            sh = join_sh(static.raw(), dynamic.raw(), residuals)
         offsets = None
-        if use_deformation and len(dynamic):
-            offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
-        if not late_sh or logit_residuals is not None:
-            join(stream)
-            stream = None
+        with concurrently(device) as beside:
+            with beside:
+                if use_appearance and len(static):
+                    residuals, logit_residuals = self.appearance(static.means, time)
+                sh = join_sh(static.raw(), dynamic.raw(), residuals)
+            if use_deformation and len(dynamic):
+                offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
-        return Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, sh_stream=stream)
+        return Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
 
     def static_splats(self, sh_degree: int | None = None) -> Splats:
         """The static Gaussians alone, with their own appearance w⁰."""

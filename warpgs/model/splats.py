@@ -9,7 +9,6 @@ from torch import Tensor
 
 from warpgs.ops.sh import check_coefficients
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.streams import join
 
 
 @dataclass(frozen=True)
@@ -25,8 +24,6 @@ class Splats:
         sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
         sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
-        sh_stream: CUDA stream on which ``sh`` may still be computed, which ``render`` joins before it reads ``sh``;
-            None if ``sh`` is computed on the current stream.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -40,7 +37,6 @@ class Splats:
     sh: Float[Tensor, "N bases 3"] | None = None
     is_dynamic: Bool[Tensor, " N"] | None = None
     sh_degree: int | None = None
-    sh_stream: torch.cuda.Stream | None = None
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -72,6 +68,5 @@ class Splats:
 
     def to(self, device: torch.device | str) -> "Splats":
         """A copy on another device."""
-        join(self.sh_stream)
         tensors = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
-        return dataclasses.replace(self, **tensors, sh_stream=None)
+        return dataclasses.replace(self, **tensors)

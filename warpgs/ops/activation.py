@@ -3,7 +3,7 @@
 Geometry and colours are separate ops, so that the appearance network can run while geometry is activated and binned.
 """
 
-from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -12,7 +12,8 @@ from torch import Tensor
 
 from warpgs.kernels import activation as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext, differentiable
+from warpgs.runtime.launch import launch
+from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 NUM_GEOMETRY = 4
 """Number of fields of ``Raw`` that are not colours."""
@@ -82,17 +83,34 @@ def activate(
         ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
     """
     _check_geometry(("static", static, static_changes), ("dynamic", dynamic, dynamic_changes))
+    inputs = (*static[:NUM_GEOMETRY], *static_changes, *dynamic[:NUM_GEOMETRY], *dynamic_changes)
+    return Activated(*differentiable(_activate, *inputs))
 
-    def op(ctx: OpContext, *tensors: Any) -> tuple[Tensor, ...]:
-        half = len(tensors) // 2
-        N = len(tensors[0]) + len(tensors[half])
-        out = Activated(ctx.empty(N, 3), ctx.empty(N, 4), ctx.empty(N, 3), ctx.empty(N))
-        for branch, first_row in ((tensors[:half], 0), (tensors[half:], len(tensors[0]))):
-            _record_branch(ctx, branch[:NUM_GEOMETRY], Changes(*branch[NUM_GEOMETRY:]), out, first_row)
-        return tuple(out)
 
-    static_inputs = (*static[:NUM_GEOMETRY], *static_changes)
-    return Activated(*differentiable(op, *static_inputs, *dynamic[:NUM_GEOMETRY], *dynamic_changes))
+def _activate(*tensors: Any) -> Recorded:
+    half = len(tensors) // 2
+    branches, num_static = (tensors[:half], tensors[half:]), len(tensors[0])
+    N, new = num_static + len(tensors[half]), tensors[0].new_empty
+    out = Activated(new(N, 3), new(N, 4), new(N, 3), new(N))
+    for branch, first_row in zip(branches, (0, num_static), strict=True):
+        launch(kernels.activate_fwd, len(branch[0]), first_row, *branch, *out)
+    return Recorded(tuple(out), _activate_backward, (*tensors, out.scales, out.opacities))
+
+
+def _activate_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients:
+    *tensors, scales, opacities = saved
+    half = len(tensors) // 2
+    columns = ((3,), (4,), (3,), ())
+    v_out = [scales.new_zeros(len(scales), *c) if v is None else v for v, c in zip(v_outputs, columns, strict=True)]
+    gradients: list[Tensor | None] = []
+    for branch, first_row in ((tensors[:half], 0), (tensors[half:], len(tensors[0]))):
+        _, quats, *_, offsets, logit_residuals = branch
+        v_raw = [torch.empty_like(t) for t in branch[:NUM_GEOMETRY]]
+        v_offsets = None if offsets is None else torch.empty_like(offsets)
+        inputs = (quats, offsets, scales, opacities, *v_out)
+        launch(kernels.activate_bwd, len(quats), first_row, *inputs, *v_raw, v_offsets)
+        gradients += [*v_raw, v_offsets, None if logit_residuals is None else v_raw[-1]]
+    return gradients
 
 
 def _check_geometry(*branches: tuple[str, Raw, Changes]) -> None:
@@ -110,34 +128,6 @@ def _check_geometry(*branches: tuple[str, Raw, Changes]) -> None:
     check_same_device(tensors)
 
 
-def _record_branch(ctx: OpContext, raw: Sequence[Tensor], changes: Changes, out: Activated, first_row: int) -> None:
-    """Writes the geometry of one branch to the rows of the output from ``first_row`` on."""
-    N, quats = len(raw[0]), raw[1]
-    ctx.launch(kernels.activate_fwd, N, first_row, *raw, *changes, *out)
-
-    def backward(ctx: OpContext) -> None:
-        v_out = [torch.zeros_like(t) if (v := ctx.gradient(t)) is None else v for t in out]
-        v_raw = [ctx.empty(*t.shape) for t in raw]
-        v_offsets = None if changes.offsets is None else ctx.empty(N, 10)
-        ctx.launch(
-            kernels.activate_bwd,
-            N,
-            first_row,
-            quats,
-            changes.offsets,
-            out.scales,
-            out.opacities,
-            *v_out,
-            *v_raw,
-            v_offsets,
-        )
-        for tensor, value in zip((*raw, *changes), (*v_raw, v_offsets, v_raw[-1]), strict=True):
-            if tensor is not None and value is not None:
-                ctx.add_gradient(tensor, value)
-
-    ctx.on_backward(backward, reads=(out.scales, out.opacities))
-
-
 def join_sh(static: Raw, dynamic: Raw, residuals: Float[Tensor, "N R 3"] | None = None) -> Float[Tensor, "M bases 3"]:
     """Joins the spherical harmonics coefficients of both branches, static ones first; differentiable in everything.
 
@@ -150,14 +140,25 @@ def join_sh(static: Raw, dynamic: Raw, residuals: Float[Tensor, "N R 3"] | None 
     """
     bases = _check_coefficients(static, dynamic, residuals)
 
-    def op(ctx: OpContext, *tensors: Any) -> tuple[Tensor, ...]:
-        num_static = len(tensors[0])
-        sh = ctx.empty(num_static + len(tensors[3]), bases, 3)
-        _record_sh_branch(ctx, tensors[:3], sh, 0)
-        _record_sh_branch(ctx, (*tensors[3:], None), sh, num_static)
-        return (sh,)
+    inputs = (static.sh_dc, static.sh_rest, residuals, dynamic.sh_dc, dynamic.sh_rest, None)
+    return differentiable(partial(_join_sh, bases), *inputs)[0]
 
-    return differentiable(op, static.sh_dc, static.sh_rest, residuals, dynamic.sh_dc, dynamic.sh_rest)[0]
+
+def _join_sh(bases: int, *tensors: Any) -> Recorded:
+    num_static = len(tensors[0])
+    sh = tensors[0].new_empty(num_static + len(tensors[3]), bases, 3)
+    for parts, first_row in ((tensors[:3], 0), (tensors[3:], num_static)):
+        launch(kernels.join_sh_fwd, len(parts[0]) * bases, first_row, *parts, sh)
+    return Recorded((sh,), _join_sh_backward, tensors)
+
+
+def _join_sh_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients:
+    (v_sh,) = v_outputs
+    assert v_sh is not None
+    v_inputs = [None if t is None else torch.empty_like(t) for t in saved]
+    for k, first_row in ((0, 0), (3, len(saved[0]))):
+        launch(kernels.join_sh_bwd, len(saved[k]) * v_sh.shape[1], first_row, v_sh, *v_inputs[k : k + 3])
+    return v_inputs
 
 
 def _check_coefficients(static: Raw, dynamic: Raw, residuals: Tensor | None) -> int:
@@ -178,24 +179,3 @@ def _check_coefficients(static: Raw, dynamic: Raw, residuals: Tensor | None) -> 
             raise ValueError(f"sh_residuals has {sizes['R']} bases, but there are only {bases}")
     check_same_device(tensors)
     return bases
-
-
-def _record_sh_branch(ctx: OpContext, parts: Sequence[Tensor | None], sh: Tensor, first_row: int) -> None:
-    """Writes the coefficients of one branch (sh_dc, sh_rest, residuals) to the rows from ``first_row`` on."""
-    sh_dc, _, residuals = parts
-    assert sh_dc is not None
-    threads = len(sh_dc) * sh.shape[1]
-    ctx.launch(kernels.join_sh_fwd, threads, first_row, *parts, sh)
-
-    def backward(ctx: OpContext) -> None:
-        v_sh = ctx.gradient(sh)
-        if v_sh is None:
-            return
-        inputs = [t for t in parts if t is not None]
-        v_inputs = [ctx.empty(*t.shape) for t in inputs]
-        v_residuals = None if residuals is None else v_inputs[2]
-        ctx.launch(kernels.join_sh_bwd, threads, first_row, v_sh, *v_inputs[:2], v_residuals)
-        for tensor, value in zip(inputs, v_inputs, strict=True):
-            ctx.add_gradient(tensor, value)
-
-    ctx.on_backward(backward)

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from warpgs.kernels import adam as kernels
-from warpgs.runtime.tape import OpContext
+from warpgs.runtime.launch import launch
 
 
 class Adam(torch.optim.Optimizer):
@@ -37,11 +37,10 @@ class Adam(torch.optim.Optimizer):
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
         torch._foreach_add_([self.state[parameter]["step"] for _, parameter in trained], 1.0)
-        ctx = OpContext(trained[0][1].device, [])
         for group, parameter in trained:
             state = self.state[parameter]
             betas = [value for beta in group["betas"] for value in (beta, 1.0 - beta, math.log(beta))]
-            ctx.launch(
+            launch(
                 kernels.adam_step,
                 parameter.numel(),
                 parameter.grad.contiguous().view(-1),

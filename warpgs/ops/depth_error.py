@@ -6,7 +6,8 @@ from torch import Tensor
 
 from warpgs.kernels import depth_error as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import LITTLE_WORK, OpContext, differentiable
+from warpgs.runtime.launch import LITTLE_WORK, launch
+from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 
 def depth_error(
@@ -31,22 +32,21 @@ def depth_error(
         ValueError: On a wrong shape, dtype or device, or an image without pixels.
     """
     _check_inputs({"depth": depth, "alpha": alpha, "inverse_depth": inverse_depth}, alignment, region)
+    num_pixels, mask = depth.numel(), region.view(torch.uint8).view(-1)
 
-    def op(ctx: OpContext, depth: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-        inputs = (depth.view(-1), *(t.view(-1) for t in others), region.view(torch.uint8).view(-1))
-        errors = ctx.empty(depth.numel())
-        ctx.launch(kernels.depth_error_fwd, depth.numel(), *inputs, errors, work=LITTLE_WORK)
-        result = errors.mean()
+    def op(*tensors: Tensor) -> Recorded:
+        errors = tensors[0].new_empty(num_pixels)
+        inputs = (*(t.view(-1) for t in tensors), mask)
+        launch(kernels.depth_error_fwd, num_pixels, *inputs, errors, work=LITTLE_WORK)
+        return Recorded((errors.mean(),), backward, tensors)
 
-        def backward(ctx: OpContext) -> None:
-            if (v := ctx.gradient(result)) is not None:
-                v_depth = ctx.empty(*depth.shape)
-                gradients = (1.0 / depth.numel(), v.view(1), v_depth.view(-1))
-                ctx.launch(kernels.depth_error_bwd, depth.numel(), *inputs, *gradients, work=LITTLE_WORK)
-                ctx.add_gradient(depth, v_depth)
-
-        ctx.on_backward(backward)
-        return (result,)
+    def backward(saved: tuple[Tensor, ...], v_outputs: Gradients) -> Gradients:
+        (v_mean,) = v_outputs
+        assert v_mean is not None
+        v_depth = torch.empty_like(saved[0])
+        outputs = (1.0 / num_pixels, v_mean.view(1), v_depth.view(-1))
+        launch(kernels.depth_error_bwd, num_pixels, *(t.view(-1) for t in saved), mask, *outputs, work=LITTLE_WORK)
+        return v_depth, None, None, None
 
     return differentiable(op, depth, alpha.detach(), inverse_depth.detach(), alignment.detach())[0]
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from warpgs.kernels import encoding as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext
+from warpgs.runtime.launch import launch
 
 ALIGNMENT = 8
 """Rows are padded with zeros to multiples of this: tensor cores need rows of multiples of 16 bytes."""
@@ -39,13 +39,11 @@ def encode(
         ValueError: On a wrong shape, dtype or device.
     """
     _check_inputs(means, {"time": time, "center": box[0], "half_size": box[1]})
-    with torch.no_grad():
-        ctx = OpContext(means.device, [])
-        columns = aligned(encoded_size(*bands, raw))
-        encoding = ctx.empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
-        lanes_log2 = kernels.CUDA_LANES_LOG2 if ctx.is_cuda else 0
-        arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
-        ctx.launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
+    columns = aligned(encoded_size(*bands, raw))
+    encoding = means.new_empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
+    lanes_log2 = kernels.CUDA_LANES_LOG2 if means.is_cuda else 0
+    arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
+    launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
 
 

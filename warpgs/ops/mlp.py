@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import mlp as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext
+from warpgs.runtime.launch import launch
 
 from .encoding import ALIGNMENT
 
@@ -203,6 +203,5 @@ def relu_backward(
             f"gradients must have a multiple of {kernels.PIECE} columns, "
             f"{features.shape[1]} at most as features have, got {columns}"
         )
-    ctx = OpContext(gradients.device, [])
     pieces = columns // kernels.PIECE
-    ctx.launch(kernels.relu_bwd, len(sums) * pieces, features, gradients, sums, work=ROWS_PER_CHUNK)
+    launch(kernels.relu_bwd, len(sums) * pieces, features, gradients, sums, work=ROWS_PER_CHUNK)

@@ -1,6 +1,7 @@
 """EWA projection of Gaussians to splats (kernels/projection.py)."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int32
@@ -9,7 +10,8 @@ from torch import Tensor, int32
 from warpgs.config import RenderSettings
 from warpgs.kernels import projection as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext, differentiable
+from warpgs.runtime.launch import launch
+from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 
 class Geometry(NamedTuple):
@@ -61,50 +63,63 @@ class Projection(NamedTuple):
     radii: Int32[Tensor, "N 2"]
 
 
-def record_projection(ctx: OpContext, geometry: Geometry, view: View, near: float, antialias: bool) -> Projection:
-    """``project`` as a part of a larger op, without checks."""
-    N = len(geometry.means)
-    splats = Projection(ctx.empty(N, 2), ctx.empty(N, 3), ctx.empty(N), ctx.empty(N), ctx.empty(N, 2, dtype=int32))
-    ctx.launch(
-        kernels.project_fwd,
-        N,
-        *geometry,
-        *view,
-        near,
-        int(antialias),
-        splats.means2d,
-        splats.conics,
-        splats.depths,
-        splats.radii,
-        splats.opacities,
+def project_fwd(
+    geometry: Geometry, view: View, near: float, antialias: bool, screen_offsets: Tensor | None = None
+) -> Projection:
+    """``project`` without checks; ``screen_offsets`` [N, 2] are added to the means, in halves of the image size."""
+    means = geometry.means
+    N = len(means)
+    splats = Projection(
+        means2d=means.new_empty(N, 2),
+        conics=means.new_empty(N, 3),
+        depths=means.new_empty(N),
+        opacities=means.new_empty(N),
+        radii=means.new_empty(N, 2, dtype=int32),
     )
-
-    def backward(ctx: OpContext) -> None:
-        v_splats = [ctx.gradient(t) for t in (splats.means2d, splats.conics, splats.depths, splats.opacities)]
-        v_geometry = [ctx.empty(*t.shape) for t in geometry]
-        with_camera = ctx.needs_gradient(view.viewmat) or ctx.needs_gradient(view.K)
-        v_cameras = ctx.empty(N, kernels.CAMERA_GRADIENTS if with_camera else 0)
-        inputs = (*geometry, *view, int(antialias), splats.conics, splats.radii)
-        ctx.launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras)
-        for tensor, gradient in zip(geometry, v_geometry, strict=True):
-            ctx.add_gradient(tensor, gradient)
-        if with_camera:
-            _add_camera_gradients(ctx, view, v_cameras.sum(0))
-
-    ctx.on_backward(backward, reads=(splats.conics, splats.radii))
+    launch(kernels.project_fwd, N, *geometry, *view, near, int(antialias), screen_offsets, *splats)
     return splats
 
 
-def _add_camera_gradients(ctx: OpContext, view: View, sums: Float[Tensor, "16"]) -> None:
-    """Adds to the gradients of ``viewmat`` and ``K``; their constant last rows get none."""
-    if ctx.needs_gradient(view.viewmat):
-        v_viewmat = torch.zeros_like(view.viewmat)
-        v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
-        ctx.add_gradient(view.viewmat, v_viewmat)
-    if ctx.needs_gradient(view.K):
-        v_K = torch.zeros_like(view.K)
-        v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
-        ctx.add_gradient(view.K, v_K)
+class ProjectionGradients(NamedTuple):
+    """Gradients of the fields of a ``Projection`` that have one; None stands for zeros."""
+
+    v_means2d: Tensor | None
+    v_conics: Tensor | None
+    v_depths: Tensor | None
+    v_opacities: Tensor | None
+
+
+def project_bwd(
+    geometry: Geometry,
+    view: View,
+    antialias: bool,
+    splats: tuple[Tensor, Tensor],
+    v_splats: Sequence[Tensor | None],
+    v_means_of_colors: Tensor | None = None,
+) -> tuple[Geometry, Tensor | None, Tensor | None]:
+    """Gradients of the geometry, and of ``viewmat`` and ``K`` if one of them requires a gradient.
+
+    Args:
+        geometry, view, antialias: As in ``project_fwd``.
+        splats: Conics and radii of its result.
+        v_splats: Gradients of means2d, conics, depths and opacities of its result; None for zeros.
+        v_means_of_colors: [N, 3] gradient of the means through the colours, to be added; overwritten.
+    """
+    N = len(geometry.means)
+    v_geometry = Geometry(*(torch.empty_like(t) for t in geometry))
+    if v_means_of_colors is not None:
+        v_geometry = v_geometry._replace(means=v_means_of_colors)
+    with_camera = view.viewmat.requires_grad or view.K.requires_grad
+    v_cameras = geometry.means.new_empty(N, kernels.CAMERA_GRADIENTS if with_camera else 0)
+    inputs = (*geometry, *view, int(antialias), *splats)
+    launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras, v_means_of_colors)
+    if not with_camera:
+        return v_geometry, None, None
+    sums = v_cameras.sum(0)
+    v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
+    v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
+    v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
+    return v_geometry, v_viewmat, v_K
 
 
 def project(
@@ -128,11 +143,18 @@ def project(
         ValueError: On a wrong shape, dtype, device or size.
     """
     _check_inputs(geometry, view)
-    size = view[2:]
+    width, height = view.width, view.height
 
-    def op(ctx: OpContext, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def op(*tensors: Any) -> Recorded:
         *geometry, viewmat, K = tensors
-        return record_projection(ctx, Geometry(*geometry), View(viewmat, K, *size), near, antialias)
+        splats = project_fwd(Geometry(*geometry), View(viewmat, K, width, height), near, antialias)
+        return Recorded(splats[:4], backward, (*tensors, splats.conics, splats.radii), constants=(splats.radii,))
+
+    def backward(saved: tuple[Any, ...], v_splats: Gradients) -> Gradients:
+        *geometry, viewmat, K, conics, radii = saved
+        view = View(viewmat, K, width, height)
+        v_geometry, *v_camera = project_bwd(Geometry(*geometry), view, antialias, (conics, radii), v_splats)
+        return *v_geometry, *v_camera
 
     return Projection(*differentiable(op, *geometry, view.viewmat, view.K))
 

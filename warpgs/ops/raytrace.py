@@ -8,7 +8,7 @@ from torch import Tensor
 
 from warpgs.kernels import raytrace as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext, differentiable
+from warpgs.runtime.launch import launch
 
 SPHERE, CUBE, TORUS, BLOB = 0, 1, 2, 3
 """Unit shapes; the torus is around z and has radii 1 and 0.3, the blob has three lobes around z."""
@@ -72,15 +72,12 @@ def raytrace(
     check_image_size(*size)
     width, height = size
 
-    def op(ctx: OpContext, *inputs: Tensor) -> tuple[Tensor, ...]:
-        image, depth = ctx.empty(height, width, 3), ctx.empty(height, width)
-        hits = ctx.empty(height, width, dtype=torch.int32)
-        outputs = (image.view(-1, 3), depth.view(-1), hits.view(-1))
-        ctx.launch(kernels.raytrace_fwd, width * height, *inputs, width, *outputs, work=len(samples))
-        return image, depth, hits
-
-    with torch.no_grad():
-        return TracedImage(*differentiable(op, *bodies, lamp, samples, viewmat, K))
+    image, depth = lamp.new_empty(height, width, 3), lamp.new_empty(height, width)
+    hits = lamp.new_empty(height, width, dtype=torch.int32)
+    outputs = (image.view(-1, 3), depth.view(-1), hits.view(-1))
+    inputs = (*bodies, lamp, samples, viewmat, K, width)
+    launch(kernels.raytrace_fwd, width * height, *inputs, *outputs, work=len(samples))
+    return TracedImage(image, depth, hits)
 
 
 def _check_inputs(bodies: Bodies, lamp: Tensor, samples: Tensor, viewmat: Tensor, K: Tensor) -> None:

@@ -1,94 +1,92 @@
 """Splat rows: what compositing needs of each Gaussian, in pieces of 16 bytes (kernels/rows.py)."""
 
+from typing import NamedTuple
+
+import torch
 from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
-from warpgs.runtime.tape import OpContext
+from warpgs.kernels.rows import OffsetGradient
+from warpgs.runtime.launch import launch
 
 from .projection import Projection
 
 
-class Rows:
-    """Packed splats; the constructor packs their geometry, ``add_features`` their features.
-
-    Binning needs the geometry alone, so that features may be computed meanwhile; compositing needs both.
-
-    Args:
-        ctx: Of the op that this is a part of.
-        splats: N projected Gaussians. Radii of those that are skipped are set to 0.
-        num_features: Number of features that will be added.
-        with_depth: Whether depth is one more channel after the features.
-        size: (width, height) of the image [px].
+class Rows(NamedTuple):
+    """Packed splats.
 
     Attributes:
         packed: [N, parts, 4] rows.
-        num_features, with_depth: As given.
-        num_channels: Number of features, plus one with depth.
-        gradient_norms: [N, 2] length of the gradient of the screen-space mean and of a second one (``SecondNorm``;
-            zero without), in normalised device coordinates (pixels × size / 2) as in the densification of 3DGS; zero
-            until the backward pass.
-        depth_keys, gaussian_from_rank: [2 N] int32 input of the depth sort, in the first half.
+        num_features: Number of features.
+        with_depth: Whether depth is one more channel after the features.
     """
 
-    def __init__(
-        self, ctx: OpContext, splats: Projection, num_features: int, with_depth: bool, size: tuple[int, int]
-    ) -> None:
-        N = len(splats.depths)
-        self._splats, self._size = splats, size
-        self.num_features, self.with_depth, self.num_channels = num_features, with_depth, num_features + int(with_depth)
-        self.packed = ctx.empty(N, kernels.row_parts(self.num_channels), 4)
-        self.gradient_norms = ctx.empty(N, 2)
-        self.depth_keys = ctx.empty(2 * N, dtype=int32)
-        self.gaussian_from_rank = ctx.empty(2 * N, dtype=int32)
-        ctx.launch(
-            kernels.pack,
-            N,
-            splats.means2d,
-            splats.conics,
-            splats.opacities,
-            splats.depths,
-            splats.radii,
-            self.packed,
-            self.depth_keys,
-            self.gaussian_from_rank,
-            self.gradient_norms,
-        )
+    packed: Tensor
+    num_features: int
+    with_depth: bool
 
-    def add_features(self, ctx: OpContext, features: Tensor) -> None:
-        """Packs [N, num_features] features, and depth if it is a channel, beside the geometry."""
-        kernel = kernels.make_pack_features(self.num_features, self.with_depth)
-        depths = self._splats.depths if self.with_depth else None
-        ctx.launch(kernel, len(features), features, depths, self.packed, self._splats.radii)
-        ctx.outputs_written_in_backward.append(self.gradient_norms)
-        ctx.on_backward(lambda ctx: self._backward(ctx, features))
+    @property
+    def num_channels(self) -> int:
+        """Number of features, plus one with depth."""
+        return self.num_features + int(self.with_depth)
 
-    def _backward(self, ctx: OpContext, features: Tensor) -> None:
-        gradients = ctx.gradient(self.packed)
-        if gradients is None:
-            return
-        splats, N = self._splats, len(features)
-        v_means2d, v_conics = ctx.empty(N, 2), ctx.empty(N, 3)
-        v_opacities, v_features = ctx.empty(N), ctx.empty(N, self.num_features)
-        v_depths = ctx.empty(N) if self.with_depth else None
-        ctx.launch(
-            kernels.make_unpack(self.num_features, self.with_depth),
-            N,
-            splats.conics,
-            splats.opacities,
-            self.packed,
-            gradients,
-            0.5 * self._size[0],
-            0.5 * self._size[1],
-            v_means2d,
-            v_conics,
-            v_opacities,
-            v_features,
-            v_depths,
-            self.gradient_norms,
-        )
-        ctx.add_gradient(splats.means2d, v_means2d)
-        ctx.add_gradient(splats.conics, v_conics)
-        ctx.add_gradient(splats.opacities, v_opacities)
-        ctx.add_gradient(features, v_features)
-        if v_depths is not None:
-            ctx.add_gradient(splats.depths, v_depths)
+
+class DepthOrder(NamedTuple):
+    """Keys and values of the depth sort, [2 N] int32 in the first half."""
+
+    keys: Tensor
+    gaussian_from_rank: Tensor
+
+
+def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, DepthOrder]:
+    """Packs N splats with [N, num_features] features; sets the radii of those that are skipped to 0."""
+    N, num_features = features.shape
+    packed = features.new_empty(N, kernels.row_parts(num_features + int(with_depth)), 4)
+    order = DepthOrder(*(features.new_empty(2 * N, dtype=int32) for _ in range(2)))
+    launch(kernels.make_pack(num_features, with_depth), N, *splats, features, packed, *order)
+    return Rows(packed, num_features, with_depth), order
+
+
+class PackGradients(NamedTuple):
+    """Gradients of the inputs of ``pack``, and of offsets of the means on screen in halves of the image size."""
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor | None
+    opacities: Tensor
+    features: Tensor
+    screen_offsets: Tensor | None
+
+
+def unpack(
+    splats: tuple[Tensor, Tensor],
+    rows: Rows,
+    v_rows: Tensor,
+    size: tuple[int, int],
+    with_offsets: bool = False,
+    offset_gradient: OffsetGradient = None,
+) -> PackGradients:
+    """The backward pass of ``pack``.
+
+    Args:
+        splats: Conics and opacities of the splats.
+        rows: First result of ``pack``.
+        v_rows: [shards, N, gradient_stride] sums from ``composite_bwd``.
+        size: (width, height) of the image [px].
+        with_offsets: Whether to return the gradient of ``screen_offsets``.
+        offset_gradient: As in ``composite_bwd``.
+    """
+    conics, opacities = splats
+    N = len(conics)
+    v_splats = PackGradients(
+        means2d=conics.new_empty(N, 2),
+        conics=torch.empty_like(conics),
+        depths=conics.new_empty(N) if rows.with_depth else None,
+        opacities=torch.empty_like(opacities),
+        features=conics.new_empty(N, rows.num_features),
+        screen_offsets=conics.new_empty(N, 2) if with_offsets else None,
+    )
+    sign = {None: 0.0, "absolute": 1.0, "images": -1.0}[offset_gradient]
+    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], sign)
+    launch(kernels.make_unpack(rows.num_features, rows.with_depth), N, *inputs, *v_splats)
+    return v_splats

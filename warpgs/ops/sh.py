@@ -1,12 +1,17 @@
 """View-dependent colour from spherical harmonics (kernels/sh.py)."""
 
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.kernels import sh as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext, differentiable
+from warpgs.runtime.launch import launch
+from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 MAX_DEGREE = 3
 """Highest degree of spherical harmonics that the kernels support."""
@@ -35,33 +40,35 @@ def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) ->
     return degree
 
 
-def record_sh(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """``spherical_harmonics`` as a part of a larger op, without checks; Gaussians of radius 0 are black."""
-    N = means.shape[0]
-    colors = ctx.empty(N, 3)
-    ctx.launch(kernels.sh_fwd, N, means, sh, viewmat, radii, num_bases(degree), colors)
-
-    def backward(ctx: OpContext) -> None:
-        v_colors = ctx.gradient(colors)
-        if v_colors is None:
-            return
-        v_means, v_sh = ctx.empty(*means.shape), ctx.empty(*sh.shape)
-        ctx.launch(kernels.sh_bwd, N, means, sh, viewmat, radii, num_bases(degree), colors, v_colors, v_means, v_sh)
-        ctx.add_gradient(means, v_means)
-        ctx.add_gradient(sh, v_sh)
-        if ctx.needs_gradient(viewmat):
-            _add_viewmat_gradient(ctx, viewmat, -v_means.sum(0))
-
-    ctx.on_backward(backward, reads=(colors,))
+def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
+    """``spherical_harmonics`` without checks; Gaussians of radius 0 are black."""
+    colors = torch.empty_like(means)
+    launch(kernels.sh_fwd, len(means), means, sh, viewmat, radii, num_bases(degree), colors)
     return colors
 
 
-def _add_viewmat_gradient(ctx: OpContext, viewmat: Tensor, v_viewpoint: Float[Tensor, "3"]) -> None:
-    """Adds what the viewpoint -Wᵀ translation passes on to the viewing matrix [W, translation]."""
+def sh_bwd(
+    inputs: Sequence[Tensor], degree: int, colors: Tensor, v_colors: Tensor
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Gradients of means, sh and, if it requires one, viewmat.
+
+    Args:
+        inputs: means, sh, viewmat and radii, as in ``sh_fwd``.
+        degree: As in ``sh_fwd``.
+        colors: Its result.
+        v_colors: [N, 3] gradient of the colours.
+    """
+    means, sh, viewmat, _ = inputs
+    v_means, v_sh = torch.empty_like(means), torch.empty_like(sh)
+    launch(kernels.sh_bwd, len(means), *inputs, num_bases(degree), colors, v_colors, v_means, v_sh)
+    if not viewmat.requires_grad:
+        return v_means, v_sh, None
+    # The viewpoint is -Wᵀ translation of the viewing matrix [W, translation].
+    v_viewpoint = -v_means.sum(0)
     v_viewmat, finite = torch.zeros_like(viewmat), viewmat.nan_to_num(0.0, 0.0, 0.0)  # otherwise all are culled, v = 0
     v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
     v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
-    ctx.add_gradient(viewmat, v_viewmat)
+    return v_means, v_sh, v_viewmat
 
 
 def spherical_harmonics(
@@ -98,7 +105,17 @@ def spherical_harmonics(
     check_tensor("radii", radii, ("N", 2), sizes, (torch.int32,))
     check_same_device({"means": means, "sh": sh, "viewmat": viewmat, "radii": radii})
 
-    def op(ctx: OpContext, means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
-        return (record_sh(ctx, means, sh, viewmat, radii, used),)
+    return differentiable(partial(_record, used), means, sh, viewmat, radii)[0]
 
-    return differentiable(op, means, sh, viewmat, radii)[0]
+
+def _record(degree: int, *tensors: Any) -> Recorded:
+    means, sh, viewmat, radii = tensors
+    colors = sh_fwd(means, sh, viewmat, radii, degree)
+    return Recorded((colors,), partial(_backward, degree), (*tensors, colors))
+
+
+def _backward(degree: int, saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients:
+    *inputs, colors = saved
+    (v_colors,) = v_outputs
+    assert v_colors is not None
+    return *sh_bwd(inputs, degree, colors, v_colors), None

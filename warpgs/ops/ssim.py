@@ -6,7 +6,8 @@ from torch import Tensor
 
 from warpgs.kernels import ssim as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.tape import OpContext, differentiable
+from warpgs.runtime.launch import launch
+from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 from .compositing import is_small
 
@@ -67,26 +68,22 @@ def _compare(
     _, l1, similarity = weights
     with_mask = mask is not None
 
-    def op(ctx: OpContext, image: Tensor, target: Tensor) -> tuple[Tensor, ...]:
-        values = ctx.empty(H, W, C)
-        partials = ctx.empty(3 if ctx.needs_backward else 0, H, W, C)
-        images = (image, target, mask_bytes, strip)
-        ctx.launch(kernels.make_ssim_fwd(with_mask), threads, *images, *weights, values, partials, work=strip)
-        result = values.mean() if mean else values
+    def op(image: Tensor, target: Tensor) -> Recorded:
+        values = image.new_empty(H, W, C)
+        partials = image.new_empty(3 if image.requires_grad else 0, H, W, C)
+        outputs = (*weights, values, partials)
+        launch(kernels.make_ssim_fwd(with_mask), threads, image, target, mask_bytes, strip, *outputs, work=strip)
+        return Recorded((values.mean() if mean else values,), backward, (image, target, partials))
 
-        def backward(ctx: OpContext) -> None:
-            v = ctx.gradient(result)
-            if v is None:
-                return
-            v_image = ctx.empty(H, W, C)
-            scale, scaled_partials = (1.0 / image.numel(), partials) if mean else (1.0, v * partials)
-            v_sum = v.view(1) if mean else v.new_ones(1)
-            arguments = (scale * l1, scale * similarity, scaled_partials, v_sum, v_image)
-            ctx.launch(kernels.make_ssim_bwd(with_mask), threads, *images, *arguments, work=strip)
-            ctx.add_gradient(image, v_image)
-
-        ctx.on_backward(backward)
-        return (result,)
+    def backward(saved: tuple[Tensor, ...], v_outputs: Gradients) -> Gradients:
+        (image, target, partials), (v,) = saved, v_outputs
+        assert v is not None
+        v_image = torch.empty_like(image)
+        scale, scaled_partials = (1.0 / image.numel(), partials) if mean else (1.0, v * partials)
+        v_sum = v.view(1) if mean else v.new_ones(1)
+        arguments = (scale * l1, scale * similarity, scaled_partials, v_sum, v_image)
+        launch(kernels.make_ssim_bwd(with_mask), threads, image, target, mask_bytes, strip, *arguments, work=strip)
+        return v_image, None
 
     return differentiable(op, image, target.detach())[0]
 

@@ -116,5 +116,5 @@ class TrainedScene:
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
         settings = RenderSettings(branches=branches, antialias=self.config.antialias)
         flags = self.metadata.use_deformation, self.metadata.use_appearance
-        splats = self.scene.splats(time, *flags, self.metadata.sh_degree, late_sh=True)
+        splats = self.scene.splats(time, *flags, self.metadata.sh_degree)
         return render(splats, camera, settings=settings)

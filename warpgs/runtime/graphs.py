@@ -1,16 +1,19 @@
 """CUDA graphs: work that is recorded once and replayed with a single launch."""
 
+import threading
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
 
 import torch
-import warp as wp
 from torch import Tensor
 
-from .streams import PRIORITY, WARP_STREAM, join_captured, side_stream
+from .streams import PRIORITY, side_stream
 
 WARM_UPS = 3
 """Eager runs before a capture: they compile kernels, allocate scratch memory and learn the number of intersections."""
+
+_one_capture = threading.RLock()
+"""Held during a capture, in which no thread may wait for the whole GPU, as another capture would."""
 
 Key = TypeVar("Key", bound=Hashable)
 Replay = Callable[[], tuple[Tensor, ...]]
@@ -140,28 +143,15 @@ def record(
     """
     stream = stream or torch.cuda.Stream(priority=PRIORITY)
     graph = torch.cuda.CUDAGraph()
-    with WARP_STREAM:  # one capture at a time, because no thread may wait for the whole GPU during a capture
+    with _one_capture:
         torch.cuda.synchronize()
-        _record(work, graph, stream, pool)
-    return graph.replay
-
-
-def _record(work: Callable[[], None], graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any) -> None:
-    warp_stream = wp.stream_from_torch(stream)
-    with torch.cuda.stream(stream):
-        side_stream(stream.device)  # created here, because a capture cannot create streams
-    current = torch.cuda.current_stream()
-    try:
-        # Autograd's own thread runs the backward pass, so the capture must not be restricted to this thread.
-        with (
-            torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
-            wp.ScopedStream(warp_stream, sync_enter=False),
-            wp.ScopedCapture(stream=warp_stream, external=True, force_module_load=False),
-        ):
-            try:
+        with torch.cuda.stream(stream):
+            side_stream(stream.device)  # created here, because a capture cannot create streams
+        current = torch.cuda.current_stream()
+        try:
+            # Other threads may go on using the GPU meanwhile.
+            with torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
                 work()
-            except BaseException:
-                join_captured(stream.device)
-                raise
-    finally:
-        torch.cuda.set_stream(current)  # torch does not restore it if the end of a capture fails
+        finally:
+            torch.cuda.set_stream(current)  # torch does not restore it if the end of a capture fails
+    return graph.replay

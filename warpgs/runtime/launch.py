@@ -1,7 +1,15 @@
-"""Recorded launches of kernels, which cost the host less than ``wp.launch``."""
+"""Launching Warp kernels on torch tensors.
 
+Kernels run on torch's current stream. A launch is recorded once per thread and kernel, and its arguments are
+overwritten in place afterwards, which costs the host less than ``wp.launch``. On CPU a launch is cut into shards for
+all cores.
+"""
+
+import functools
+import os
 import threading
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +17,20 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from . import kernel_cache
+from . import kernel_cache, profiling
+
+kernel_cache.init_warp()
+
+CHUNKS_PER_SHARD = 16
+"""Chunks per core that a CPU launch is split into; cores take them in turn, so that their work is balanced."""
+
+MIN_SHARD = 16384
+"""A CPU launch with less work than this, in plain threads, uses a single core."""
+
+LITTLE_WORK = 1 / 16
+"""Work of a thread that only copies a few numbers, relative to a plain thread."""
+
+_CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -17,6 +38,66 @@ class PerShard:
     """A kernel argument of which each CPU shard gets its own slice, because Warp's atomics are not atomic on CPU."""
 
     tensor: Tensor
+
+
+def num_shards(device: torch.device) -> int:
+    """Number of cores that a CPU launch uses (``torch.get_num_threads()``); 1 on CUDA."""
+    return 1 if device.type == "cuda" else max(1, min(torch.get_num_threads(), _CORES))
+
+
+def launch(kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int | float = 1) -> None:
+    """Launches ``dim`` threads of a kernel on the device of its arguments, on torch's current stream.
+
+    Args:
+        kernel: Its first parameter is ``first``, the index of the first thread.
+        dim: Number of threads.
+        arguments: Of the parameters after ``first``: tensors, numbers, or None for an empty array.
+        block_dim: Threads per CUDA block.
+        work: Work of one of its threads relative to a plain thread, to decide how many cores a CPU launch uses.
+    """
+    if dim == 0:
+        return
+    device = next(a.device for a in arguments if isinstance(a, Tensor))
+    with profiling.span(kernel.func.__name__, device):
+        if device.type == "cuda":
+            command_for(kernel, device, block_dim)(dim, 0, arguments, current_stream(device))
+        else:
+            launch_on_cpu(kernel, dim, arguments, work)
+
+
+def launch_on_cpu(kernel: wp.Kernel, dim: int, arguments: Sequence[Any], work: int | float) -> None:
+    """Launches a kernel on one core, or cut into shards on all of them."""
+    device = torch.device("cpu")
+    shards = num_shards(device) if dim * work >= MIN_SHARD else 1
+    chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
+
+    def run_shard(shard: int) -> None:
+        command = command_for(kernel, device, 1)
+        for first in range(shard * chunk, dim, shards * chunk):
+            command(min(chunk, dim - first), first, arguments, None, shard)
+
+    if shards == 1:
+        run_shard(0)
+    else:
+        list(_workers().map(run_shard, range(shards)))
+
+
+@functools.cache
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=_CORES, thread_name_prefix="warpgs")
+
+
+def current_stream(device: torch.device) -> wp.Stream:
+    """torch's current stream on a GPU as a Warp stream."""
+    key = device.index, torch.accelerator.current_stream(device.index).stream_id  # faster than a torch.cuda.Stream
+    stream = _streams.get(key)
+    if stream is None:
+        handle = torch.cuda.current_stream(device).cuda_stream
+        stream = _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+    return stream
+
+
+_streams: dict[tuple[int, int], wp.Stream] = {}
 
 
 class Command:

@@ -12,9 +12,6 @@ PRIORITY = -1
 """Priority of the main work; concurrent work has 0, the lowest. With equal priorities, large matrix products of the
 concurrent work would delay many small kernels."""
 
-WARP_STREAM = threading.RLock()
-"""Lock for changing Warp's current stream, which all threads share, unlike torch's."""
-
 _streams = threading.local()
 
 
@@ -32,34 +29,20 @@ def side_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 @contextlib.contextmanager
-def on_side_stream(device: torch.device) -> Iterator[torch.cuda.Stream | None]:
-    """Runs the body concurrently to the code after it; autograd runs their backward passes concurrently, too.
-
-    Tensors that the body reads must stay alive and unmodified until the streams are joined.
+def concurrently(device: torch.device) -> Iterator[contextlib.AbstractContextManager[object]]:
+    """A body with work that is concurrent to the rest of it; autograd runs their backward passes concurrently, too.
 
     Yields:
-        The stream that the current stream must ``join`` before using the results; None if that is not necessary: on
-        CPU, or while a profile is active.
+        Context of the concurrent work, to be entered once. The current stream waits for that work at the end of the
+        body, also after an error: it would be hidden by that of a CUDA graph capture with work that nothing waits for.
+        On CPU, and while a profile is active, there is no concurrency.
     """
     if device.type != "cuda" or profiling.is_on():
-        yield None
+        yield contextlib.nullcontext()
         return
-    stream = side_stream(device)
-    stream.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(stream):
-        yield stream
-
-
-def join(stream: torch.cuda.Stream | None) -> None:
-    """Makes the current stream wait for a stream of ``on_side_stream``; does nothing for None."""
-    if stream is not None:
-        torch.cuda.current_stream(stream.device).wait_stream(stream)
-
-
-def join_captured(device: torch.device) -> None:
-    """Joins the side stream of a failed capture, which would otherwise hide the error that made it fail."""
-    stream = side_stream(device)
-    with torch.cuda.stream(stream):
-        is_captured = torch.cuda.is_current_stream_capturing()
-    if is_captured:
-        join(stream)
+    current, side = torch.cuda.current_stream(device), side_stream(device)
+    side.wait_stream(current)
+    try:
+        yield torch.cuda.stream(side)
+    finally:
+        current.wait_stream(side)

@@ -25,21 +25,25 @@ class GradientStatistics:
     Attributes:
         total: [N] sum of the norms.
         count: [N] number of the views.
+        screen_offsets: [N, 2] zeros to render each view with; their gradients are what is observed.
     """
 
     def __init__(self, num: int, device: torch.device) -> None:
         self.total = torch.zeros(num, device=device)
         self.count = torch.zeros(num, device=device)
+        self.screen_offsets = torch.zeros(num, 2, device=device, requires_grad=True)
 
     @torch.no_grad()
-    def observe(self, norms: Float[Tensor, " N"], radii: Int32[Tensor, "N 2"]) -> None:
+    def observe(self, radii: Int32[Tensor, "N 2"]) -> None:
         """Adds one view, after its backward pass.
 
         Args:
-            norms: [N] a column of ``Rendering.gradient_norms``.
             radii: [N, 2] ``Rendering.radii``; 0 = culled.
         """
+        v_offsets, self.screen_offsets.grad = self.screen_offsets.grad, None
+        assert v_offsets is not None
         visible = radii[:, 0] > 0
+        norms = torch.hypot(*v_offsets.unbind(-1))  # finite where squares would overflow
         self.total += torch.where(visible, norms, 0.0)
         self.count += visible
 

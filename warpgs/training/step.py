@@ -137,26 +137,26 @@ class Step:
     def _run(self, phase: Phase, view: View) -> None:
         self._choose_trained(phase)
         flags = (phase.use_deformation, phase.use_appearance)
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise, late_sh=True)
-        settings = self._settings(phase)
-        rendering = render(splats, view.camera, self._inputs.backgrounds, settings)
+        splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
+        backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
+        rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment = self.alignments.index_select(0, self._index)[0] if phase.with_depth else None
         trust = self._depth_trust.index_select(0, self._index)[0] if phase.with_depth else None
-        config, backgrounds = self.config.loss, self._inputs.backgrounds
+        config = self.config.loss
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
         # The weights are the gradients of the weighted sum, whose value is not needed.
         torch.autograd.backward(list(terms.values()), [self._inputs.scale[name] for name in terms])
         self.optimizer.step()
         self.optimizer.zero_grad()
-        self.statistics.observe(rendering.gradient_norms[:, int(settings.imagegrad)], rendering.radii)
+        self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
 
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase; without depth all gradients are those of images."""
         options = {"depth": phase.with_depth, "antialias": self.config.antialias}
         imagegrad = phase.with_depth and not self.config.densify.depth_gradients
-        return RenderSettings(branches=True, imagegrad=imagegrad, replay=False, **options)
+        return RenderSettings(branches=True, imagegrad=imagegrad, **options)
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""

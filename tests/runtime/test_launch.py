@@ -1,20 +1,22 @@
-"""The bridge between torch and Warp."""
+"""Launches: checks of arguments, shards, profiles."""
 
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
-from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
-from warpgs.kernels.covariance import covariance as kernel
+from tests.scenes import as_leaves, gradients, make_camera, make_splats
+from warpgs.kernels.projection import project_fwd
 from warpgs.rendering import render
-from warpgs.runtime import tape
+from warpgs.runtime import launch as launching
 from warpgs.runtime.profiling import profile
-from warpgs.runtime.tape import OpContext
 
 
 def launch(quats, scales):
-    OpContext(torch.device("cpu"), []).launch(kernel, 7, quats, scales, torch.zeros(7, 3, 3))
+    camera, opacities, radii = make_camera(), torch.ones(7), torch.zeros(7, 2, dtype=torch.int32)
+    inputs = (torch.zeros(7, 3), quats, scales, opacities, camera.viewmat, camera.K, *camera.size, 0.01, 0, None)
+    outputs = (torch.zeros(7, 2), torch.zeros(7, 3), torch.zeros(7), torch.zeros(7), radii)
+    launching.launch(project_fwd, 7, *inputs, *outputs)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +43,7 @@ def image_and_gradients(seed: int) -> list[torch.Tensor]:
 @pytest.fixture
 def all_cores(monkeypatch):
     """Small launches use all cores, too."""
-    monkeypatch.setattr(tape, "MIN_SHARD", 1)
+    monkeypatch.setattr(launching, "MIN_SHARD", 1)
 
 
 def test_concurrent_threads_render_the_same_as_alone(all_cores):
@@ -73,11 +75,12 @@ def test_a_profile_lists_the_kernels_of_forward_and_backward():
         image_and_gradients(0)
     times = taken.times()
     names = [t.name for t in times]
-    forward = ["project_fwd", "pack", "sort_pairs", "count_tiles", "emit_isects", "sort_pairs", "tile_ranges"]
+    binning = ["sort_pairs", "count_tiles", "emit_isects", "sort_pairs", "tile_ranges"]
     assert names == [
-        *forward,
+        "project_fwd",
         "sh_fwd",
-        "pack_features",
+        "pack",
+        *binning,
         "composite_fwd",
         "composite_bwd",
         "unpack",
@@ -98,21 +101,3 @@ def test_nothing_is_listed_after_the_end_of_a_profile():
 def test_two_profiles_at_once_are_refused():
     with profile(), pytest.raises(RuntimeError, match="another profile is active"), profile():
         pass
-
-
-@pytest.mark.parametrize("name_with_gradient", ["means", "quats", "scales", "opacities", "sh"])
-def test_gradients_flow_only_to_tensors_that_require_them(name_with_gradient):
-    everything, one = as_leaves(make_splats()), as_leaves(make_splats())
-    for name, tensor in float_tensors(one).items():
-        tensor.requires_grad_(name == name_with_gradient)
-    for splats in (everything, one):
-        render(splats, make_camera()).joint.image.sum().backward()
-    for name, gradient in gradients(one).items():
-        if name == name_with_gradient:
-            assert torch.equal(gradient, gradients(everything)[name])
-        else:
-            assert gradient is None
-
-
-def test_without_inputs_that_require_gradients_nothing_is_recorded():
-    assert not render(make_splats(), make_camera()).joint.image.requires_grad
