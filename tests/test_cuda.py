@@ -17,6 +17,7 @@ from tests.scenes import (
     relative_error,
     weighted_sum,
 )
+from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.config import RenderSettings
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
@@ -177,6 +178,16 @@ def test_a_render_can_be_a_graphed_callable(settings):
         expected = image_and_gradients(image, other)
         for actual, wanted in zip(image_and_gradients(graphed, other), expected, strict=True):
             assert relative_error(actual, wanted) < 1e-4
+
+
+def test_graphed_workloads_of_the_benchmark_compute_the_same():
+    splats, camera = make_splats(200, channels=3).to("cuda"), make_camera().to("cuda")
+    for name in PARAMETERS:
+        getattr(splats, name).requires_grad_()
+    workload = make_workload(splats, camera, RenderSettings(branches=True, depth=True))
+    expected = workload.forward_backward()
+    for actual, wanted in zip(graphed(workload).forward_backward(), expected, strict=True):
+        assert relative_error(actual, wanted) < 1e-4
 
 
 def test_a_bounded_render_needs_no_render_of_its_size_before():

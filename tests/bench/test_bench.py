@@ -7,12 +7,15 @@ import pytest
 import torch
 
 from tests import tiny
+from warpgs.bench import measure
 from warpgs.bench.command import Bench
 from warpgs.bench.measure import STAGES, time_in_turn
 from warpgs.bench.run_bench import bench
 from warpgs.bench.scenes import SCENES, Scene, random_splats
 from warpgs.bench.training import measure_steps, random_scene
+from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.cli import main
+from warpgs.config import RenderSettings
 from warpgs.runs.run import Run
 
 TINY = Scene("tiny", 48, 32, 100, 3.0)
@@ -99,6 +102,34 @@ def test_the_output_has_names_and_no_keys(capsys):
         assert name in output
     assert "_" not in output.replace("x86_64", "")
     assert "fwd" not in output
+
+
+def test_graphs_are_measured_beside_plain_calls(monkeypatch):
+    """On CPU, where calls are not recorded but repeated."""
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", lambda render, _parameters: render)
+    monkeypatch.setattr(measure, "capture", lambda step: step)
+    workload = tiny_workload()
+    times = measure.time_passes({"one_image": workload}, ["one_image"], "cpu", repeats=1)
+    passes = ("forward", "forward_backward", "callable_forward_backward", "graph_forward_backward")
+    assert list(times) == [("one_image", f"{name}_ms") for name in passes]
+    assert all(ms > 0 for ms in times.values())
+    for ours, plain in zip(graphed(workload).forward_backward(), workload.forward_backward(), strict=True):
+        assert torch.equal(ours, plain)
+
+
+def test_a_workload_renders_the_given_parameters():
+    workload = tiny_workload()
+    images = workload.render()
+    assert torch.equal(workload.render(*workload.parameters)[0], images[0])
+    *geometry, colors = workload.parameters
+    assert torch.allclose(workload.render(*geometry, 0.5 * colors)[0], 0.5 * images[0])
+
+
+def tiny_workload():
+    splats, camera = TINY.make("none", "cpu")
+    for name in PARAMETERS:
+        getattr(splats, name).requires_grad_()
+    return make_workload(splats, camera, RenderSettings())
 
 
 @pytest.mark.parametrize("option", [("--against", "gsplat"), ("--graph",)])

@@ -22,7 +22,8 @@ class Bench:
     depth: bool = False
     """Also render depth."""
     graph: bool = False
-    """Also measure forward and backward pass as a replayed CUDA graph."""
+    """Also measure forward and backward pass as CUDA graphs: one of each pass (torch.cuda.make_graphed_callables), and
+    one of both."""
     against: Literal["gsplat"] | None = None
     """Also measure another renderer, alternating with this one, and compare images and gradients."""
     json: Path | None = None

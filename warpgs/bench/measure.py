@@ -22,7 +22,7 @@ from warpgs.runtime.profiling import KernelTime, profile
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
-from .workloads import PARAMETERS, Workload, make_gsplat_workload, make_workload
+from .workloads import PARAMETERS, Workload, graphed, make_gsplat_workload, make_workload
 
 WARM_UPS = {"cuda": 50, "cpu": 1}
 """Runs before the first measured one. On CUDA they bring clock rates and threads to a steady state; on CPU, where runs
@@ -81,16 +81,18 @@ def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, li
 
 
 def time_passes(
-    workloads: dict[str, Workload], graphed: list[str], device: str, repeats: int
+    workloads: dict[str, Workload], graphs: list[str], device: str, repeats: int
 ) -> dict[tuple[str, str], float]:
-    """Median times [ms] by workload and metric, measured one metric after the other."""
+    """Median times [ms] by workload and metric, measured one metric after the other; ``graphs`` also as CUDA graphs."""
     passes = {"forward_ms": Workload.forward, "forward_backward_ms": Workload.forward_backward}
     if device == "cuda":
         passes["one_thread_forward_backward_ms"] = Workload.forward_backward_on_one_thread
     metrics: dict[str, dict[str, Callable[[], object]]] = {
         metric: {name: partial(run, workload) for name, workload in workloads.items()} for metric, run in passes.items()
     }
-    metrics["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphed}
+    if graphs:
+        metrics["callable_forward_backward_ms"] = {name: graphed(workloads[name]).forward_backward for name in graphs}
+        metrics["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphs}
     return {
         (n, metric): ms for metric, steps in metrics.items() for n, ms in time_in_turn(steps, device, repeats).items()
     }
@@ -152,9 +154,9 @@ def ratios(measured: Measurements, base: Measurements) -> Measurements:
     """Times relative to those of ``base``; without a graph, plain calls are compared with the graph of ``base``."""
     passes = ("forward", "forward_backward", "one_thread_forward_backward")
     result = {f: measured[f"{f}_ms"] / base[f"{f}_ms"] for f in passes if f"{f}_ms" in base}
-    graph = "graph_forward_backward_ms"
-    if graph in base:
-        result["graph_forward_backward"] = measured.get(graph, measured["forward_backward_ms"]) / base[graph]
+    for graph in ("callable_forward_backward", "graph_forward_backward"):
+        if f"{graph}_ms" in base:
+            result[graph] = measured.get(f"{graph}_ms", measured["forward_backward_ms"]) / base[f"{graph}_ms"]
     return result
 
 

@@ -33,6 +33,8 @@ NAMES = {
     "forward_backward": "forward and backward",
     "one_thread_forward_backward_ms": "forward and backward, one thread [ms]",
     "one_thread_forward_backward": "forward and backward, one thread",
+    "callable_forward_backward_ms": "forward and backward, graphed callable [ms]",
+    "callable_forward_backward": "forward and backward, graphed callable",
     "graph_forward_backward_ms": "forward and backward, CUDA graph [ms]",
     "graph_forward_backward": "forward and backward, CUDA graph",
     "stages_ms": "pass [ms]:",

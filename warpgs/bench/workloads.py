@@ -1,7 +1,10 @@
 """Renders for ``warpgs bench`` to measure, by this package and by others."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,12 +24,12 @@ class Workload:
     """A render and its backward pass.
 
     Attributes:
-        render: Renders the images.
+        render: Renders the images, of other tensors in the place of the parameters if they are given.
         parameters: Tensors to compute gradients of, in the order of ``PARAMETERS``.
         v_images: Gradient with respect to each image.
     """
 
-    render: Callable[[], tuple[Tensor, ...]]
+    render: Callable[..., tuple[Tensor, ...]]
     parameters: tuple[Tensor, ...]
     v_images: tuple[Tensor, ...]
 
@@ -43,11 +46,19 @@ class Workload:
             return self.forward_backward()
 
 
+def graphed(workload: Workload) -> Workload:
+    """The same as two CUDA graphs, of the forward and the backward pass, from ``torch.cuda.make_graphed_callables``."""
+    render: Any = torch.cuda.make_graphed_callables(workload.render, workload.parameters)
+    return dataclasses.replace(workload, render=partial(render, *workload.parameters))
+
+
 def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> Workload:
     """A render by this package, with random gradients that depend only on the sizes of its images."""
 
-    def run() -> tuple[Tensor, ...]:
-        rendering = render(splats, camera, settings=settings)
+    def run(*parameters: Tensor) -> tuple[Tensor, ...]:
+        given: dict[str, Any] = dict(zip(PARAMETERS, parameters, strict=True)) if parameters else {}
+        own = dataclasses.replace(splats, **given) if given else splats  # which checks them
+        rendering = render(own, camera, settings=settings)
         layers = [layer for layer in (rendering.joint, rendering.static, rendering.dynamic) if layer is not None]
         return tuple(t for layer in layers for t in (layer.image, layer.depth) if t is not None)
 
