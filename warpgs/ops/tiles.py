@@ -1,7 +1,6 @@
 """Tile binning: the Gaussians of each tile, front to back (kernels/tiles.py)."""
 
 import threading
-from collections import defaultdict
 from typing import NamedTuple
 
 import torch
@@ -68,16 +67,19 @@ class _Budget:
         return -(-wanted // step) * step
 
 
-_budgets = threading.local()
+class _Budgets(threading.local):
+    """Those of this thread, by device and size of the image."""
+
+    def __init__(self) -> None:
+        self.by_size: dict[tuple[torch.device, tuple[int, int]], _Budget] = {}
 
 
-def _budget(device: torch.device, size: tuple[int, int]) -> _Budget:
-    return _budgets.__dict__.setdefault("cache", defaultdict(_Budget))[device, size]
+_budgets = _Budgets()
 
 
 def reset_budgets() -> None:
     """Forgets the numbers of intersections that this thread has learned, before another scene of the same size."""
-    for budget in _budgets.__dict__.get("cache", {}).values():  # kept, because a CUDA graph may write to them
+    for budget in _budgets.by_size.values():  # which are kept, because a CUDA graph may write to them
         budget.recent_max = None
 
 
@@ -92,13 +94,14 @@ def _capacity(end_of_rank: Tensor, size: tuple[int, int], max_intersections: int
         return max(max_intersections, N), end_of_rank.new_empty(1)
     if device.type == "cpu":
         return max(int(end_of_rank[-1]), N), end_of_rank.new_empty(1)
-    budget = _budget(device, size)
-    if budget.recent_max is None:
+    budget = _budgets.by_size.get((device, size))
+    if budget is None or budget.recent_max is None:
         if torch.cuda.is_current_stream_capturing():
             raise RuntimeError(
                 f"a CUDA graph captures the first render of {size[0]} x {size[1]} pixels on this thread: "
                 "set RenderSettings.max_intersections, or render once before"
             )
+        budget = _budgets.by_size.setdefault((device, size), budget or _Budget())
         budget.num_isects.copy_(end_of_rank[-1:])
     return budget.capacity(N), budget.num_isects
 
