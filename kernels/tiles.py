@@ -194,8 +194,8 @@ def emit_isects(
 @wp.kernel(enable_backward=False)
 def tile_ranges(
     first: int,
-    end_of_rank: wp.array[wp.int64],
     gaussian_from_rank: wp.array[int],
+    end_of_rank: wp.array[wp.int64],
     is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     num_tiles: int,

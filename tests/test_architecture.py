@@ -7,7 +7,7 @@ import jaxtyping
 import pytest
 import torch
 
-from warpgs.ops.sh import spherical_harmonics
+from warpgs.ops.ssim import ssim
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
@@ -106,7 +106,7 @@ def test_no_function_is_long(path):
 
 def test_annotated_shapes_are_checked_while_tests_run():
     with pytest.raises(jaxtyping.TypeCheckError):
-        spherical_harmonics(torch.ones(5, 3), torch.ones(4, 1, 3), torch.eye(4))
+        ssim(torch.ones(5, 6, 3), torch.ones(5, 7, 3))
 
 
 def defines_kernels(path: Path) -> bool:

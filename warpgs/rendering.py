@@ -11,14 +11,7 @@ from torch import Tensor
 from .cameras import Camera
 from .config import RenderSettings
 from .model.splats import Splats
-from .ops.compositing import (
-    NUM_BRANCH_IMAGES,
-    Composite,
-    Traversal,
-    background_bwd,
-    composite_bwd,
-    composite_fwd,
-)
+from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, composite_bwd, composite_fwd
 from .ops.projection import Geometry, View, project_bwd, project_fwd
 from .ops.rows import OffsetGradient, Rows, pack, unpack
 from .ops.sh import degree_of, sh_bwd, sh_fwd
@@ -159,21 +152,21 @@ def _inputs(
 
 def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Rendering:
     """Gives names to the outputs of ``_forward``."""
-    num_images = NUM_BRANCH_IMAGES if settings.branches else 1
-    num_layers = num_images * (2 + int(settings.depth))
-    radii, *statistics = outputs[num_layers:]
-    num_intersections = None if settings.max_intersections is None else statistics.pop()
-    composite = Composite.from_flat((*outputs[:num_layers], *statistics), num_images, settings.depth)
-    depths = composite.depths or (None,) * num_images
-    layers = [Layer(*parts) for parts in zip(composite.images, composite.alphas, depths, strict=True)]
+    n = NUM_BRANCH_IMAGES if settings.branches else 1
+    images, alphas, outputs = outputs[:n], outputs[n : 2 * n], outputs[2 * n :]
+    depths: tuple[Tensor | None, ...] = (None,) * n
+    if settings.depth:
+        depths, outputs = outputs[:n], outputs[n:]
+    layers = [Layer(*parts) for parts in zip(images, alphas, depths, strict=True)]
+    radii, *optional = outputs
     return Rendering(
         joint=layers[0],
         static=layers[1] if settings.branches else None,
         dynamic=layers[2] if settings.branches else None,
         radii=radii,
-        contributed=composite.contributed,
-        weights=composite.weights,
-        num_intersections=num_intersections,
+        contributed=optional.pop(0) if settings.statistics else None,
+        weights=optional.pop(0) if settings.statistics else None,
+        num_intersections=optional.pop(0) if settings.max_intersections is not None else None,
     )
 
 

@@ -4,12 +4,12 @@ import warnings
 
 import pytest
 
+from tests.ops.alone import project, spherical_harmonics
 from tests.reference.covariance import covariance
 from tests.scenes import error, make_camera, make_splats, relative_error
 from warpgs.ops import tiles
-from warpgs.ops.projection import Geometry, View, project
+from warpgs.ops.projection import Geometry, View
 from warpgs.ops.rows import pack
-from warpgs.ops.sh import spherical_harmonics
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of gsplat itself, on import

@@ -106,5 +106,5 @@ def test_branches_of_different_degrees_are_refused():
 
 
 def test_offsets_of_another_number_of_gaussians_are_refused():
-    with pytest.raises(ValueError, match=r"dynamic: offsets must have shape \[N, 10\] with N = 2"):
+    with pytest.raises(ValueError, match=r"dynamic\.offsets must have shape \[N, 10\] with N = 2"):
         activate(random_raw(2), random_raw(2), dynamic_changes=random_changes(3))

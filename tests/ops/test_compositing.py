@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from tests.ops.alone import composite
 from tests.reference.compositing import composite as reference
 from tests.scenes import error, generator, random_like, relative_error, weighted_sum
-from warpgs.ops.compositing import composite, composite_bwd, composite_fwd
+from warpgs.ops.compositing import composite_bwd, composite_fwd
 from warpgs.ops.projection import Projection
 from warpgs.ops.rows import pack, unpack
 from warpgs.ops.tiles import bin_splats

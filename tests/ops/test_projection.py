@@ -3,9 +3,10 @@
 import pytest
 import torch
 
+from tests.ops.alone import project
 from tests.reference.projection import project as reference
 from tests.scenes import GEOMETRY, make_camera, make_splats, random_like, relative_error, weighted_sum
-from warpgs.ops.projection import Geometry, View, project
+from warpgs.ops.projection import Geometry, View
 
 CAMERA = make_camera()
 NUM = 150

@@ -3,11 +3,12 @@
 import pytest
 import torch
 
+from tests.ops.alone import project
 from tests.reference import rows as reference
 from tests.scenes import GEOMETRY, HEIGHT, WIDTH, error, generator, make_camera, make_splats, relative_error
 from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.kernels.rows import NUM_MOMENTS, gradient_stride
-from warpgs.ops.projection import Geometry, Projection, View, project
+from warpgs.ops.projection import Geometry, Projection, View
 from warpgs.ops.rows import pack, unpack
 
 NUM = 150

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from tests.ops.alone import spherical_harmonics
 from tests.reference.sh import spherical_harmonics as reference
 from tests.scenes import error, make_camera, make_splats, random_like, relative_error
-from warpgs.ops.sh import spherical_harmonics
 
 VIEW = make_camera().viewmat
 

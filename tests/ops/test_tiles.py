@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from tests.ops.alone import composite, project
 from tests.reference.tiles import ALPHA_MIN, max_alphas
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
 from warpgs.kernels import tiles as kernels
 from warpgs.ops import tiles
-from warpgs.ops.compositing import composite
-from warpgs.ops.projection import Geometry, Projection, View, project
+from warpgs.ops.projection import Geometry, Projection, View
 from warpgs.ops.rows import pack
 from warpgs.rendering import render
 

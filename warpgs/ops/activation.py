@@ -114,17 +114,15 @@ def _activate_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradient
 
 
 def _check_geometry(*branches: tuple[str, Raw, Changes]) -> None:
+    shapes = (("N", 3), ("N", 4), ("N", 3), ("N",), ("N", 10), ("N",))
     tensors: dict[str, Tensor | None] = {}
-    for name, raw, changes in branches:
+    for branch, raw, changes in branches:
         sizes: dict[str, int] = {}
-        shapes = [("N", 3), ("N", 4), ("N", 3), ("N",)]
-        for field, tensor, shape in zip(Raw._fields, raw[:NUM_GEOMETRY], shapes, strict=False):
-            check_tensor(f"{name}.{field}", tensor, shape, sizes)
-            tensors[f"{name}.{field}"] = tensor
-        for (field, change), shape in zip(changes._asdict().items(), [("N", 10), ("N",)], strict=True):
-            if change is not None:
-                check_tensor(f"{name}: {field}", change, shape, sizes)
-            tensors[f"{name}: {field}"] = change
+        fields = raw._fields[:NUM_GEOMETRY] + changes._fields
+        for field, tensor, shape in zip(fields, (*raw[:NUM_GEOMETRY], *changes), shapes, strict=True):
+            tensors[f"{branch}.{field}"] = tensor
+            if tensor is not None:
+                check_tensor(f"{branch}.{field}", tensor, shape, sizes)
     check_same_device(tensors)
 
 

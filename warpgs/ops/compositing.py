@@ -1,7 +1,6 @@
 """Alpha compositing of splats into one or three images, and its backward pass (kernels/compositing_{fwd,bwd}.py)."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -13,13 +12,11 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import OffsetGradient, gradient_stride
-from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
 from warpgs.runtime.launch import PerShard, launch, num_shards
-from warpgs.runtime.tape import Gradients, Recorded, differentiable
+from warpgs.runtime.tape import Gradients
 
-from .projection import Projection
-from .rows import Rows, pack, unpack
-from .tiles import Tiles, bin_splats
+from .rows import Rows
+from .tiles import Tiles
 
 NUM_BRANCH_IMAGES = 3
 """Joint, static only, dynamic only."""
@@ -67,13 +64,6 @@ class Composite(NamedTuple):
     def statistics(self) -> tuple[Tensor, ...]:
         """``contributed`` and ``weights``, or nothing."""
         return () if self.contributed is None or self.weights is None else (self.contributed, self.weights)
-
-    @staticmethod
-    def from_flat(tensors: Sequence[Tensor], num_images: int, with_depth: bool) -> "Composite":
-        """The inverse of ``(*layers, *statistics)``."""
-        n, m = num_images, num_images * (2 + int(with_depth))
-        contributed, weights = tensors[m:] or (None, None)
-        return Composite(tuple(tensors[:n]), tuple(tensors[n : 2 * n]), tuple(tensors[2 * n : m]), contributed, weights)
 
 
 class Traversal(NamedTuple):
@@ -210,79 +200,3 @@ def background_bwd(background: Tensor, alphas: Sequence[Tensor], v_images: Gradi
         if v_image is not None:
             v_color.copy_(((1.0 - alpha).view(1, -1) @ v_image.view(-1, len(v_color)))[0])
     return v_colors.sum(0) if background.ndim == 1 else v_colors
-
-
-def composite(
-    splats: Projection,
-    features: Float[Tensor, "N C"],
-    size: tuple[int, int],
-    *,
-    background: Float[Tensor, " C"] | None = None,
-    is_dynamic: Bool[Tensor, " N"] | None = None,
-    statistics: bool = False,
-) -> Composite:
-    """Composites projected splats front to back; differentiable in their geometry, opacities, features, background.
-
-    Args:
-        splats: From ``project``. Splats with a conic that is not positive definite, an opacity outside [1/255, 1] or a
-            value that is not finite are skipped.
-        features: [N, C] values to blend, any number of channels.
-        size: (width, height) [px].
-        background: [C] value behind everything; zero by default.
-        is_dynamic: [N] branch of each splat; if given, three images are made: joint, static only, dynamic only.
-        statistics: Whether to report the contribution of each splat.
-
-    Raises:
-        ValueError: On a wrong shape, dtype, device or size.
-    """
-    _check_inputs(splats, features, size, background, is_dynamic)
-    branch = None if is_dynamic is None else is_dynamic.view(torch.uint8)
-
-    def op(*tensors: Any) -> Recorded:
-        means2d, conics, depths, opacities, features, background = tensors
-        radii = splats.radii.clone()  # packing writes to them
-        projection = Projection(means2d, conics, depths, opacities, radii)
-        rows, order = pack(projection, features, with_depth=False)
-        tiles = bin_splats(rows, order, size, branch)
-        composite, traversal = composite_fwd(rows, tiles, size, background, statistics)
-        saved = (*tensors, *composite.alphas, *composite.depths)
-        backward = partial(_backward, rows, traversal)
-        return Recorded(composite.layers, backward, saved, constants=composite.statistics)
-
-    tensors = differentiable(op, *splats[:4], features, background)
-    return Composite.from_flat(tensors, 1 if is_dynamic is None else NUM_BRANCH_IMAGES, with_depth=False)
-
-
-def _backward(rows: Rows, traversal: Traversal, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
-    """The backward pass of ``composite``."""
-    _, conics, _, opacities, _, background, *layers = saved
-    num_images = traversal.num_images
-    v_splats = unpack((conics, opacities), rows, composite_bwd(rows, background, traversal, v_layers), traversal.size)
-    v_background = None
-    if background is not None and background.requires_grad:
-        v_background = background_bwd(background, layers[:num_images], v_layers[:num_images])
-    return *v_splats[:5], v_background
-
-
-def _check_inputs(
-    splats: Projection,
-    features: Tensor,
-    size: tuple[int, int],
-    background: Tensor | None,
-    is_dynamic: Tensor | None,
-) -> None:
-    sizes: dict[str, int] = {}
-    check_tensor("splats.means2d", splats.means2d, ("N", 2), sizes)
-    check_tensor("splats.conics", splats.conics, ("N", 3), sizes)
-    check_tensor("splats.depths", splats.depths, ("N",), sizes)
-    check_tensor("splats.opacities", splats.opacities, ("N",), sizes)
-    check_tensor("splats.radii", splats.radii, ("N", 2), sizes, (torch.int32,))
-    check_tensor("features", features, ("N", "C"), sizes)
-    if features.shape[1] == 0:
-        raise ValueError("features must have at least one channel, got none")
-    if background is not None:
-        check_tensor("background", background, ("C",), sizes)
-    if is_dynamic is not None:
-        check_tensor("is_dynamic", is_dynamic, ("N",), sizes, (torch.bool,))
-    check_same_device({**splats._asdict(), "features": features, "background": background, "is_dynamic": is_dynamic})
-    check_image_size(*size)

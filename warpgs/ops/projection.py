@@ -1,17 +1,14 @@
 """EWA projection of Gaussians to splats (kernels/projection.py)."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int32
 from torch import Tensor, int32
 
-from warpgs.config import RenderSettings
 from warpgs.kernels import projection as kernels
-from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
 from warpgs.runtime.launch import launch
-from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 
 class Geometry(NamedTuple):
@@ -66,7 +63,18 @@ class Projection(NamedTuple):
 def project_fwd(
     geometry: Geometry, view: View, near: float, antialias: bool, screen_offsets: Tensor | None = None
 ) -> Projection:
-    """``project`` without checks; ``screen_offsets`` [N, 2] are added to the means, in halves of the image size."""
+    """Projects Gaussians into a pinhole camera.
+
+    Gaussians that are at the near plane or behind it, 1e10 or more from the camera, outside the image, fainter than
+    1/255 or that have an opacity above 1 or a value that is not finite are culled.
+
+    Args:
+        geometry: N Gaussians.
+        view: The camera.
+        near: Depth of the near plane [scene units].
+        antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
+        screen_offsets: [N, 2] added to the means on screen, in halves of the image size.
+    """
     means = geometry.means
     N = len(means)
     splats = Projection(
@@ -120,53 +128,3 @@ def project_bwd(
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
     v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
     return v_geometry, v_viewmat, v_K
-
-
-def project(
-    geometry: Geometry, view: View, *, near: float = RenderSettings.near, antialias: bool = False
-) -> Projection:
-    """Projects Gaussians into a pinhole camera; differentiable in them and in the camera.
-
-    The formulas are at the head of ``kernels/projection.py``.
-
-    Args:
-        geometry: N Gaussians.
-        view: The camera.
-        near: Near plane: Gaussians at this depth or closer are culled [scene units].
-        antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
-
-    Returns:
-        A ``Projection``. Gaussians that are behind the near plane, 1e10 or more from the camera, outside the image,
-        fainter than 1/255 or that have an opacity above 1 or a value that is not finite are culled.
-
-    Raises:
-        ValueError: On a wrong shape, dtype, device or size.
-    """
-    _check_inputs(geometry, view)
-    width, height = view.width, view.height
-
-    def op(*tensors: Any) -> Recorded:
-        *geometry, viewmat, K = tensors
-        splats = project_fwd(Geometry(*geometry), View(viewmat, K, width, height), near, antialias)
-        return Recorded(splats[:4], backward, (*tensors, splats.conics, splats.radii), constants=(splats.radii,))
-
-    def backward(saved: tuple[Any, ...], v_splats: Gradients) -> Gradients:
-        *geometry, viewmat, K, conics, radii = saved
-        view = View(viewmat, K, width, height)
-        v_geometry, *v_camera = project_bwd(Geometry(*geometry), view, antialias, (conics, radii), v_splats)
-        return *v_geometry, *v_camera
-
-    return Projection(*differentiable(op, *geometry, view.viewmat, view.K))
-
-
-def _check_inputs(geometry: Geometry, view: View) -> None:
-    """Raises ``ValueError`` unless the tensors describe Gaussians and a camera on one device."""
-    sizes: dict[str, int] = {}
-    check_tensor("means", geometry.means, ("N", 3), sizes)
-    check_tensor("quats", geometry.quats, ("N", 4), sizes)
-    check_tensor("scales", geometry.scales, ("N", 3), sizes)
-    check_tensor("opacities", geometry.opacities, ("N",), sizes)
-    check_tensor("viewmat", view.viewmat, (4, 4), sizes)
-    check_tensor("K", view.K, (3, 3), sizes)
-    check_same_device({**geometry._asdict(), "viewmat": view.viewmat, "K": view.K})
-    check_image_size(view.width, view.height)

@@ -1,17 +1,13 @@
 """View-dependent colour from spherical harmonics (kernels/sh.py)."""
 
 from collections.abc import Sequence
-from functools import partial
-from typing import Any
 
 import torch
-from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.kernels import sh as kernels
-from warpgs.runtime.checks import check_same_device, check_tensor
+from warpgs.runtime.checks import check_tensor
 from warpgs.runtime.launch import launch
-from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 MAX_DEGREE = 3
 """Highest degree of spherical harmonics that the kernels support."""
@@ -41,7 +37,18 @@ def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) ->
 
 
 def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
-    """``spherical_harmonics`` without checks; Gaussians of radius 0 are black."""
+    """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k).
+
+    Args:
+        means: [N, 3] centres in the world.
+        sh: [N, bases, 3] coefficients with 1, 4, 9 or 16 bases (degree 0 to 3).
+        viewmat: [4, 4] rigid world-to-camera transform.
+        radii: [N, 2] int32 of a ``Projection``; culled Gaussians (radius 0) are black.
+        degree: Highest degree to use.
+
+    Returns:
+        [N, 3] RGB, not negative.
+    """
     colors = torch.empty_like(means)
     launch(kernels.sh_fwd, len(means), means, sh, viewmat, radii, num_bases(degree), colors)
     return colors
@@ -69,53 +76,3 @@ def sh_bwd(
     v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
     v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
     return v_means, v_sh, v_viewmat
-
-
-def spherical_harmonics(
-    means: Float[Tensor, "N 3"],
-    sh: Float[Tensor, "N bases 3"],
-    viewmat: Float[Tensor, "4 4"],
-    *,
-    degree: int | None = None,
-    radii: Int32[Tensor, "N 2"] | None = None,
-) -> Float[Tensor, "N 3"]:
-    """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k).
-
-    Differentiable in means, sh and viewmat.
-
-    Args:
-        means: [N, 3] centres in the world.
-        sh: [N, bases, 3] coefficients with 1, 4, 9 or 16 bases (degree 0 to 3).
-        viewmat: [4, 4] rigid world-to-camera transform.
-        degree: Highest degree to use; that of ``sh`` by default.
-        radii: [N, 2] of a ``Projection``; culled Gaussians (radius 0) are black.
-
-    Returns:
-        [N, 3] RGB, not negative.
-
-    Raises:
-        ValueError: On a wrong shape, dtype or device.
-    """
-    sizes: dict[str, int] = {}
-    check_tensor("means", means, ("N", 3), sizes)
-    used = check_coefficients(sizes, sh, degree)
-    check_tensor("viewmat", viewmat, (4, 4), sizes)
-    if radii is None:
-        radii = torch.ones(means.shape[0], 2, dtype=torch.int32, device=means.device)
-    check_tensor("radii", radii, ("N", 2), sizes, (torch.int32,))
-    check_same_device({"means": means, "sh": sh, "viewmat": viewmat, "radii": radii})
-
-    return differentiable(partial(_record, used), means, sh, viewmat, radii)[0]
-
-
-def _record(degree: int, *tensors: Any) -> Recorded:
-    means, sh, viewmat, radii = tensors
-    colors = sh_fwd(means, sh, viewmat, radii, degree)
-    return Recorded((colors,), partial(_backward, degree), (*tensors, colors))
-
-
-def _backward(degree: int, saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients:
-    *inputs, colors = saved
-    (v_colors,) = v_outputs
-    assert v_colors is not None
-    return *sh_bwd(inputs, degree, colors, v_colors), None

@@ -111,17 +111,6 @@ def num_tiles(width: int, height: int) -> tuple[int, int]:
     return -(-width // TILE_SIZE), -(-height // TILE_SIZE)
 
 
-class _Sorted(NamedTuple):
-    """N > 0 splats in order of depth, to be binned into ``columns`` × ``rows`` > 0 tiles."""
-
-    splats: Tensor
-    gaussian_from_rank: Tensor
-    end_of_rank: Tensor
-    is_dynamic: Tensor | None
-    columns: int
-    rows: int
-
-
 def bin_splats(
     splat_rows: Rows,
     order: DepthOrder,
@@ -143,47 +132,35 @@ def bin_splats(
         ValueError: If there are too many splats with branches.
         RuntimeError: If the first frame of a size is captured in a CUDA graph without ``max_intersections``.
     """
-    packed = splat_rows.packed
-    N, columns, rows = len(packed), *num_tiles(*size)
+    splats, grid = splat_rows.packed, num_tiles(*size)
+    N, total = len(splats), grid[0] * grid[1]
     if is_dynamic is not None and N >= kernels.MAX_WITH_BRANCHES:
         raise ValueError(f"with branches there must be fewer than {kernels.MAX_WITH_BRANCHES} Gaussians, got {N}")
-    if N == 0 or columns * rows == 0:
-        empty = packed.new_zeros(columns * rows, 2, dtype=int32)
-        none, no_isects = packed.new_empty(1, dtype=int32), packed.new_zeros(1, dtype=int64)
+    if N == 0 or total == 0:
+        empty = splats.new_zeros(total, 2, dtype=int32)
+        none, no_isects = splats.new_empty(1, dtype=int32), splats.new_zeros(1, dtype=int64)
         return Tiles(empty, none, None if is_dynamic is None else empty, no_isects)
-    splats = _sort(packed, order, columns, rows, is_dynamic)
-    capacity, num_isects = _capacity(splats.end_of_rank, size, max_intersections)
-    ranges, gaussian_from_isect = _bin(splats, capacity, num_isects)
-    lengths = None if is_dynamic is None else torch.empty_like(ranges)
-    tiles = Tiles(ranges, gaussian_from_isect, lengths, num_isects)
-    if lengths is not None:
-        threads = columns * rows * (WARP_SIZE if packed.is_cuda else 1)
-        launch(kernels.split_tiles, threads, ranges, tiles.half, gaussian_from_isect, lengths, block_dim=BLOCK_DIM)
-    return tiles
-
-
-def _sort(splats: Tensor, order: DepthOrder, columns: int, rows: int, is_dynamic: Tensor | None) -> _Sorted:
-    """Sorts splats by depth and counts the intersections of each one and all in front of it."""
-    N, gaussian_from_rank = len(splats), order.gaussian_from_rank
     sort_pairs(*order, N, DEPTH_BITS)
-    end_of_rank = splats.new_empty(N, dtype=int64)
-    launch(kernels.count_tiles, N, splats, gaussian_from_rank, columns, rows, end_of_rank)
+    end_of_rank = splats.new_empty(N, dtype=int64)  # intersections of each Gaussian and all in front of it
+    launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, end_of_rank)
     torch.cumsum(end_of_rank, 0, out=end_of_rank)
-    return _Sorted(splats, gaussian_from_rank, end_of_rank, is_dynamic, columns, rows)
+    return _bin(splats, (order.gaussian_from_rank, end_of_rank, is_dynamic), size, max_intersections)
 
 
-def _bin(sorted_splats: _Sorted, capacity: int, num_isects: Tensor) -> tuple[Tensor, Tensor]:
-    """Fills buffers of ``capacity`` intersections; returns ``ranges`` and ``gaussian_from_isect`` of ``Tiles``."""
-    splats, gaussian_from_rank, end_of_rank, is_dynamic, columns, rows = sorted_splats
+def _bin(
+    splats: Tensor, ranks: tuple[Tensor, Tensor, Tensor | None], size: tuple[int, int], max_intersections: int | None
+) -> Tiles:
+    """Bins splats that have been sorted and counted."""
+    (_, end_of_rank, is_dynamic), (columns, rows) = ranks, num_tiles(*size)
     N, total = len(splats), columns * rows
+    capacity, num_isects = _capacity(end_of_rank, size, max_intersections)
     isects = splats.new_empty(2 * capacity, dtype=int32), splats.new_empty(2 * capacity, dtype=int32)  # tile, Gaussian
-    sizes = (N, columns, rows, capacity)
-    threads = max(N, capacity)
-    inputs = (splats, gaussian_from_rank, end_of_rank, is_dynamic)
-    launch(kernels.emit_isects, threads, *inputs, *sizes, *isects, num_isects)
+    launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, columns, rows, capacity, *isects, num_isects)
     sort_pairs(*isects, capacity, total.bit_length())
     ranges = splats.new_empty(total, 2, dtype=int32)
-    threads = max(capacity, total) + 1
-    order = (end_of_rank, gaussian_from_rank, is_dynamic)
-    launch(kernels.tile_ranges, threads, *order, N, total, capacity, *isects, ranges)
-    return ranges, isects[1]
+    launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
+    tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
+    if is_dynamic is not None:
+        threads = total * (WARP_SIZE if splats.is_cuda else 1)
+        launch(kernels.split_tiles, threads, ranges, tiles.half, *tiles[1:3], block_dim=BLOCK_DIM)
+    return tiles

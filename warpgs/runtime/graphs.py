@@ -70,7 +70,7 @@ class GraphCache(Generic[Key]):
             if self._pool is None:
                 self._drop_oldest(self._max_graphs - 1)
             # A capture with shared memory takes over that of the old graph, which must live until then.
-            replay = capture(work) if self._repeatable else _record_outputs(work, self._stream, self._pool)
+            replay = capture(work) if self._repeatable else record(work, self._stream, self._pool)
             self._replays.pop(key, None)
             self._replays[key] = replay
             self._stale.discard(key)
@@ -104,35 +104,13 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Replay:
     with torch.cuda.stream(stream):
         for _ in range(WARM_UPS):
             step()
-    return _record_outputs(step, stream)
-
-
-def _record_outputs(
-    work: Callable[[], tuple[Tensor, ...]], stream: torch.cuda.Stream | None, pool: Any | None = None
-) -> Replay:
-    """Records ``work`` and returns a function that replays it and returns its results."""
-    outputs: tuple[Tensor, ...] = ()
-
-    def fill_outputs() -> None:
-        nonlocal outputs
-        outputs = work()
-
-    replay = record(fill_outputs, stream, pool)
-
-    def replay_outputs() -> tuple[Tensor, ...]:
-        replay()
-        return outputs
-
-    return replay_outputs
+    return record(step, stream)
 
 
 def record(
-    work: Callable[[], None], stream: torch.cuda.Stream | None = None, pool: Any | None = None
-) -> Callable[[], None]:
-    """Records ``work`` in a CUDA graph without running it, and returns a function that replays it.
-
-    As ``capture``, for work that modifies tensors in place and must not be repeated for warming up: it must have run
-    ``WARM_UPS`` times before.
+    work: Callable[[], tuple[Tensor, ...]], stream: torch.cuda.Stream | None = None, pool: Any | None = None
+) -> Replay:
+    """As ``capture``, for work that must not be repeated for warming up: it must have run ``WARM_UPS`` times before.
 
     Args:
         work: Runs on the current CUDA device without reading anything back from it.
@@ -151,7 +129,12 @@ def record(
         try:
             # Other threads may go on using the GPU meanwhile.
             with torch.cuda.graph(graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
-                work()
+                outputs = work()
         finally:
             torch.cuda.set_stream(current)  # torch does not restore it if the end of a capture fails
-    return graph.replay
+
+    def replay() -> tuple[Tensor, ...]:
+        graph.replay()
+        return outputs
+
+    return replay
