@@ -137,7 +137,6 @@ def join_sh(static: Raw, dynamic: Raw, residuals: Float[Tensor, "N R 3"] | None 
         ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
     """
     bases = _check_coefficients(static, dynamic, residuals)
-
     inputs = (static.sh_dc, static.sh_rest, residuals, dynamic.sh_dc, dynamic.sh_rest, None)
     return differentiable(partial(_join_sh, bases), *inputs)[0]
 
@@ -162,14 +161,12 @@ def _join_sh_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients
 def _check_coefficients(static: Raw, dynamic: Raw, residuals: Tensor | None) -> int:
     """Raises ``ValueError`` unless the tensors fit each other; returns the number of bases."""
     tensors: dict[str, Tensor | None] = {"sh_residuals": residuals}
-    shared: dict[str, int] = {}
+    bases = 1 + static.sh_rest.shape[1]
     for name, raw in (("static", static), ("dynamic", dynamic)):
-        sizes = dict(shared)
+        sizes = {"rest": bases - 1}
         check_tensor(f"{name}.sh_dc", raw.sh_dc, ("N", 1, 3), sizes)
         check_tensor(f"{name}.sh_rest", raw.sh_rest, ("N", "rest", 3), sizes)
-        shared["rest"] = sizes["rest"]
         tensors |= {f"{name}.sh_dc": raw.sh_dc, f"{name}.sh_rest": raw.sh_rest}
-    bases = 1 + shared["rest"]
     if residuals is not None:
         sizes = {"N": len(static.sh_dc)}
         check_tensor("sh_residuals", residuals, ("N", "R", 3), sizes)

@@ -38,21 +38,16 @@ def encode(
     Raises:
         ValueError: On a wrong shape, dtype or device.
     """
-    _check_inputs(means, {"time": time, "center": box[0], "half_size": box[1]})
+    tensors = {"means": means, "time": time, "center": box[0], "half_size": box[1]}
+    for (name, tensor), shape in zip(tensors.items(), (("N", 3), (1,), (3,), (3,)), strict=True):
+        check_tensor(name, tensor, shape, {})
+    check_same_device(tensors)
     columns = aligned(encoded_size(*bands, raw))
     encoding = means.new_empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
     lanes_log2 = kernels.CUDA_LANES_LOG2 if means.is_cuda else 0
     arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
     launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
     return encoding
-
-
-def _check_inputs(means: Tensor, vectors: dict[str, Tensor]) -> None:
-    sizes: dict[str, int] = {}
-    check_tensor("means", means, ("N", 3), sizes)
-    for name, vector in vectors.items():
-        check_tensor(name, vector, (1 if name == "time" else 3,), sizes)
-    check_same_device({"means": means, **vectors})
 
 
 def aligned(number: int) -> int:

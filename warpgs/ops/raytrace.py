@@ -68,7 +68,7 @@ def raytrace(
     Raises:
         ValueError: On a wrong shape, dtype, device or size.
     """
-    _check_inputs(bodies, lamp, samples, viewmat, K)
+    _check_inputs({**bodies._asdict(), "lamp": lamp, "samples": samples, "viewmat": viewmat, "K": K})
     check_image_size(*size)
     width, height = size
 
@@ -80,15 +80,9 @@ def raytrace(
     return TracedImage(image, depth, hits)
 
 
-def _check_inputs(bodies: Bodies, lamp: Tensor, samples: Tensor, viewmat: Tensor, K: Tensor) -> None:
+def _check_inputs(tensors: dict[str, Tensor]) -> None:
+    shapes = (("B",), ("B", 3, 4), ("B", 2, 3), ("B",), ("B", 3), (3, 3), ("S", 4), (4, 4), (3, 3))
     sizes: dict[str, int] = {}
-    check_tensor("shapes", bodies.shapes, ("B",), sizes, (torch.int32,))
-    check_tensor("body_from_world", bodies.body_from_world, ("B", 3, 4), sizes)
-    check_tensor("colors", bodies.colors, ("B", 2, 3), sizes)
-    check_tensor("frequencies", bodies.frequencies, ("B",), sizes)
-    check_tensor("materials", bodies.materials, ("B", 3), sizes)
-    check_tensor("lamp", lamp, (3, 3), sizes)
-    check_tensor("samples", samples, ("S", 4), sizes)
-    check_tensor("viewmat", viewmat, (4, 4), sizes)
-    check_tensor("K", K, (3, 3), sizes)
-    check_same_device({**bodies._asdict(), "lamp": lamp, "samples": samples, "viewmat": viewmat, "K": K})
+    for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
+        check_tensor(name, tensor, shape, sizes, (torch.int32 if name == "shapes" else torch.float32,))
+    check_same_device(tensors)

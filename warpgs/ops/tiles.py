@@ -9,8 +9,7 @@ from torch import Tensor, int32, int64
 from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
-from warpgs.runtime.launch import launch
-from warpgs.runtime.sorting import sort_pairs
+from warpgs.runtime.launch import launch, sort_pairs
 
 from .rows import DepthOrder, Rows
 

@@ -11,7 +11,7 @@ import torch
 
 @dataclass
 class KernelTime:
-    """One launch: start since the begin of the profile and duration [ms]."""
+    """One launch: start since the first launch of the profile and duration [ms]."""
 
     name: str
     start_ms: float
@@ -22,36 +22,33 @@ class KernelTime:
 class Profile:
     """The launches inside ``profile``."""
 
-    _origin: float = field(default_factory=time.perf_counter)
-    _first_event: Any = None
     _entries: list[tuple[str, Any, Any]] = field(default_factory=list)
 
     def times(self) -> list[KernelTime]:
         """One entry per launch, in order; waits for the device."""
-        if self._first_event is not None:
+        if self._entries and not isinstance(self._entries[0][1], float):
             torch.cuda.synchronize()
-        result = []
-        for name, begin, end in self._entries:
-            if isinstance(begin, float):
-                result.append(KernelTime(name, (begin - self._origin) * 1e3, (end - begin) * 1e3))
-            else:
-                result.append(KernelTime(name, self._first_event.elapsed_time(begin), begin.elapsed_time(end)))
-        return result
+        return [KernelTime(n, _milliseconds(self._entries[0][1], a), _milliseconds(a, b)) for n, a, b in self._entries]
 
     @contextlib.contextmanager
     def span(self, name: str, device: torch.device) -> Iterator[None]:
         """Times the body of a ``with`` statement as one entry."""
-        if device.type == "cuda":
-            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            begin.record()
-            self._first_event = self._first_event or begin
-            yield
-            end.record()
-            self._entries.append((name, begin, end))
-        else:
-            start = time.perf_counter()
-            yield
-            self._entries.append((name, start, time.perf_counter()))
+        begin = _now(device)
+        yield
+        self._entries.append((name, begin, _now(device)))
+
+
+def _now(device: torch.device) -> Any:
+    """A CUDA event on the current stream, or the time on CPU."""
+    if device.type == "cpu":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def _milliseconds(begin: Any, end: Any) -> float:
+    return (end - begin) * 1e3 if isinstance(begin, float) else begin.elapsed_time(end)
 
 
 _active_profile: Profile | None = None
