@@ -63,4 +63,4 @@ def composite(splats, features, size, *, background=None, is_dynamic=None, stati
         return Recorded(result.layers, backward, (*tensors, *result.alphas), constants=result.statistics)
 
     tensors = differentiable(op, *splats[:4], features, background)
-    return Composite(tensors[:n], tensors[n : 2 * n], (), *(tensors[2 * n :] or (None, None)))
+    return Composite(tensors[:n], tensors[n : 2 * n], (), tensors[2 * n :])

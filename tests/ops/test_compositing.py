@@ -115,7 +115,7 @@ def test_a_stack_of_opaque_splats_stops_where_the_reference_stops():
     result, (image, _, weights) = ours(single, statistics=True), theirs(double)
     hidden = weights.sum((1, 2)) == 0
     assert hidden.any()
-    assert torch.equal(result.contributed, ~hidden)
+    assert torch.equal(result.statistics[0], ~hidden)
     assert error(result.images[0], image) < 2e-6
     v_outputs = random_like([result.images[0]])
     weighted_sum(result.images, v_outputs).backward()
@@ -141,8 +141,8 @@ def test_statistics_are_the_sums_of_the_blend_weights():
     inputs = make_inputs()
     weights = theirs([t.double() for t in inputs])[2].sum((1, 2))
     result = ours(inputs, statistics=True)
-    assert relative_error(result.weights, weights) < 2e-6
-    assert torch.equal(result.contributed, weights > 0)
+    assert relative_error(result.statistics[1], weights) < 2e-6
+    assert torch.equal(result.statistics[0], weights > 0)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.5, 0.9, 1.0])

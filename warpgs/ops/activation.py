@@ -1,7 +1,4 @@
-"""Activation of the raw Gaussians of both branches, with the outputs of the networks applied (kernels/activation.py).
-
-Geometry and colours are separate ops, so that the appearance network can run while geometry is activated and binned.
-"""
+"""Activation of the raw Gaussians of both branches, with the outputs of the networks (kernels/activation.py)."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,6 +11,8 @@ from warpgs.kernels import activation as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
 from warpgs.runtime.launch import launch
 from warpgs.runtime.tape import Gradients, Recorded, differentiable
+
+from .projection import Geometry
 
 NUM_GEOMETRY = 4
 """Number of fields of ``Raw`` that are not colours."""
@@ -54,26 +53,10 @@ class Changes(NamedTuple):
 NO_CHANGES = Changes()
 
 
-class Activated(NamedTuple):
-    """Gaussians in activated form, static ones first.
-
-    Attributes:
-        means: [N, 3] centres.
-        quats: [N, 4] rotations (w, x, y, z) of any length.
-        scales: [N, 3] standard deviations.
-        opacities: [N] in (0, 1).
-    """
-
-    means: Float[Tensor, "N 3"]
-    quats: Float[Tensor, "N 4"]
-    scales: Float[Tensor, "N 3"]
-    opacities: Float[Tensor, " N"]
-
-
 def activate(
     static: Raw, dynamic: Raw, static_changes: Changes = NO_CHANGES, dynamic_changes: Changes = NO_CHANGES
-) -> Activated:
-    """Joins both branches and applies the outputs of the networks (paper Eq. 5, 8, 11); differentiable in everything.
+) -> Geometry:
+    """Joins both branches, static ones first, with the outputs of the networks (paper Eq. 5, 8, 11); differentiable.
 
     Args:
         static, dynamic: The branches; their colours are not used.
@@ -84,14 +67,14 @@ def activate(
     """
     _check_geometry(("static", static, static_changes), ("dynamic", dynamic, dynamic_changes))
     inputs = (*static[:NUM_GEOMETRY], *static_changes, *dynamic[:NUM_GEOMETRY], *dynamic_changes)
-    return Activated(*differentiable(_activate, *inputs))
+    return Geometry(*differentiable(_activate, *inputs))
 
 
 def _activate(*tensors: Any) -> Recorded:
     half = len(tensors) // 2
     branches, num_static = (tensors[:half], tensors[half:]), len(tensors[0])
     N, new = num_static + len(tensors[half]), tensors[0].new_empty
-    out = Activated(new(N, 3), new(N, 4), new(N, 3), new(N))
+    out = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))
     for branch, first_row in zip(branches, (0, num_static), strict=True):
         launch(kernels.activate_fwd, len(branch[0]), first_row, *branch, *out)
     return Recorded(tuple(out), _activate_backward, (*tensors, out.scales, out.opacities))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, int32
 
 from warpgs.kernels.compositing_bwd import make_composite_bwd
@@ -42,28 +42,20 @@ class Composite(NamedTuple):
     Attributes:
         images: [H, W, C] each.
         alphas: [H, W] each, opacity in [0, 1 - 1e-4).
-        depths: [H, W] each, mean depth weighted by contribution [scene units], 0 in empty pixels; an empty tuple unless
-            the rows have depth.
-        contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless requested.
-        weights: [N] sum of alpha times transmittance over the pixels of the joint image, not differentiable; None
-            unless requested.
+        depths: [H, W] each, mean depth weighted by contribution [scene units], 0 in empty pixels; none without depth.
+        statistics: Nothing, or [N] whether the Gaussian changed a pixel of the joint image and [N] sum of its alpha
+            times transmittance over that image; not differentiable.
     """
 
     images: tuple[Float[Tensor, "H W C"], ...]
     alphas: tuple[Float[Tensor, "H W"], ...]
     depths: tuple[Float[Tensor, "H W"], ...]
-    contributed: Bool[Tensor, " N"] | None
-    weights: Float[Tensor, " N"] | None
+    statistics: tuple[Tensor, ...]
 
     @property
     def layers(self) -> tuple[Tensor, ...]:
         """All images, then all alphas, then all depths: what has gradients."""
         return (*self.images, *self.alphas, *self.depths)
-
-    @property
-    def statistics(self) -> tuple[Tensor, ...]:
-        """``contributed`` and ``weights``, or nothing."""
-        return () if self.contributed is None or self.weights is None else (self.contributed, self.weights)
 
 
 class Traversal(NamedTuple):
@@ -138,7 +130,7 @@ def composite_fwd(
         tiles: Of the same rows.
         size: (width, height) [px].
         background: [features], or [images, features] with one for each image; None is black. Depth has none.
-        statistics: Whether to fill ``contributed`` and ``weights``.
+        statistics: Whether to report the contribution of each Gaussian.
 
     Raises:
         ValueError: If all images together have too many pixels to be counted.
@@ -162,9 +154,8 @@ def composite_fwd(
         () if t is None else tuple(layer.detach() for layer in t.view(num_images, height, width, *t.shape[1:]))
         for t in (image, alpha, depth)  # detached from each other, so that they may be modified in place
     )
-    if contributed is None or weights is None:
-        return Composite(images, alphas, depths, None, None), traversal
-    return Composite(images, alphas, depths, contributed.view(torch.bool), weights.sum(0)), traversal
+    found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
+    return Composite(images, alphas, depths, found), traversal
 
 
 def composite_bwd(

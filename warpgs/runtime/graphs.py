@@ -88,13 +88,8 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Replay:
     """Captures ``step`` in a CUDA graph and returns a function that replays it.
 
     The replay runs on torch's current stream and returns the same tensors every time, with new values. The graph holds
-    addresses, not tensors: the inputs of ``step`` must stay alive and may only be modified in place. Scalars, image
-    sizes and the size of the buffers for intersections are those of the capture; a replay with more intersections than
-    the buffers hold is still rendered completely, but slowly.
-
-    A capture must not wait for the device, but ``render`` does so on each thread for the first frame of an image size,
-    to learn the number of intersections. So ``step`` is first run ``WARM_UPS`` times, on this thread and on the stream
-    of the capture. (The backward pass runs on autograd's own thread and does not wait.)
+    addresses, not tensors: the inputs of ``step`` must stay alive and may only be modified in place. Scalars and sizes
+    of images and buffers are those of the capture, before which ``step`` is run ``WARM_UPS`` times.
 
     Args:
         step: Runs on the current CUDA device without reading anything back from it.
