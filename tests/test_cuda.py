@@ -167,6 +167,8 @@ def test_a_render_can_be_captured_and_replayed(settings, capfd):
     assert "Warp" not in capfd.readouterr().err
 
 
+# torch's own warm-up, on another stream than its capture, makes it warn.
+@pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream does not match")
 @BOTH
 def test_a_render_can_be_a_graphed_callable(settings):
     splats, camera = make_splats(200).to("cuda"), make_camera().to("cuda")
@@ -219,7 +221,7 @@ def test_the_first_render_of_a_size_cannot_be_captured_unless_it_is_bounded():
 def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
     splats, camera = make_splats(200).to("cuda"), make_camera(300, 200).to("cuda")
     splats.scales.mul_(0.1)
-    settings = RenderSettings(max_intersections=2_000)
+    settings = RenderSettings(max_intersections=1_000)
     with torch.no_grad():
         on_another_stream(lambda: render(splats, camera, settings=settings))
         graph = torch.cuda.CUDAGraph()
@@ -228,7 +230,7 @@ def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
         splats.scales.mul_(20.0)
         graph.replay()
         torch.cuda.synchronize()
-        assert int(captured.num_intersections) > 2_000
+        assert int(captured.num_intersections) > 1_000
         assert torch.equal(captured.joint.image, render(splats, camera).joint.image)
 
 
