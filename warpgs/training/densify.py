@@ -11,6 +11,7 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.ops.adam import Adam
 
 from . import optimizer as optim
+from . import ranks
 
 RESET_OPACITY = 0.01
 """Maximum opacity after a reset (3DGS)."""
@@ -46,6 +47,14 @@ class GradientStatistics:
         norms = torch.hypot(*v_offsets.unbind(-1))  # finite where squares would overflow
         self.total += torch.where(visible, norms, 0.0)
         self.count += visible
+
+    @torch.no_grad()
+    def merge(self) -> None:
+        """Moves what all ranks have observed to rank 0; the others are left with zeros."""
+        for tensor in (self.total, self.count):
+            ranks.add_(tensor)
+            if not ranks.is_first():
+                tensor.zero_()
 
     def mean(self) -> Float[Tensor, " N"]:
         return self.total / self.count.clamp_min(1.0)

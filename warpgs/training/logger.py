@@ -41,15 +41,15 @@ class TrainingLogger:
     """A context that shows progress and writes TensorBoard events.
 
     Args:
-        folder: Folder of the events.
+        folder: Folder of the events; None: without events.
         num_iterations: Length of the run.
         first_iteration: Iterations done before this session.
-        quiet: Whether to write events only.
+        quiet: Whether to show nothing.
     """
 
-    def __init__(self, folder: Path, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
+    def __init__(self, folder: Path | None, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
         self._console = Console(quiet=quiet)
-        self._events = SummaryWriter(str(folder), purge_step=first_iteration)
+        self._events = None if folder is None else SummaryWriter(str(folder), purge_step=first_iteration)
         self._total = num_iterations
         self._bar: Progress | None = None
         self._task: TaskID | None = None
@@ -77,7 +77,8 @@ class TrainingLogger:
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
-        self._events.close()
+        if self._events is not None:
+            self._events.close()
 
     def log(self, text: str) -> None:
         """Prints a line above the bar."""
@@ -105,11 +106,13 @@ class TrainingLogger:
 
     def add_scalar(self, name: str, value: float, iteration: int) -> None:
         """Adds a number to the events."""
-        self._events.add_scalar(name, value, iteration)
+        if self._events is not None:
+            self._events.add_scalar(name, value, iteration)
 
     def add_image(self, name: str, image: UInt8[np.ndarray, "H W 3"], iteration: int) -> None:
         """Adds an 8-bit RGB image to the events."""
-        self._events.add_image(name, image, iteration, dataformats="HWC")
+        if self._events is not None:
+            self._events.add_image(name, image, iteration, dataformats="HWC")
 
     def skip(self, seconds: float) -> None:
         """Leaves out time in which nothing was trained [s]."""
@@ -126,4 +129,4 @@ class TrainingLogger:
             **{f"loss/{name}": value for name, value in status.terms.items()},
         }
         for name, value in values.items():
-            self._events.add_scalar(name, value, status.iteration)
+            self.add_scalar(name, float(value), status.iteration)

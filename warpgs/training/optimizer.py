@@ -1,6 +1,14 @@
-"""Adam over Gaussians, networks and camera poses, and its learning rates."""
+"""Adam over Gaussians, networks and camera poses, and its learning rates.
 
-from collections.abc import Mapping
+With N ranks a step averages the gradients of N views. Adam is scaled to that as in gsplat
+(``create_splats_with_optimizers`` in ``examples/simple_trainer.py``) and Grendel-GS (``training_setup`` in
+``scene/gaussian_model.py``, mode ``sqrt``), after Malladi et al. 2022, "On the SDEs and scaling rules for adaptive
+gradient algorithms": learning rates times √N, ε divided by √N. The decay rates of the moments are βᴺ, as in Grendel-GS;
+gsplat's 1 − N (1 − β) agrees to first order, but is 0 for ten ranks.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Int64
@@ -11,6 +19,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
+
+from . import ranks
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15
@@ -54,7 +64,8 @@ def make_optimizer(parameters: Mapping[str, nn.Parameter], rates: Mapping[str, T
         }
         for name in GROUPS
     ]
-    return Adam(groups, BETAS, EPSILON)
+    num = ranks.num_ranks()
+    return Adam(groups, (BETAS[0] ** num, BETAS[1] ** num), EPSILON / math.sqrt(num))
 
 
 def learning_rates(
@@ -65,10 +76,10 @@ def learning_rates(
     network_progress: Mapping[str, float],
     warmup_factors: Mapping[str, float],
 ) -> dict[str, float]:
-    """Learning rate of each group of ``GROUPS``.
+    """Learning rate of each group of ``GROUPS``, for a step over as many views as there are ranks.
 
     Args:
-        config: Rates.
+        config: Rates of one view per step.
         extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
         progress: Fraction of the run done, in [0, 1].
         means_progress: By branch, fraction done of the decay of its positions' rate.
@@ -90,13 +101,51 @@ def learning_rates(
         rate = exponential(config.networks, config.networks_end, network_progress[name])
         rates[name] = warmup_factors[name] * rate
     rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, progress)
-    return rates
+    return {name: math.sqrt(ranks.num_ranks()) * rate for name, rate in rates.items()}
 
 
 def exponential(start: float, end: float, progress: float) -> float:
     """Log-linear interpolation from ``start`` at progress 0 to ``end`` at 1; constant outside."""
     progress = min(max(progress, 0.0), 1.0)
     return float(start ** (1.0 - progress) * end**progress)
+
+
+@torch.no_grad()
+def average_gradients(optimizer: Adam) -> None:
+    """Replaces the gradients of every rank by their means over the ranks, in one transfer.
+
+    Which parameters have gradients must be the same on all ranks: it depends on the ``Phase`` alone.
+    """
+    trained = [p for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+    if ranks.num_ranks() == 1 or not trained:
+        return
+    flat = torch.cat([parameter.grad.view(-1) for parameter in trained])
+    ranks.add_(flat)
+    flat /= ranks.num_ranks()
+    for parameter, gradient in zip(trained, flat.split([p.numel() for p in trained]), strict=True):
+        parameter.grad = gradient.view_as(parameter)
+
+
+@torch.no_grad()
+def copy_first(parameters: Sequence[nn.Parameter], optimizer: Adam | None = None) -> None:
+    """Replaces parameters and Adam's moments by those of rank 0, where their first axes may have other lengths.
+
+    Args:
+        parameters: The same ones, in the same order, on all ranks. What keeps its shape stays at its address.
+        optimizer: From ``make_optimizer``; None before it has any state.
+    """
+    if ranks.num_ranks() == 1:
+        return
+    lengths = torch.tensor([len(parameter) for parameter in parameters])
+    ranks.copy_first_(lengths)
+    for parameter, length in zip(parameters, lengths.tolist(), strict=True):
+        state = {} if optimizer is None else optimizer.state.get(parameter, {})
+        if len(parameter) != length:
+            parameter.grad = None
+            parameter.data = parameter.new_empty(length, *parameter.shape[1:])
+            state.update({name: torch.empty_like(parameter) for name in MOMENTS if name in state})
+        for tensor in (parameter.data, *(state[name] for name in MOMENTS if name in state)):
+            ranks.copy_first_(tensor)
 
 
 @torch.no_grad()

@@ -83,6 +83,16 @@ class IterationPlan:
     realign: bool
     remove_large: bool
 
+    @property
+    def replaces_gaussians(self) -> bool:
+        """Whether Gaussians are added or removed after the iteration."""
+        return self.densify or self.prune or self.prune_weakest or self.reseed
+
+    @property
+    def adapts(self) -> bool:
+        """Whether anything is done after the iteration."""
+        return self.replaces_gaussians or self.reset or self.realign
+
 
 def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
     """The config of a run whose last stage is longer, so that the run takes ``iterations`` in total.

@@ -14,6 +14,7 @@ from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
 
 from . import optimizer as optim
+from . import ranks
 from .densify import GradientStatistics
 from .loss_terms import TERMS
 from .losses import LossInputs
@@ -52,7 +53,7 @@ class Means(NamedTuple):
 
 
 class Step:
-    """Trains a scene by one view per iteration.
+    """Trains a scene by one view per iteration and rank.
 
     ``_run`` is all that happens on the device. It is given a ``Phase``, branches on nothing else that changes during a
     run, and reads whatever else changes from tensors. So on CUDA it is captured once per phase and replayed until the
@@ -69,7 +70,8 @@ class Step:
     Attributes:
         scene: What is trained.
         optimizer: Its Adam.
-        statistics: Screen-space gradients since the last densification.
+        statistics: Screen-space gradients since the last densification; on rank 0 those of all ranks until the last
+            ``merge``, too.
     """
 
     def __init__(
@@ -123,8 +125,13 @@ class Step:
         else:
             self._graphs.run(plan.phase, partial(self._run_resident, plan.phase))
 
+    def release_graphs(self) -> None:
+        """Frees the memory of the CUDA graphs; from then on, iterations are eager."""
+        self._graphs = None
+
     def take_means(self) -> Means:
-        """Means over the iterations since the last call; waits for the device."""
+        """Means over the iterations of all ranks since the last call; waits for the device."""
+        ranks.add_(self._sums)
         *terms, psnr, iterations = self._sums.tolist()
         self._sums.zero_()
         return Means({name: value / iterations for name, value in zip(TERMS, terms, strict=True)}, psnr / iterations)
@@ -147,6 +154,7 @@ class Step:
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
         # The weights are the gradients of the weighted sum, whose value is not needed.
         torch.autograd.backward(list(terms.values()), [self._inputs.scale[name] for name in terms])
+        optim.average_gradients(self.optimizer)
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.statistics.observe(rendering.radii)

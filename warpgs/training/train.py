@@ -1,6 +1,8 @@
 """A training run from start to end: run folder, training, evaluation."""
 
+import contextlib
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,8 +16,9 @@ from warpgs.evaluation.lpips import locate
 from warpgs.model.poses import PoseCorrections
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
-from warpgs.runs.run import Run, choose_device, new_folder, open_capture
+from warpgs.runs.run import Device, Run, choose_device, new_folder, open_capture
 
+from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
 from .interrupt import Interrupt
 from .logger import TrainingLogger
@@ -41,7 +44,7 @@ class UnfitCaptureError(ValueError):
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """Ctrl-C stopped the training after an iteration, and a checkpoint of it was saved.
+    """Ctrl-C or SIGTERM stopped the training after an iteration, and a checkpoint of it was saved.
 
     Attributes:
         folder: Run folder; ``TrainConfig(resume=folder)`` continues it.
@@ -59,7 +62,10 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
     ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
     does, with ``dataclasses.replace`` and ``warpgs.presets.PRESETS``.
 
-    The first Ctrl-C lets the current iteration finish and saves a checkpoint, the second one stops at once.
+    The first Ctrl-C or SIGTERM lets the current iteration finish and saves a checkpoint, the second one stops at once.
+
+    Under torchrun its processes train one scene together (``ranks.py``). The first one writes the run folder and
+    evaluates; in the others, ``log`` and ``callbacks`` are not called, and ``train`` returns when training has ended.
 
     Args:
         config: The config; ``PRESETS`` has complete ones. ``resume`` continues a run with its own config, for
@@ -77,36 +83,50 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         ValueError: If the run, its capture or an option cannot be used, or the loss is repeatedly not finite.
         OSError: If a file cannot be written.
     """
+    with ranks.joined():
+        is_first = ranks.is_first()
+        log = log if is_first else None
+        trainer = make_trainer(config, log)
+        _describe(trainer, log or _ignore)
+        is_extended = config.resume is not None and config.iterations is not None
+        _train(trainer, is_extended, callbacks, quiet=log is None)
+    if is_first:
+        _evaluate(trainer, log)
+    return Run(trainer.run, trainer.config)
+
+
+def _evaluate(trainer: Trainer, log: Log | None) -> None:
+    """Evaluates what was trained and logs the results."""
     quiet, log = log is None, log or _ignore
-    trainer = make_trainer(config, log)
-    run = Run(trainer.run, trainer.config)
-    _describe(trainer, log)
-    is_extended = config.resume is not None and config.iterations is not None
-    _train(trainer, run, is_extended, callbacks, quiet)
     if trainer.views.poses is not None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
-    log(evaluate_run(run.folder, capture, device=trainer.config.device, quiet=quiet))
-    log(f"metrics.json, views.csv, images/ and time.mp4 are in {run.folder}")
-    return run
+    log(evaluate_run(trainer.run, capture, device=trainer.config.device, quiet=quiet))
+    log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 
 
-def _train(trainer: Trainer, run: Run, is_extended: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
+def _train(trainer: Trainer, is_extended: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
     """Trains in the locked run folder; raises TrainingInterrupted after Ctrl-C."""
-    num_iterations = trainer.protocol.num_iterations
+    num_iterations, is_first = trainer.protocol.num_iterations, ranks.is_first()
+    run = Run(trainer.run, trainer.config)
+    events = run.folder / "events" if is_first else None
     with (
-        run.lock(),
+        run.lock() if is_first else contextlib.nullcontext(),
         Interrupt() as interrupt,
-        TrainingLogger(run.folder / "events", num_iterations, trainer.iteration, quiet) as logger,
+        TrainingLogger(events, num_iterations, trainer.iteration, quiet) as logger,
     ):
-        if is_extended:
-            write_config(run.folder, run.config)
-        trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
+        if is_first:
+            if is_extended:
+                write_config(run.folder, run.config)
+            trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
         try:
             finished = trainer.train(logger, interrupt)
         finally:
-            preview.remove(run.folder)
-    if not finished and interrupt.requested:
+            if is_first:
+                preview.remove(run.folder)
+        trainer.step.release_graphs()
+        interrupted = ranks.any_rank(not finished and interrupt.requested)
+    if interrupted:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
 
 
@@ -115,7 +135,8 @@ def _describe(trainer: Trainer, log: Log) -> None:
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
     config, name = trainer.config, trainer.capture.name
     layout = "" if config.data is None else f" (read as {config.dataset or recognize(config.data)})"
-    log(f"{name}{layout}: {num_views} views, on {config.device}, into {trainer.run}")
+    together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
+    log(f"{name}{layout}: {num_views} views, on {config.device}{together}, into {trainer.run}")
     if jumps := int((trainer.gains != 1.0).any(1).sum()):
         low, high = trainer.gains.min().item(), trainer.gains.max().item()
         log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")
@@ -157,22 +178,42 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
         saved = extended(read_config(config.resume), config.iterations)
         if config.lpips is not None:
             saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
-        run = Run(config.resume, dataclasses.replace(saved, device=choose_device(config.device or saved.device)))
+        run = Run(config.resume, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
         locate(run.config.lpips, run.config.lpips_net)
         capture = check_capture(run.open_capture(quiet), run.config, log)
+        _compare_ranks(run.config, capture)
         trainer = Trainer(run.config, capture, run.folder)
         trainer.restore_newest(log)
         return trainer
-    config = scaled(dataclasses.replace(config, device=choose_device(config.device)))
+    config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
     bands = fitted_bands(config.model, len(capture.train))
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    trainer = Trainer(config, capture, new_folder(config, capture))
-    Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
+    _compare_ranks(config, capture)
+    folder = str(new_folder(config, capture)) if ranks.is_first() else ""
+    trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
+    if ranks.is_first():
+        Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
     return trainer
+
+
+def _own_device(asked: Device | None) -> Device:
+    """The type of device to train on; on GPUs each rank of torchrun uses its own."""
+    device = choose_device(asked)
+    ranks.use_device(device)
+    return device
+
+
+def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
+    """Raises ValueError if a rank of torchrun was started with other options or has another capture than the first."""
+    ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
+    cameras = [(name, camera.size, camera.time) for name, camera in sorted(capture.cameras.items())]
+    values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
+    numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
+    ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:

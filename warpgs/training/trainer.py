@@ -1,6 +1,5 @@
 """The training loop."""
 
-import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 from warpgs.runs.trained import TrainedScene
 
-from . import initialize
+from . import initialize, ranks
 from . import optimizer as optim
 from .callbacks import Callback, Progress
 from .densify import DensifyLimits, densify, reset_opacities
@@ -25,12 +24,16 @@ from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .prune import blend_weights, prune_invisible, prune_weakest
 from .reseed import gaussians_that_show, lost_fraction, lost_pixels
+from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
 from .views import Views
 
 CHECK_EVERY = 50
 """Iterations between checks of the loss, which synchronize with the device."""
+
+AGREE_EVERY = 10
+"""Iterations after which several ranks tell each other whether to stop, as long as a single one does in each."""
 
 MAX_ROLLBACKS = 3
 """Maximum number of returns to the last checkpoint after a loss that is not finite."""
@@ -39,8 +42,11 @@ MAX_ROLLBACKS = 3
 class Trainer:
     """Trains a scene on a capture into a run folder.
 
-    All random numbers are a function of the seed, the iteration and the number of rollbacks, so that a resumed run
-    continues exactly as the interrupted one would have.
+    All random numbers are a function of the seed, the iteration, the number of rollbacks and the rank, so that a
+    resumed run continues exactly as the interrupted one would have.
+
+    Several ranks (``ranks.py``) train one scene: an iteration is one step of Adam over one view of each. Nothing in the
+    schedule depends on their number, as in gsplat, whose users shorten it by ``--steps_scaler``.
 
     Args:
         config: Resolved config: schedule rescaled, device chosen.
@@ -79,12 +85,19 @@ class Trainer:
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
         found = initialize.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
+        for tensor in found:
+            ranks.copy_first_(tensor)
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
         self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.protocol = Protocol(config, has_depth=self.num_aligned > 0)
-        self._order: tuple[int, int, list[int]] = (-1, 0, [])
-        self._set_scene(initialize.initial_scene(config, self.capture, self._generator("points")))
+        self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
+        self._start_from(initialize.initial_scene(config, self.capture, self._generator("points")))
+
+    def _start_from(self, scene: SplitScene) -> None:
+        """Replaces the scene on all ranks by that of rank 0, with a new optimizer."""
+        optim.copy_first(list(optim.trained_parameters(scene.to(self.device), self.views.poses).values()))
+        self._set_scene(scene)
 
     def _set_scene(self, scene: SplitScene) -> None:
         """Replaces the scene, with a new optimizer."""
@@ -109,14 +122,15 @@ class Trainer:
                 self._add_dynamic_gaussians()
             plan = self.protocol.at(self.iteration)
             self.step(plan, self._sample(plan))
-            self._adapt(plan, logger)
+            if plan.adapts:
+                self._adapt_all_ranks(plan, logger)
             self.iteration += 1
             at_checkpoint = self.iteration % self.config.checkpoint_every == 0
             at_checkpoint |= self.iteration == self.protocol.num_iterations
-            stop = interrupt is not None and interrupt.requested
+            stop = self._is_stop_requested(interrupt)
             if at_checkpoint or stop or self.iteration % CHECK_EVERY == 0:
                 status = self._check(plan.phase, logger)
-                stop |= status is not None and self._call_back(status, logger)
+                stop |= status is not None and ranks.any_rank(self._call_back(status, logger))
                 if status is None:
                     self._roll_back(logger)
                 elif at_checkpoint or stop:
@@ -124,6 +138,25 @@ class Trainer:
             if stop:
                 return False
         return True
+
+    def _is_stop_requested(self, interrupt: Interrupt | None) -> bool:
+        """Whether training is to stop after this iteration; the same answer on all ranks."""
+        requested = interrupt is not None and interrupt.requested
+        if ranks.num_ranks() == 1:
+            return requested
+        at_end = self.iteration == self.protocol.num_iterations
+        return (at_end or self.iteration % AGREE_EVERY == 0) and ranks.any_rank(requested)
+
+    def _adapt_all_ranks(self, plan: IterationPlan, logger: TrainingLogger) -> None:
+        """Lets rank 0 change the scene as planned and sends it to the others."""
+        ranks.any_rank(False)  # so that a lost rank is found here, where no GPU waits for it yet
+        self.step.statistics.merge()
+        if ranks.is_first():
+            self._adapt(plan, logger)
+        optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
+        ranks.copy_first_(self.alignments)
+        if plan.replaces_gaussians:
+            self.step.reset_statistics()
 
     def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Changes the alignment of depth and the sets of Gaussians as planned."""
@@ -151,8 +184,6 @@ class Trainer:
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
-        if plan.densify or plan.prune or plan.reseed or plan.prune_weakest:
-            self.step.reset_statistics()
 
     def _densify(self, remove_large: bool) -> None:
         """Densifies both branches, which divide the remaining capacity in proportion to how many want to grow."""
@@ -198,29 +229,17 @@ class Trainer:
         self.scene.dynamic = initialize.dynamic_gaussians(
             self.config, self.capture, self.views, self.alignments, self._generator("dynamic")
         )
-        self._set_scene(self.scene)
+        self._start_from(self.scene)
 
     # Randomness -------------------------------------------------------------------------------------------------------
 
-    def _generator(self, purpose: str, iteration: int | None = None) -> torch.Generator:
-        """Random numbers for a purpose at an iteration, by default the current one."""
-        iteration = self.iteration if iteration is None else iteration
-        words = f"{self.config.seed} {purpose} {iteration} {self.rollbacks}"
-        return torch.Generator().manual_seed(
-            int.from_bytes(hashlib.blake2b(words.encode(), digest_size=7).digest(), "big")
-        )
+    def _generator(self, purpose: str) -> torch.Generator:
+        """Random numbers for a purpose at the current iteration."""
+        return random_numbers(self.config.seed, purpose, self.iteration, self.rollbacks)
 
     def _sample(self, plan: IterationPlan) -> Sample:
-        """A view (every epoch visits each once, in a new order), noise on time and a background."""
-        epoch, index = divmod(self.iteration, len(self.views))
-        if self._order[:2] != (epoch, self.rollbacks):
-            order = torch.randperm(len(self.views), generator=self._generator("views", epoch))
-            self._order = (epoch, self.rollbacks, order.tolist())
-        generator = self._generator("draw")
-        noise = plan.time_noise / len(self.views) * torch.randn(1, generator=generator).item()
-        is_random = self.config.loss.dynamic_background == "random"
-        background = torch.rand(3, generator=generator) if is_random else torch.zeros(3)
-        return Sample(self._order[2][index], noise, background)
+        """This rank's view, noise on time and background in the current iteration."""
+        return self._sampler(self.iteration, self.rollbacks, plan.time_noise)
 
     # Checks and checkpoints -------------------------------------------------------------------------------------------
 
@@ -269,7 +288,10 @@ class Trainer:
         )
 
     def save(self) -> None:
-        """Writes a checkpoint of the whole state of training."""
+        """Writes a checkpoint of the whole state of training, on rank 0; the others only hand over what they have."""
+        self.step.statistics.merge()
+        if not ranks.is_first():
+            return
         tensors = {f"scene.{name}": tensor for name, tensor in self.scene.state_dict().items()}
         if self.views.poses is not None:
             tensors |= {f"poses.{name}": tensor for name, tensor in self.views.poses.state_dict().items()}
@@ -322,8 +344,9 @@ class Trainer:
                     part: loaded.tensor(f"adam.{part}.{name}", shape).to(self.device) for part, shape in shapes.items()
                 }
         statistics = self.step.statistics
-        statistics.total = loaded.tensor("gradients.total", statistics.total.shape).to(self.device)
-        statistics.count = loaded.tensor("gradients.count", statistics.count.shape).to(self.device)
+        if ranks.is_first():
+            statistics.total = loaded.tensor("gradients.total", statistics.total.shape).to(self.device)
+            statistics.count = loaded.tensor("gradients.count", statistics.count.shape).to(self.device)
         metadata = loaded.metadata
         self.iteration, self.rollbacks = metadata.iteration, metadata.rollbacks
         self.seconds, self._started = metadata.train_seconds, time.monotonic()
@@ -332,7 +355,8 @@ class Trainer:
     def restore_newest(self, log: Callable[[str], None]) -> None:
         """Restores the newest checkpoint of the run folder; without any, training starts from the beginning.
 
-        Damaged ones are renamed, with a warning, and the one before them is restored.
+        Damaged ones are renamed, with a warning, and the one before them is restored. Rank 0 decides which; the others
+        read the same file.
 
         Args:
             log: Receives the warnings.
@@ -340,6 +364,13 @@ class Trainer:
         Raises:
             ValueError: If all are damaged, or the newest that is not is of another config or capture.
         """
+        path = self._restore_newest(log) if ranks.is_first() else None
+        name = ranks.text_of_first("" if path is None else path.name)
+        if name and not ranks.is_first():
+            self.restore(self.run / checkpoint.FOLDER / name)
+
+    def _restore_newest(self, log: Callable[[str], None]) -> Path | None:
+        """Restores the newest checkpoint that is not damaged; returns it."""
         damaged: list[checkpoint.DamagedCheckpointError] = []
         for path in reversed(checkpoint.list_checkpoints(self.run)):
             try:
@@ -350,6 +381,7 @@ class Trainer:
             for reason in damaged:
                 aside = checkpoint.set_aside(reason.path)
                 log(f"warning: {reason}; it is now {aside.name}, and training continues from {path}")
-            return
+            return path
         if damaged:
             raise damaged[0]
+        return None
