@@ -1,4 +1,4 @@
-"""Ctrl-C: the first is recorded, the second interrupts, and the previous handler is restored."""
+"""Ctrl-C and SIGTERM: the first is recorded, the second interrupts, and the previous handler is restored."""
 
 import dataclasses
 import signal
@@ -51,6 +51,15 @@ def test_a_third_ctrl_c_interrupts_too():
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 press()
+
+
+def test_sigterm_is_recorded_as_ctrl_c_is_and_then_left_to_the_system():
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupt() as interrupt:
+        signal.raise_signal(signal.SIGTERM)
+        assert interrupt.requested
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize("presses", [0, 1])

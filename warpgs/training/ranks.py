@@ -54,7 +54,8 @@ def joined() -> Iterator[None]:
     except BaseException as error:
         _end(error)
         raise
-    gc.collect()  # NCCL waits for CUDA graphs that hold its communicator
+    if torch.cuda.is_initialized():
+        gc.collect()  # of CUDA graphs that hold NCCL's communicator, for which its end would wait
     dist.destroy_process_group()
 
 

@@ -1,0 +1,149 @@
+"""Processes that train together as those of torchrun do, forked from one that has imported everything."""
+
+import dataclasses
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch._dynamo  # noqa: F401  # optimizers import it, which takes seconds
+from torch.distributed import TCPStore
+
+from warpgs.config import TrainConfig
+from warpgs.files import write_json
+from warpgs.runs.checkpoint import _hash
+from warpgs.training import command, ranks
+from warpgs.training import train as script
+from warpgs.training.step import Step
+from warpgs.training.trainer import Trainer
+
+TIMEOUT = 120.0
+"""Time after which processes that have not ended are killed [s]."""
+
+
+def start(folder: Path, work: Callable[..., Any], *arguments: Any, num: int = 2) -> list[int]:
+    """Runs ``work(folder, *arguments)`` on ``num`` ranks; returns their exit codes, negative after a signal.
+
+    ``folder`` then has what they wrote: rank0.out, rank0.err, rank1.out …
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.two_ranks"])
+    folder.mkdir(exist_ok=True)
+    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # torchrun also holds it
+    processes = [
+        context.Process(target=_main, args=(rank, num, store.port, folder, work, arguments)) for rank in range(num)
+    ]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(TIMEOUT)
+        process.kill()
+        process.join()
+    return [process.exitcode for process in processes]
+
+
+def errors(folder: Path, rank: int) -> list[str]:
+    """The lines that a rank has written to stderr, without those of Warp and torch."""
+    lines = (folder / f"rank{rank}.err").read_text().splitlines()
+    return [line for line in lines if not line.startswith(("Warp ", "[W", "[Gloo]"))]
+
+
+def _main(rank: int, num: int, port: int, folder: Path, work: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    numbers = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": num, "LOCAL_WORLD_SIZE": num, "MASTER_PORT": port}
+    os.environ.update({name: str(number) for name, number in numbers.items()})
+    os.environ.update(
+        MASTER_ADDR="127.0.0.1",
+        TORCHELASTIC_RUN_ID="test",
+        TORCHELASTIC_USE_AGENT_STORE="True",
+        GLOO_SOCKET_IFNAME="lo",
+    )
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder / f"rank{rank}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", buffering=1) for number in (1, 2))
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    torch.set_num_threads(1)
+    sys.exit(work(folder, *arguments))
+
+
+# What the ranks do ---------------------------------------------------------------------------------------------------
+
+
+def digest(trainer: Trainer) -> str:
+    """Hash of all parameters and of Adam's state."""
+    tensors = {name: parameter.detach().cpu() for name, parameter in trainer.step.parameters().items()}
+    for name, parameter in trainer.step.parameters().items():
+        state = trainer.step.optimizer.state.get(parameter, {})
+        tensors |= {f"{part} {name}": value.cpu() for part, value in state.items()}
+    return _hash(tensors, "")
+
+
+def train(folder: Path, config: TrainConfig, stop_at: int | None = None) -> int:
+    """Trains; each rank writes what it has in the end and in between to rank0.json, rank1.json …"""
+    rank, steps, lines, whole = int(os.environ["RANK"]), [], [], Step.__call__
+
+    def step(self, plan, sample):
+        whole(self, plan, sample)
+        steps.append({"view": sample.view, "static": len(self.scene.static), "dynamic": len(self.scene.dynamic)})
+        if len(steps) == stop_at and rank == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    Step.__call__ = step
+    script.evaluate_run = lambda *_, **__: "evaluated"
+    make_trainer, trainers = script.make_trainer, []
+    script.make_trainer = lambda *arguments: trainers.append(make_trainer(*arguments)) or trainers[0]
+    try:
+        return command.run_command(lambda: script.train(config, log=lines.append))
+    finally:
+        result = {"digest": digest(trainers[0]), "iteration": trainers[0].iteration, "steps": steps, "lines": lines}
+        write_json(folder / f"rank{rank}.json", result)
+
+
+def one_step(folder: Path, config: TrainConfig) -> None:
+    """One iteration, of which each rank saves its choices, and rank 0 what is known after it."""
+    with ranks.joined():
+        trainer = script.make_trainer(config)
+        plan = trainer.protocol.at(0)
+        sample = trainer._sample(plan)
+        trainer.step(plan, sample)
+        torch.save((sample.view, sample.time_noise, sample.background), folder / f"sample{ranks.rank()}.pt")
+        trainer.step.statistics.merge()
+        counts = trainer.step.statistics.count.clone()
+        trainer.iteration = 1
+        trainer.save()
+        assert ranks.is_first() or not counts.any()
+
+
+def fail_in_step(folder: Path, config: TrainConfig, how: str) -> int:
+    """Trains by the command; rank 1 fails in its fifth iteration."""
+    whole, count = Step.__call__, 0
+
+    def step(self, plan, sample):
+        nonlocal count
+        whole(self, plan, sample)
+        count += 1
+        if count == 5 and os.environ["RANK"] == "1":
+            if how == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise ValueError("rank 1 has a reason")
+
+    Step.__call__ = step
+    return command_with(config)
+
+
+def command_with(config: TrainConfig) -> int:
+    command.parse = lambda *_: config
+    return command.main([], "warpgs train")
+
+
+def with_differences(folder: Path, config: TrainConfig, what: str) -> int:
+    """Trains by the command; rank 1 has other options, or another capture under the same path."""
+    if os.environ["RANK"] == "1" and what == "the options":
+        config = dataclasses.replace(config, seed=1)
+    elif os.environ["RANK"] == "1":
+        whole = script.open_capture
+        script.open_capture = lambda *_: dataclasses.replace(c := whole(*_), points=c.points + 1e-3)
+    return command_with(config)
