@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ TIMEOUT = 120.0
 def start(folder: Path, work: Callable[..., Any], *arguments: Any, num: int = 2) -> list[int]:
     """Runs ``work(folder, *arguments)`` on ``num`` ranks; returns their exit codes, negative after a signal.
 
+    As torchrun, it sends SIGTERM to all when one has failed.
+
     ``folder`` then has what they wrote: rank0.out, rank0.err, rank1.out …
     """
     context = multiprocessing.get_context("forkserver")
@@ -39,8 +42,13 @@ def start(folder: Path, work: Callable[..., Any], *arguments: Any, num: int = 2)
     ]
     for process in processes:
         process.start()
+    end = time.monotonic() + TIMEOUT
+    while any(process.is_alive() for process in processes) and time.monotonic() < end:
+        if any(process.exitcode for process in processes):
+            for process in processes:
+                process.terminate()
+        time.sleep(0.1)
     for process in processes:
-        process.join(TIMEOUT)
         process.kill()
         process.join()
     return [process.exitcode for process in processes]

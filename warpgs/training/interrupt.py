@@ -7,9 +7,9 @@ from typing import Any
 
 
 class Interrupt:
-    """A context in which the first Ctrl-C or SIGTERM is only recorded; the second one ends the program as usual.
+    """A context in which the first Ctrl-C is only recorded; the second one raises KeyboardInterrupt as usual.
 
-    Schedulers of clusters, and torchrun if a process fails, send SIGTERM some seconds before they kill.
+    SIGTERM is recorded, too, every time: schedulers of clusters and torchrun send it some seconds before they kill.
 
     Outside the main thread, where Python does not handle signals, it does nothing.
 
@@ -30,7 +30,6 @@ class Interrupt:
     def _record(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

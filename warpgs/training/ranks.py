@@ -14,8 +14,11 @@ import datetime
 import gc
 import hashlib
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
+from types import FrameType
 
 import torch
 import torch.distributed as dist
@@ -23,15 +26,15 @@ from torch import Tensor
 
 from warpgs.errors import FAILED, INTERRUPTED
 
-TIMEOUT = datetime.timedelta(minutes=10)
-"""How long a rank waits for the others, which callbacks and checkpoints of rank 0 let wait, before it gives up."""
+TIMEOUT_MINUTES = 10
+"""How long a rank waits for the others, as for callbacks and checkpoints of rank 0, before it gives up [minutes]."""
 
 REPORTED = "warpgs/reported"
 """Key of the ranks' common store: how many of them have ended with an error."""
 
 
 class RankLostError(ValueError):
-    """Another rank ended, or did not answer for ``TIMEOUT``."""
+    """Another rank ended, or did not answer for ``TIMEOUT_MINUTES``."""
 
 
 @contextlib.contextmanager
@@ -48,15 +51,27 @@ def joined() -> Iterator[None]:
         yield
         return
     has_nccl = torch.cuda.is_available() and dist.is_nccl_available()
-    dist.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo", timeout=TIMEOUT)
+    dist.init_process_group(
+        "cpu:gloo,cuda:nccl" if has_nccl else "gloo", timeout=datetime.timedelta(minutes=TIMEOUT_MINUTES)
+    )
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, _stop) if is_main else None
     try:
         yield
     except BaseException as error:
+        if is_main:  # torchrun ends all when one has ended, but first they are to report
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
         _end(error)
         raise
+    if before is not None:
+        signal.signal(signal.SIGTERM, before)
     if torch.cuda.is_initialized():
         gc.collect()  # of CUDA graphs that hold NCCL's communicator, for which its end would wait
     dist.destroy_process_group()
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt("stopped")
 
 
 def _end(error: BaseException) -> None:
@@ -117,7 +132,7 @@ def _reaching_all(tensor: Tensor) -> Iterator[None]:
         if tensor.is_cuda and not isinstance(error, dist.DistError):  # out of memory, for example
             raise
         raise RankLostError(
-            f"another of the {num_ranks()} processes ended, or did not answer for {TIMEOUT}; "
+            f"another of the {num_ranks()} processes ended, or did not answer for {TIMEOUT_MINUTES} minutes; "
             "continue from the last checkpoint with --resume"
         ) from error
 

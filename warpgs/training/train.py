@@ -62,7 +62,8 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
     ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
     does, with ``dataclasses.replace`` and ``warpgs.presets.PRESETS``.
 
-    The first Ctrl-C or SIGTERM lets the current iteration finish and saves a checkpoint, the second one stops at once.
+    SIGTERM and the first Ctrl-C let the current iteration finish and save a checkpoint; the second Ctrl-C stops at
+    once.
 
     Under torchrun its processes train one scene together (``ranks.py``). The first one writes the run folder and
     evaluates; in the others, ``log`` and ``callbacks`` are not called, and ``train`` returns when training has ended.
