@@ -183,3 +183,25 @@ def test_without_torchrun_nothing_is_shared():
     assert ranks.any_rank(True)
     assert not ranks.any_rank(False)
     assert ranks.text_of_first("run") == "run"
+
+
+# On GPUs -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA devices")
+@pytest.mark.parametrize("graph", [False, True])
+def test_two_gpus_end_with_the_same_bits_and_a_run_that_opens(data, tmp_path, graph):
+    config = dataclasses.replace(config_of(data, tmp_path, graph=graph), device="cuda")
+    assert two_ranks.start(tmp_path, two_ranks.train, config) == [0, 0]
+    first, second = results(tmp_path)
+    assert first["digest"] == second["digest"]
+    assert first["iteration"] == tiny.LENGTH
+    assert checkpoint.load(checkpoint.path_of(tmp_path / "run", tiny.LENGTH)).metadata.iteration == tiny.LENGTH
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA devices")
+def test_a_rank_that_is_killed_ends_the_other_although_its_gpu_waits(data, tmp_path):
+    config = dataclasses.replace(config_of(data, tmp_path), device="cuda")
+    assert two_ranks.start(tmp_path, two_ranks.fail_in_step, config, "killed") == [2, -9]
+    (line,) = two_ranks.errors(tmp_path, 0)
+    assert line.startswith("warpgs train: another of the 2 processes ended, ")

@@ -119,7 +119,7 @@ def average_gradients(optimizer: Adam) -> None:
     trained = [p for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
     if ranks.num_ranks() == 1 or not trained:
         return
-    flat = torch.cat([parameter.grad.view(-1) for parameter in trained])
+    flat = torch.cat([parameter.grad.reshape(-1) for parameter in trained])
     ranks.add_(flat)
     flat /= ranks.num_ranks()
     for parameter, gradient in zip(trained, flat.split([p.numel() for p in trained]), strict=True):

@@ -139,14 +139,14 @@ def _reaching_all(tensor: Tensor) -> Iterator[None]:
 
 def add_(tensor: Tensor) -> None:
     """Replaces a tensor on every rank by the sum over the ranks."""
-    if num_ranks() > 1:
+    if num_ranks() > 1 and tensor.numel():
         with _reaching_all(tensor):
             dist.all_reduce(tensor)
 
 
 def copy_first_(tensor: Tensor) -> None:
     """Replaces a tensor, which has one shape everywhere, by that of rank 0."""
-    if num_ranks() > 1:
+    if num_ranks() > 1 and tensor.numel():
         with _reaching_all(tensor):
             dist.broadcast(tensor, 0)
 
@@ -169,8 +169,7 @@ def text_of_first(text: str) -> str:
     copy_first_(size)
     if not is_first():
         content = torch.empty(int(size.item()), dtype=torch.uint8)
-    if len(content):
-        copy_first_(content)
+    copy_first_(content)
     return bytes(content.tolist()).decode()
 
 
