@@ -89,8 +89,11 @@ def digest(trainer: Trainer) -> str:
     return _hash(tensors, "")
 
 
-def train(folder: Path, config: TrainConfig, stop_at: int | None = None) -> int:
-    """Trains; each rank writes what it has in the end and in between to rank0.json, rank1.json …"""
+def train(folder: Path, config: TrainConfig, stop_at: int | None = None, bad_at: int | None = None) -> int:
+    """Trains; each rank writes what it has in the end and in between to rank0.json, rank1.json …
+
+    After its step ``stop_at`` rank 1 gets SIGTERM, after ``bad_at`` its loss is not finite.
+    """
     rank, steps, lines, whole = int(os.environ["RANK"]), [], [], Step.__call__
 
     def step(self, plan, sample):
@@ -98,6 +101,8 @@ def train(folder: Path, config: TrainConfig, stop_at: int | None = None) -> int:
         steps.append({"view": sample.view, "static": len(self.scene.static), "dynamic": len(self.scene.dynamic)})
         if len(steps) == stop_at and rank == 1:
             signal.raise_signal(signal.SIGTERM)
+        if len(steps) == bad_at and rank == 1:
+            self._sums.fill_(torch.nan)
 
     Step.__call__ = step
     script.evaluate_run = lambda *_, **__: "evaluated"

@@ -1,5 +1,6 @@
 """Progress on the console and TensorBoard events."""
 
+import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -134,3 +135,11 @@ def test_a_quiet_logger_writes_events_only(tmp_path, capsys, monkeypatch, is_ter
         log.log("nothing")
     assert capsys.readouterr().out == ""
     assert events(tmp_path)["loss/total"] == [(500, 0.75)]
+
+
+def test_without_a_folder_there_are_no_events(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with TrainingLogger(None, 500, 0, quiet=True) as log:
+        log.report(status(50))
+        log.add_image("image", np.zeros((2, 2, 3), np.uint8), 50)
+    assert list(tmp_path.iterdir()) == []

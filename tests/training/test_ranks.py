@@ -99,6 +99,17 @@ def test_a_step_is_as_much_larger_as_gsplat_and_grendel_scale_it(monkeypatch, da
     assert adam.defaults["eps"] == optimizer.EPSILON / 2
 
 
+def test_a_loss_of_one_rank_that_is_not_finite_rolls_all_back(data, tmp_path):
+    assert two_ranks.start(tmp_path, two_ranks.train, config_of(data, tmp_path), None, 12) == [0, 0]
+    first, second = results(tmp_path)
+    assert any(
+        "not finite after iteration 15: back to iteration 10" in line
+        for line in (tmp_path / "rank0.out").read_text().splitlines()
+    )
+    assert len(first["steps"]) == len(second["steps"]) == tiny.LENGTH + 5
+    assert first["digest"] == second["digest"]
+
+
 # One run -------------------------------------------------------------------------------------------------------------
 
 

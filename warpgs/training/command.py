@@ -45,8 +45,8 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
 def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Trains, then evaluates; returns the exit code.
 
-    Ctrl-C saves a checkpoint and ends with 130. Errors that the user can fix end with one line and 2, captures on which
-    training would be useless with one line per error and 1.
+    Ctrl-C and SIGTERM save a checkpoint and end with 130. Errors that the user can fix end with one line and 2,
+    captures on which training would be useless with one line per error and 1.
     """
     return run_command(lambda: run(parse(sys.argv[1:] if arguments is None else arguments, prog)), prog, ADVICE)
 
