@@ -115,6 +115,15 @@ def train(folder: Path, config: TrainConfig, stop_at: int | None = None, bad_at:
         write_json(folder / f"rank{rank}.json", result)
 
 
+def train_with_callback(folder: Path, config: TrainConfig) -> int:
+    """Trains until a callback asks to stop, at the first check; each rank writes how often it was called."""
+    calls = []
+    script.evaluate_run = lambda *_, **__: "evaluated"
+    script.train(config, callbacks=[lambda progress: calls.append(progress.status.iteration) or True])
+    write_json(folder / f"rank{os.environ['RANK']}.json", {"calls": calls})
+    return 0
+
+
 def one_step(folder: Path, config: TrainConfig) -> None:
     """One iteration, of which each rank saves its choices, and rank 0 what is known after it."""
     with ranks.joined():

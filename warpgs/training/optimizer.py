@@ -136,11 +136,11 @@ def copy_first(parameters: Sequence[nn.Parameter], optimizer: Adam | None = None
     """
     if ranks.num_ranks() == 1:
         return
-    lengths = torch.tensor([len(parameter) for parameter in parameters])
+    lengths = torch.tensor([parameter.shape[:1].numel() for parameter in parameters])
     ranks.copy_first_(lengths)
     for parameter, length in zip(parameters, lengths.tolist(), strict=True):
         state = {} if optimizer is None else optimizer.state.get(parameter, {})
-        if len(parameter) != length:
+        if parameter.shape[:1].numel() != length:
             parameter.grad = None
             parameter.data = parameter.new_empty(length, *parameter.shape[1:])
             state.update({name: torch.empty_like(parameter) for name in MOMENTS if name in state})

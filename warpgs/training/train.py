@@ -83,6 +83,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         UnfitCaptureError: If the capture has errors that would make training useless.
         ValueError: If the run, its capture or an option cannot be used, or the loss is repeatedly not finite.
         OSError: If a file cannot be written.
+        SystemExit: Under torchrun, if another of its processes has failed and reports why.
     """
     with ranks.joined():
         is_first = ranks.is_first()
