@@ -123,10 +123,10 @@ def test_the_first_rank_alone_writes_reports_and_evaluates(whole):
 def test_a_signal_to_one_rank_stops_all_with_a_checkpoint_from_which_they_continue(data, whole, tmp_path):
     folder, config = tmp_path / "ranks", config_of(data, tmp_path / "ranks")
     assert two_ranks.start(folder, two_ranks.train, config, 12) == [130, 130]
-    assert [rank["iteration"] for rank in results(folder)] == [20, 20]
-    assert checkpoint.list_checkpoints(folder / "run")[-1] == checkpoint.path_of(folder / "run", 20)
+    assert [rank["iteration"] for rank in results(folder)] == [15, 15]
+    assert checkpoint.list_checkpoints(folder / "run")[-1] == checkpoint.path_of(folder / "run", 15)
     lines = two_ranks.errors(folder, 0) + two_ranks.errors(folder, 1)
-    assert lines == [f"warpgs: stopped after iteration 20 of {tiny.LENGTH}; continue with --resume {folder / 'run'}"]
+    assert lines == [f"warpgs: stopped after iteration 15 of {tiny.LENGTH}; continue with --resume {folder / 'run'}"]
 
     assert two_ranks.start(folder, two_ranks.train, TrainConfig(resume=folder / "run")) == [0, 0]
     assert tiny.differences(tiny.state(folder / "run"), tiny.state(whole / "run")) == []

@@ -127,8 +127,9 @@ class Trainer:
             self.iteration += 1
             at_checkpoint = self.iteration % self.config.checkpoint_every == 0
             at_checkpoint |= self.iteration == self.protocol.num_iterations
-            stop = self._is_stop_requested(interrupt)
-            if at_checkpoint or stop or self.iteration % CHECK_EVERY == 0:
+            is_check = at_checkpoint or self.iteration % CHECK_EVERY == 0
+            stop = self._is_stop_requested(interrupt, is_check)
+            if is_check or stop:
                 status = self._check(plan.phase, logger)
                 stop |= status is not None and ranks.any_rank(self._call_back(status, logger))
                 if status is None:
@@ -139,17 +140,19 @@ class Trainer:
                 return False
         return True
 
-    def _is_stop_requested(self, interrupt: Interrupt | None) -> bool:
-        """Whether training is to stop after this iteration; the same answer on all ranks."""
+    def _is_stop_requested(self, interrupt: Interrupt | None, is_check: bool) -> bool:
+        """Whether training is to stop after this iteration; the same answer on all ranks.
+
+        They agree before every check, too: a lost rank is found here, where no rank waits for its GPU yet.
+        """
         requested = interrupt is not None and interrupt.requested
         if ranks.num_ranks() == 1:
             return requested
-        at_end = self.iteration == self.protocol.num_iterations
-        return (at_end or self.iteration % AGREE_EVERY == 0) and ranks.any_rank(requested)
+        return (is_check or self.iteration % AGREE_EVERY == 0) and ranks.any_rank(requested)
 
     def _adapt_all_ranks(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Lets rank 0 change the scene as planned and sends it to the others."""
-        ranks.any_rank(False)  # so that a lost rank is found here, where no GPU waits for it yet
+        ranks.any_rank(False)  # finds a lost rank
         self.step.statistics.merge()
         if ranks.is_first():
             self._adapt(plan, logger)
@@ -226,6 +229,7 @@ class Trainer:
 
     def _add_dynamic_gaussians(self) -> None:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned."""
+        ranks.any_rank(False)  # finds a lost rank
         self.scene.dynamic = initialize.dynamic_gaussians(
             self.config, self.capture, self.views, self.alignments, self._generator("dynamic")
         )
