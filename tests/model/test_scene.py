@@ -1,5 +1,8 @@
 """The scene at a time: static Gaussians with changing appearance, dynamic ones that deform (paper Eq. 5, 8, 11)."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -243,3 +246,16 @@ def test_the_appearance_network_has_the_size_of_both_networks_unless_it_has_its_
     scene = make_scene(appearance_depth=2, appearance_width=16)
     assert [rows for rows, _ in scene.appearance.trunk.sizes] == [16, 16, 3]
     assert [rows for rows, _ in scene.deformation.trunk.sizes] == [8, 8, 8, 10]
+
+
+def test_a_scene_is_made_on_the_meta_device_without_the_compiler_of_torch():
+    """Every run is opened by that; the compiler takes seconds to import, and 90 MB."""
+    code = (
+        "import sys, torch\n"
+        "from warpgs.config import ModelConfig\n"
+        "from warpgs.model.scene import SplitScene\n"
+        "with torch.device('meta'):\n"
+        "    SplitScene.empty(5, 4, ModelConfig())\n"
+        "print({'torch._dynamo', 'sympy'} & set(sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "set()\n"

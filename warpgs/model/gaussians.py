@@ -69,7 +69,10 @@ class Gaussians(nn.Module):
     @staticmethod
     def empty(num: int, sh_degree: int = MAX_SH_DEGREE) -> "Gaussians":
         """``num`` Gaussians with arbitrary values, to load a state into."""
-        return Gaussians.from_points(torch.zeros(num, 3), torch.zeros(num, 3), torch.ones(num), 0.5, sh_degree)
+        # Only calls that make new tensors: on torch's "meta" device others import torch's compiler, a second and 90 MB.
+        rest = (sh_degree + 1) ** 2 - 1
+        widths = ((3,), (4,), (3,), (), (1, 3), (rest, 3))
+        return Gaussians(*(torch.zeros(num, *width) for width in widths))
 
     def __len__(self) -> int:
         return self.means.shape[0]
