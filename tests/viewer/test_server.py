@@ -1,5 +1,6 @@
 """The server of the viewer, its sessions, and one-line errors."""
 
+import gc
 import importlib.util
 import random
 import shutil
@@ -7,6 +8,7 @@ import socket
 import threading
 import time
 import urllib.request
+import weakref
 from types import SimpleNamespace
 
 import pytest
@@ -128,6 +130,27 @@ def test_images_are_rendered_by_threads_that_end_with_their_browsers(run, monkey
             until(lambda: rendered)
         assert [thread for thread, *_ in rendered] == [session._thread]
         until(lambda: not session._thread.is_alive())
+
+
+@pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
+def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
+    """Python by itself finds what viser's handles refer to so late that memory grows over a hundred visits."""
+    gc.collect()
+    gc.disable()
+    try:
+        with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
+            left = []
+            for k in range(2):
+                with Browser(viewer.port, random.Random(k)) as browser:
+                    browser.look()
+                    until(lambda: viewer.sessions)
+                    (session,) = viewer.sessions.values()
+                left.append((weakref.ref(session), weakref.ref(session._client)))
+                until(lambda session=session: not session._thread.is_alive())
+                del session
+            until(lambda: [ref() for ref in left[0]] == [None, None])
+    finally:
+        gc.enable()
 
 
 def until(condition):

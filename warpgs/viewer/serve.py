@@ -43,6 +43,8 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
         lower_priority(NICENESS)
     with Viewer(source, training_cameras(source, warn), options.host, options.port) as viewer:
         host = f"[{options.host}]" if ":" in options.host else options.host
+        gc.collect()
+        gc.freeze()  # what is there by now stays: collections after visits need not visit it
         report(f"{options.run_folder}: http://{host}:{viewer.port} (press Ctrl-C to stop)")
         _wait()
         report("\nstopping")

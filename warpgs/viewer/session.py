@@ -1,6 +1,7 @@
 """One browser: its camera, its controls, and the thread that renders for it."""
 
 import bisect
+import gc
 import threading
 import time
 from collections import deque
@@ -271,6 +272,7 @@ class Session:
             self._update_status()
             if wait and self._wake.wait(wait):
                 self._wake.clear()
+        gc.collect()  # viser's handles refer to each other: Python finds that of itself after about a hundred visits
         release_free_memory()
 
     def _update_image(self) -> float:
