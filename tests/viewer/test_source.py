@@ -1,6 +1,7 @@
 """The scene that the viewer shows."""
 
 import shutil
+import threading
 
 import pytest
 import torch
@@ -101,6 +102,25 @@ def test_a_checkpoint_deleted_while_it_is_read_is_ignored(run, without_interval,
     monkeypatch.setattr(Run, "newest_checkpoint", lambda _: deleted)
     assert source.current() is before
     assert source.note == ""
+
+
+def test_nobody_waits_for_a_scene_that_another_thread_reads(run, without_interval, monkeypatch):
+    source = open_source(run, "cpu", True)
+    before = source.current()
+    watched.advance(run)
+    begun, read = threading.Event(), threading.Event()
+    monkeypatch.setattr(Run, "trained_scene", lambda *_: (begun.set(), read.wait(60.0), before)[-1])
+    reader = threading.Thread(target=source.current)
+    reader.start()
+    begun.wait(60.0)
+    assert source.current() is before
+    source.stop()
+    assert reader.is_alive()
+    assert not preview.is_requested(run)
+    read.set()
+    reader.join()
+    source.current()
+    assert not preview.is_requested(run)
 
 
 def test_a_run_without_a_checkpoint_is_refused(run):

@@ -35,7 +35,7 @@ class Source:
     def __init__(self, run: Run, follow: bool = False) -> None:
         self.run, self.follow = run, follow
         self.note = self.progress = ""
-        self._lock = threading.Lock()
+        self._reading, self._asking = threading.Lock(), threading.Lock()
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
@@ -47,23 +47,30 @@ class Source:
     def current(self) -> TrainedScene | None:
         """The newest scene; the one before it if the newest cannot be read; None before the first checkpoint.
 
-        A training that is followed is asked for what it has between its checkpoints.
+        A training that is followed is asked for what it has between its checkpoints. While one thread reads a newer
+        scene, others get the one before it.
         """
-        with self._lock:
-            if self.follow and time.monotonic() - self._checked >= POLL_SECONDS:
-                self._checked = time.monotonic()
-                self._reload()
-            return self._scene
+        if self.follow and self._reading.acquire(blocking=False):
+            try:
+                if time.monotonic() - self._checked >= POLL_SECONDS:
+                    self._checked = time.monotonic()
+                    self._reload()
+            finally:
+                self._reading.release()
+        return self._scene
 
     def stop(self) -> None:
-        """Follows the run no longer; nothing of the viewer remains in its folder."""
-        with self._lock:
+        """Follows the run no longer; nothing of the viewer remains in its folder. A scene being read is not awaited."""
+        with self._asking:
             if self.follow:
                 self.follow = False
                 preview.withdraw(self.run.folder)
 
     def _reload(self) -> None:
-        preview.request(self.run.folder)
+        with self._asking:
+            if not self.follow:
+                return
+            preview.request(self.run.folder)
         try:
             newest = self._newest()
             if newest is None:
