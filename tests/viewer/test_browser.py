@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 import time
 from pathlib import Path
 
@@ -191,7 +192,10 @@ def test_truth_is_shown_left_of_the_border_until_the_camera_moves(page, session,
 def test_camera_and_controls_survive_a_reload(page, session, viewer):
     session.panel.layer.value = "static"
     camera = session._client.camera
-    camera.position = camera.position + 0.05
+    target, arrived = camera.position + 0.05, threading.Event()
+    camera.on_update(lambda told: arrived.set() if np.allclose(told.position, target, atol=1e-5) else None)
+    camera.position = target
+    assert arrived.wait(60.0)  # until the browser says so, it may still tell where it was before
     settle(session)
     pose, time_shown = session._pose(), session.panel.time.value
     page.reload()
@@ -294,8 +298,8 @@ def test_looking_through_a_training_camera_takes_its_pose_and_time(page, session
     view = viewer._training.views[2]
     session.panel.view.value = 3
     until(lambda: session.panel.time.value == pytest.approx(view.time))
+    until(lambda: session._pose().position == pytest.approx(view.pose.position, abs=1e-4))
     settle(session)
-    assert session._pose().position == pytest.approx(view.pose.position, abs=1e-4)
     width, height = session._canvas()
     across = height * view.aspect * np.tan(view.pose.fov / 2) / np.tan(session._pose().fov / 2)
     assert across == pytest.approx(min(width, height * view.aspect))  # exactly the whole image of the camera
