@@ -1,5 +1,6 @@
 """Errors of commands end with one line and an exit code."""
 
+import os
 import subprocess
 import sys
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from warpgs.data.check import Finding
-from warpgs.errors import ADVICE, is_out_of_memory, one_line, run_command
+from warpgs.errors import ADVICE, CLOSED, is_out_of_memory, one_line, run_command
 
 
 def failing(error):
@@ -104,3 +105,17 @@ def test_importing_errors_imports_no_torch():
     code = "import warpgs.errors, sys; print('torch' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unbuffered"),
+    [(["--help"], ""), (["--help"], "1"), (["train", "--help"], ""), (["--tyro-print-completion", "bash"], "")],
+)
+def test_output_that_nobody_reads_is_no_error(arguments, unbuffered):
+    """As of ``warpgs --help | head``."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command, environment = [sys.executable, "-m", "warpgs", *arguments], {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (CLOSED, b"")

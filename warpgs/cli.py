@@ -104,8 +104,7 @@ def train(arguments: Sequence[str], prog: str) -> int:
             return training.main(arguments, prog)
     finally:
         if not help_all:
-            with contextlib.suppress(BrokenPipeError):  # of --help | head
-                print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.", flush=True)
+            print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.")
 
 
 def usage() -> str:

@@ -2,6 +2,7 @@
 
 import functools
 import io
+import os
 import sys
 from collections.abc import Callable
 from typing import ParamSpec
@@ -13,6 +14,9 @@ FAILED = 2
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as in shells."""
+
+CLOSED = 141
+"""Exit code if nobody reads the output any more (``| head``), as in shells."""
 
 ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a GPU has too little"
 """What to do without enough memory, where a command has no advice of its own."""
@@ -31,6 +35,8 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
     """
     try:
         code = command()
+    except BrokenPipeError:
+        raise  # to ``program``
     except (ValueError, ImportError, OSError) as error:
         sys.stderr.write(f"{prog}: {one_line(error)}\n")
         return FAILED
@@ -48,8 +54,9 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
 def program(main: Callable[P, int]) -> Callable[P, int]:
     """A program's main function.
 
-    It ends with one line after Ctrl-C also while it imports and reads its options. Characters that standard output
-    cannot represent (outside of terminals on Windows) are escaped, as those of standard error are.
+    It ends with one line after Ctrl-C also while it imports and reads its options, and without one if nobody reads its
+    output any more. Characters that standard output cannot represent (outside of terminals on Windows) are escaped, as
+    those of standard error are.
     """
 
     @functools.wraps(main)
@@ -57,7 +64,14 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
         try:
             if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
                 sys.stdout.reconfigure(errors="backslashreplace")
-            return main(*args, **kwargs)
+            try:
+                return main(*args, **kwargs)
+            finally:
+                sys.stdout.flush()  # at exit, it would be too late to catch the error
+        except BrokenPipeError:
+            with open(os.devnull, "wb") as nowhere:  # for what Python still writes at exit
+                os.dup2(nowhere.fileno(), sys.stdout.fileno())
+            return CLOSED
         except KeyboardInterrupt:
             sys.stderr.write("warpgs: stopped\n")
             return INTERRUPTED
