@@ -1,7 +1,8 @@
-"""Fills in the generated parts of the site: the tables of options.md, from the dataclasses that commands parse."""
+"""What the site changes in its pages: the tables of options.md come from the dataclasses that commands parse."""
 
 import dataclasses
 import functools
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,13 +13,17 @@ from warpgs.presets import PRESETS
 
 MARKER = "<!-- options -->"
 
+ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
+
 SHOWN = "best"
 """Preset whose values are the defaults of ``train`` in the tables: that of captures."""
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """mkdocs calls this for the text of every page."""
-    return markdown.replace(MARKER, "\n".join(sections())) if MARKER in markdown else markdown
+    filled = markdown.replace(MARKER, "\n".join(sections())) if MARKER in markdown else markdown
+    # GitHub needs pipes escaped also in the code of a table, where Python's Markdown shows the backslash.
+    return ROW.sub(lambda row: CODE.sub(lambda code: code[0].replace("\\|", "|"), row[0]), filled)
 
 
 def sections() -> Iterator[str]:

@@ -139,6 +139,13 @@ def test_the_page_of_options_has_the_defaults_of_the_command_line(monkeypatch):
     assert (defaults["RUN"], defaults["--supersample"]) == (dataclasses.MISSING, 1)
 
 
+def test_pipes_in_the_code_of_tables_are_shown_without_the_backslash_that_github_needs(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    text = "| `--a b\\|c` | either \\| or |\n\nnot `d\\|e`"
+    assert pages.on_page_markdown(text) == "| `--a b|c` | either \\| or |\n\nnot `d\\|e`"
+
+
 SITE = ("mkdocs", "material", "mkdocstrings")
 
 
