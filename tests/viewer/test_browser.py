@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import threading
 import time
 from pathlib import Path
 
@@ -192,10 +191,15 @@ def test_truth_is_shown_left_of_the_border_until_the_camera_moves(page, session,
 def test_camera_and_controls_survive_a_reload(page, session, viewer):
     session.panel.layer.value = "static"
     camera = session._client.camera
-    target, arrived = camera.position + 0.05, threading.Event()
-    camera.on_update(lambda told: arrived.set() if np.allclose(told.position, target, atol=1e-5) else None)
+    target, told = camera.position + 0.05, []
+
+    @camera.on_update
+    async def _(camera):
+        told.append(camera.position)
+
     camera.position = target
-    assert arrived.wait(60.0)  # until the browser says so, it may still tell where it was before
+    handled(page, session)
+    until(lambda: told and np.allclose(told[-1], target, atol=1e-5))  # before, it may still tell where it was
     settle(session)
     pose, time_shown = session._pose(), session.panel.time.value
     page.reload()
@@ -203,7 +207,7 @@ def test_camera_and_controls_survive_a_reload(page, session, viewer):
     until(lambda: viewer.sessions and session not in viewer.sessions.values())
     (after,) = viewer.sessions.values()
     settle(after)
-    assert after._pose().position == pytest.approx(pose.position, abs=1e-5)
+    until(lambda: after._pose().position == pytest.approx(pose.position, abs=1e-5))
     assert abs(np.dot(after._pose().wxyz, pose.wxyz)) == pytest.approx(1.0, abs=1e-5)
     assert (after.panel.layer.value, after.panel.time.value) == ("static", time_shown)
 
