@@ -17,7 +17,7 @@ def layer(value):
 @pytest.fixture
 def rendering():
     nothing = torch.zeros(0, 2)
-    return Rendering(layer(0.2), layer(0.4), layer(0.6), nothing.int(), nothing, None, None)
+    return Rendering(layer(0.2), layer(0.4), layer(0.6), nothing.int(), None, None, None)
 
 
 @pytest.mark.parametrize(

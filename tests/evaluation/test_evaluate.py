@@ -60,7 +60,7 @@ def rendering(image, dynamic_alpha=None):
     alpha = torch.zeros(H, W) if dynamic_alpha is None else dynamic_alpha
     nothing = torch.zeros(0, 2)
     joint = layer(image, torch.ones(H, W))
-    return Rendering(joint, joint, layer(torch.zeros(H, W, 3), alpha), nothing.int(), nothing, None, None)
+    return Rendering(joint, joint, layer(torch.zeros(H, W, 3), alpha), nothing.int(), None, None, None)
 
 
 class Scene:
@@ -245,7 +245,7 @@ def pattern_scene():
         image = pattern(*rays(camera))
         layer = Layer(image, torch.zeros(camera.height, camera.width), None)
         nothing = torch.zeros(0, 2)
-        return Rendering(layer, layer, layer, nothing.int(), nothing, None, None)
+        return Rendering(layer, layer, layer, nothing.int(), None, None, None)
 
     return Scene(render)
 
