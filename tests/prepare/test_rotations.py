@@ -1,10 +1,13 @@
 """Directions of a camera that only turns, from matches."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from warpgs.data.lens import Lens
+from warpgs.prepare import rotations
 from warpgs.prepare.cameras import NoCamerasError
 from warpgs.prepare.rotations import find_directions
 
@@ -79,3 +82,13 @@ def test_without_enough_matches_the_focal_length_must_be_given():
 def test_frames_without_matches_are_refused():
     with pytest.raises(NoCamerasError, match=r"only \d+ of 14 frames are connected"):
         find_directions(NAMES, {}, TRUE, finds_focal=False, finds_distortion=False)
+
+
+def test_an_impossible_lens_is_refused_with_what_to_give(monkeypatch):
+    impossible = dataclasses.replace(TRUE, radial=(-3.0, 0.0, 0.0))  # lines through the middle fold back
+    solve = rotations._Problem.solve
+    monkeypatch.setattr(rotations._Problem, "solve", lambda problem, start: (solve(problem, start)[0], impossible))
+    monkeypatch.setattr(rotations, "_checked_error", lambda residuals: 0.3)
+    advice = r"too strong to undistort.*--focal PX.*--intrinsics FILE.*--lens SIMPLE_PINHOLE"
+    with pytest.raises(NoCamerasError, match=advice):
+        find_directions(NAMES, matches(), UNKNOWN, finds_focal=True, finds_distortion=True)

@@ -61,7 +61,8 @@ def find_directions(
         finds_distortion: Whether to find the first coefficient of radial distortion.
 
     Raises:
-        NoCamerasError: If the frames show too little in common, or the camera does not only turn.
+        NoCamerasError: If the frames show too little in common, the camera does not only turn, or the lens that is
+            found is impossible.
     """
     usable = {pair: matches for pair, matches in pairs.items() if len(matches[0]) >= MIN_MATCHES}
     if finds_focal:
@@ -79,6 +80,7 @@ def find_directions(
     problem = _Problem.of(used, lens, finds_focal, finds_distortion)
     directions, lens = problem.solve(np.array([r.as_matrix() for r in rotations if r is not None]))
     error = _checked_error(problem.residuals(directions, lens))
+    _check_lens(lens)
     poses = np.concatenate([directions, np.zeros((len(placed), 3, 1))], 2)
     return Cameras([names[k] for k in placed], lens, poses, np.zeros((0, 3)), error, 0.0)
 
@@ -93,6 +95,17 @@ def _checked_error(residuals: Float[np.ndarray, "M 2"]) -> float:
             f"less than {MIN_EXPLAINED:.0%}; use --camera moving"
         )
     return float(errors[explained].mean())
+
+
+def _check_lens(lens: Lens) -> None:
+    """Refuses a lens that no camera has; what the matches leave open can become anything."""
+    try:
+        lens.checked()
+    except ValueError as error:
+        raise NoCamerasError(
+            f"the matches determine no possible lens: {error}; give the focal length (--focal PX) or the whole lens "
+            "(--intrinsics FILE), or leave out distortion (--lens SIMPLE_PINHOLE)"
+        ) from error
 
 
 def _with_focal(pairs: Sequence[Matches], lens: Lens) -> Lens:
