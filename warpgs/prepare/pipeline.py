@@ -65,7 +65,7 @@ def _run_steps(source: Path, options: Options, journal: Journal) -> None:
     frames = take(source, options, journal)
     steps, masks = Steps(frames, options, journal), Masks()
     if MASKERS.get(options.masks) is not None:
-        first = steps.recover("cameras, first pass", frames.names, thorough=False)
+        first = steps.recover_background("cameras, first pass")
         masks = steps.find_masks("masks", first)
         if masks.dynamic_fraction > DOUBTFUL_FRACTION:  # dynamic objects have misled the cameras
             first, masks = _repair(first, masks, steps)

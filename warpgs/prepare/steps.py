@@ -5,15 +5,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from warpgs.data.lens import Lens
 
+from .background_motion import SIDE, off_background
 from .cameras import Cameras, NoCamerasError
 from .checks import check_count
 from .depth import DEPTHS, add_depth
 from .frames import Frames, take_frames
 from .given_masks import find_given_masks, read_dynamic
+from .images import read_images, resize_to_side
 from .intrinsics import read_intrinsics
 from .journal import Journal
 from .masks import MASKERS, Masks, find_masks, write_masks
@@ -142,6 +145,34 @@ class Steps:
         width, height = self.frames.width, self.frames.height
         source = round(width / self.frames.factor), round(height / self.frames.factor)
         return read_intrinsics(self.options.intrinsics, source).resized(width, height)
+
+    def recover_background(self, name: str) -> Cameras:
+        """The cameras of all frames, without features that do not move with the background if that suffices."""
+        names = self.frames.names
+        if self.options.camera != "moving":
+            return self.recover(name, names, thorough=False)
+        background = self.find_background("background")
+        try:
+            return self.recover(name, names, background, thorough=False)
+        except NoCamerasError:  # too little is left, or all parallax is in what was left out
+            return self.recover(name, names, thorough=False)
+
+    def find_background(self, name: str) -> Masks:
+        """Masks of what does not move with the background, found without cameras."""
+
+        def make(path: Path) -> str:
+            folder, names = self.frames.folder, self.frames.names
+            images = [resize_to_side(image, SIDE) for image in read_images(folder, names)]
+            size = self.frames.width, self.frames.height
+            off = [
+                cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+                for mask in off_background(images, self.journal.quiet)
+            ]
+            self._require_space(MASK_BYTES)
+            write_masks(path, names, off)
+            return f"{np.mean([mask.mean() for mask in off]):.1%} of the pixels do not move with it"
+
+        return self.journal.result(name, Masks.load, make)
 
     def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
         """The masks of the cameras' frames."""
