@@ -357,7 +357,7 @@ def test_force_removes_only_the_files_of_prepare(shots, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         prepare(shots, tmp_path, force=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".prepare", "letter.txt"]
-    assert sorted(path.name for path in (tmp_path / ".prepare").iterdir()) == ["frames", "state.json"]
+    assert sorted(path.name for path in (tmp_path / ".prepare").iterdir()) == ["background", "frames", "state.json"]
 
 
 @pytest.mark.parametrize("options", [{"selection": Selection(fps=2.0)}, {"source": Path("no/such.mp4")}])
