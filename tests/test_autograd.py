@@ -169,6 +169,21 @@ def test_a_render_is_freed_with_its_images(backward_passes, backward):
     assert [reference() for reference in backward_passes] == [None] * 3
 
 
+def test_a_render_whose_backward_pass_fails_is_freed(monkeypatch):
+    def fail(*args):
+        raise MemoryError
+
+    monkeypatch.setattr(rendering, "project_bwd", fail)
+    background = torch.zeros(3, requires_grad=True)
+    rendered = render(as_leaves(make_splats()), CAMERA, background, RenderSettings(depth=True))
+    node = weakref.ref(rendered.joint.image.grad_fn)
+    with pytest.raises(MemoryError):
+        rendered.joint.image.sum().backward()
+    del rendered
+    gc.collect()  # of the exception and its frames
+    assert node() is None
+
+
 def test_a_render_without_gradients_is_freed_at_once(backward_passes):
     with torch.no_grad():
         render(make_splats(), CAMERA)

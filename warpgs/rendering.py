@@ -219,8 +219,11 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
     """composite → unproject: plays the tape in reverse."""
     back.begin(saved, v_layers)
-    tape.backward()
-    return back.end()
+    try:
+        tape.backward()
+        return back.gradients()
+    finally:
+        back.end()
 
 
 class _Backward:
@@ -278,11 +281,14 @@ class _Backward:
         v_colors = self.v.get("viewmat")
         self.v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
 
-    def end(self) -> Gradients:
-        """Frees everything but the gradients of the inputs, and returns these."""
-        gradients = [self.v.get(name) for name in _Inputs._fields]
-        del self.inputs, self.saved, self.layers, self.v_layers, self.v_rows, self.v_splats, self.v
-        return gradients
+    def gradients(self) -> Gradients:
+        """The gradients of the inputs."""
+        return [self.v.get(name) for name in _Inputs._fields]
+
+    def end(self) -> None:
+        """Frees everything of this pass, also after an error: outputs among it would keep their own node alive."""
+        for name in ("inputs", "saved", "layers", "v_layers", "v_rows", "v_splats", "v"):
+            self.__dict__.pop(name, None)
 
     def _rows(self) -> Rows:
         features = self.saved.features.shape[1]
