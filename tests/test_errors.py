@@ -19,6 +19,11 @@ def failing(error):
     return command
 
 
+def test_a_pipe_that_breaks_elsewhere_is_an_error_like_others(capsys):
+    assert run_command(failing(BrokenPipeError(32, "Broken pipe"))) == 2
+    assert capsys.readouterr().err == "warpgs: [Errno 32] Broken pipe\n"
+
+
 @pytest.mark.parametrize(("returned", "code"), [(None, 0), (0, 0), (1, 1), (130, 130), ("text", 0), (True, 0)])
 def test_a_command_that_succeeds_decides_its_exit_code(returned, code, capsys):
     assert run_command(lambda: returned) == code

@@ -35,9 +35,9 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
     """
     try:
         code = command()
-    except BrokenPipeError:
-        raise  # to ``program``
     except (ValueError, ImportError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and _is_output_closed():
+            raise  # to ``program``
         sys.stderr.write(f"{prog}: {one_line(error)}\n")
         return FAILED
     except KeyboardInterrupt as stop:
@@ -49,6 +49,15 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
         sys.stderr.write(f"{prog}: {out_of_memory(error)}; {advice}\n")
         return FAILED
     return code if type(code) is int else 0
+
+
+def _is_output_closed() -> bool:
+    """Whether nobody reads standard output any more; what could not be written is still in its buffer."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return True
+    return False
 
 
 def program(main: Callable[P, int]) -> Callable[P, int]:
