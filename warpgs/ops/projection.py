@@ -88,15 +88,6 @@ def project_fwd(
     return splats
 
 
-class ProjectionGradients(NamedTuple):
-    """Gradients of the fields of a ``Projection`` that have one; None stands for zeros."""
-
-    v_means2d: Tensor | None
-    v_conics: Tensor | None
-    v_depths: Tensor | None
-    v_opacities: Tensor | None
-
-
 def project_bwd(
     geometry: Geometry,
     view: View,
