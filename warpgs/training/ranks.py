@@ -42,7 +42,7 @@ def joined() -> Iterator[None]:
     """Lets the processes that torchrun started work together inside; does nothing without torchrun.
 
     If training ends with errors, one rank reports its own, the first one; the others, of which most only miss that
-    rank, raise SystemExit.
+    rank, raise SystemExit. The process has to end after that: it cannot join again.
 
     Raises:
         RankLostError: If a rank ended without saying why, as a killed one does.
