@@ -122,7 +122,10 @@ class Lens:
             coefficients = np.array([*self.radial[:2], *self.tangential, self.radial[2]])
             criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
             distorted = np.stack([x, y], -1).reshape(-1, 1, 2).astype(np.float64)
-            found = cv2.undistortPoints(distorted, np.eye(3), coefficients, None, None, None, criteria)
+            if hasattr(cv2, "undistortPointsIter"):  # in OpenCV 4, whose undistortPoints takes no criteria
+                found = cv2.undistortPointsIter(distorted, np.eye(3), coefficients, np.eye(3), np.eye(3), criteria)
+            else:
+                found = cv2.undistortPoints(distorted, np.eye(3), coefficients, None, None, None, criteria)
             x, y = found[:, 0].T.reshape(2, *np.shape(x))
         return x, y
 
