@@ -211,6 +211,8 @@ def _own_device(asked: Device | None) -> Device:
 
 def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
     """Raises ValueError if a rank of torchrun was started with other options or has another capture than the first."""
+    if ranks.num_ranks() == 1:
+        return
     ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
     cameras = [(name, camera.size, camera.time) for name, camera in sorted(capture.cameras.items())]
     values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
