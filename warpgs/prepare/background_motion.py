@@ -3,9 +3,9 @@
 The camera that follows something keeps it in the image, while the background passes: the features of what is followed
 have the longest tracks, and structure from motion places the cameras relative to it. Epipolar geometry does not tell,
 because one that fits both usually exists. The background, however, is most of the image, and between neighbouring
-frames one homography, that of its dominant plane or of what is far away, explains nearly all of it: what is far off
-that homography is left out of the first pass. Parts of the static foreground are left out as well, which costs some
-features and no more.
+frames one homography, that of its dominant plane or of what is far away, explains nearly all of it: its
+outliers are masked in the first pass. Parts of the static foreground are masked as well, which only costs some
+features.
 """
 
 from collections.abc import Sequence

@@ -192,7 +192,7 @@ class _Problem:
         def cost(residuals: np.ndarray) -> float:
             return float(np.log1p((residuals**2).sum(1) / SCALE**2).sum())
 
-        # SciPy's least_squares would need hundreds of iterations: its sparse solvers search a 2D subspace in each.
+        # SciPy's least_squares converges slowly here: with a sparse Jacobian, a step is limited to a 2D subspace.
         x, damping = np.zeros(3 * len(start) - 3 + len(self.free)), 1e-3
         residuals = self.residuals(*state(x))
         for _ in range(MAX_STEPS):

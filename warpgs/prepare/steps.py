@@ -154,7 +154,7 @@ class Steps:
         background = self.find_background("background")
         try:
             return self.recover(name, names, background, thorough=False)
-        except NoCamerasError:  # too little is left, or all parallax is in what was left out
+        except NoCamerasError:  # too few features, or all parallax is in the masked region
             return self.recover(name, names, thorough=False)
 
     def find_background(self, name: str) -> Masks:
