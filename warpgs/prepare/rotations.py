@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.spatial.transform import Rotation
 
 from warpgs.data.lens import Lens
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.turning import Matches, find_turning, fit_rotation
 
 from .cameras import Cameras, NoCamerasError
@@ -146,7 +147,7 @@ def _chained(count: int, relative: Mapping[Pair, tuple[Rotation, int]]) -> list[
 
 
 def _thinned(matches: Matches) -> Matches:
-    chosen = np.unique(np.linspace(0, len(matches[0]) - 1, min(MAX_MATCHES, len(matches[0]))).astype(int))
+    chosen = evenly_spaced_indices(len(matches[0]), MAX_MATCHES)
     return matches[0][chosen], matches[1][chosen]
 
 
