@@ -7,12 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
-from warpgs.config import ModelConfig, TrainConfig, scaled, validate
+from tests.scenes import make_camera
+from warpgs.config import LossConfig, ModelConfig, TrainConfig, scaled, validate
+from warpgs.data.capture import Capture
 from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
-from warpgs.training.train import fitted_bands
+from warpgs.training.train import fitted, fitted_bands
 
 
 def changed(name, value, config=PRESETS["paper"]):
@@ -113,6 +116,24 @@ def test_frequencies_of_time_are_those_that_the_frames_determine(num_frames, ban
     model = ModelConfig(time_bands=10, min_period=4.0)
     assert fitted_bands(model, num_frames) == bands
     assert bands == 1 or 2 * (num_frames - 1) / 2 ** (bands - 1) >= 4.0
+
+
+def no_frame(name):
+    raise AssertionError(name)
+
+
+@pytest.mark.parametrize("assume", ["masks", "dynamic"])
+@pytest.mark.parametrize("asked", ["yes", "no", "given-masks"])
+@pytest.mark.parametrize("estimated", [False, True])
+def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, estimated):
+    cameras = {"a": make_camera()}
+    capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
+    lines: list[str] = []
+    config = TrainConfig(assume=assume, loss=LossConfig(branches_in_stage2=asked))
+    found = fitted(config, capture, lines.append).loss.branches_in_stage2
+    distrusted = asked == "given-masks" and estimated and assume == "masks"
+    assert found == ("no" if distrusted else "yes" if asked == "given-masks" else asked)
+    assert lines == (["the masks are estimates: stage II compares the joint image alone"] if distrusted else [])
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():

@@ -48,7 +48,7 @@ PAPER = {
         "app": True,
         "schedule.appearance_from": None,
         "schedule.joint_from": None,
-        "loss.branches_in_stage2": True,
+        "loss.branches_in_stage2": "yes",
     },
     "Experimental Setup": {
         "schedule.stage1": 30_000,

@@ -141,9 +141,9 @@ class LossConfig:
     """Final λ_depth; it decays exponentially."""
     depth_gate: bool = True
     """Whether depth is compared only where the rendered opacity exceeds a half; paper Eq. 14 compares it everywhere."""
-    branches_in_stage2: bool = True
-    """Whether stage II keeps the terms of the single branches (Eq. 9, 12 and 14) beside the joint image, as the sum in
-    Eq. 15 does; else it compares the joint image alone, as the authors' code does."""
+    branches_in_stage2: Literal["yes", "no", "given-masks"] = "yes"
+    """Whether stage II keeps the terms of the single branches (Eq. 9, 12, 14) beside the joint image, as Eq. 15 does,
+    or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""
     depth_tolerance: float = 0.0
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
     by 1 + (error / tolerance)², and depth that is hardly better than a constant is not used. If 0, all views have the

@@ -39,6 +39,7 @@ BEST = TrainConfig(
         depth_tolerance=0.03,
         depth_smooth=True,
         mask_margin=0.008,
+        branches_in_stage2="given-masks",
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
     densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.02, reseed=0.05),

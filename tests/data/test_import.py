@@ -53,6 +53,14 @@ def test_the_copy_is_the_same_capture(tmp_path, layout):
         assert_equal(load_capture(tmp_path / "copy"), original)
 
 
+def test_estimated_masks_stay_estimates(tmp_path):
+    source = captures.write_capture(tmp_path / "source", "nerfds")
+    index = json.loads((source / "dataset.json").read_text())
+    (source / "dataset.json").write_text(json.dumps({**index, "masks": "estimated"}))
+    import_capture(source, tmp_path / "copy")
+    assert load_capture(tmp_path / "copy").estimated_masks
+
+
 def test_the_command_says_what_it_read(tmp_path, capsys):
     source = layouts.write_colmap(tmp_path / "source")
     assert main(["import", str(source), str(tmp_path / "copy"), "--holdout", "6"]) == 0

@@ -44,6 +44,16 @@ def test_images_masks_and_points_are_read_back(root):
     assert np.allclose(capture.points.numpy(), (POINTS - UNITS.center) * UNITS.scale)
 
 
+def test_the_index_says_whether_masks_are_estimates(root):
+    assert not load_capture(root).estimated_masks
+    writer.write_index(root, TIMES, estimated_masks=True)
+    assert load_capture(root).estimated_masks
+    index = json.loads((root / "dataset.json").read_text())
+    (root / "dataset.json").write_text(json.dumps({**index, "masks": "guessed"}))
+    with pytest.raises(ValueError, match=r"dataset\.json: masks must be 'given' or 'estimated', got 'guessed'"):
+        load_capture(root)
+
+
 def test_cameras_are_read_back(root):
     camera = load_capture(root).cameras["b"]
     assert camera.size == SIZE

@@ -67,6 +67,7 @@ def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
         assert written_mask(root, name, "2x").shape == (96, 128)
     capture = load_capture(root)
     assert all(capture.frame(name).static_mask is not None for name in NAMES)
+    assert capture.estimated_masks
     assert (root / "masks.png").is_file()
 
 
@@ -80,6 +81,7 @@ def test_masks_that_are_there_stay(root):
     lines = []
     add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
     assert lines == ["masks: all frames have them"]
+    assert not load_capture(root).estimated_masks
     assert not written_mask(root, "shot003").any()
 
 
@@ -95,6 +97,7 @@ def test_masks_are_not_split_over_two_folders(root):
     (root / "mask").rename(root / "resized_mask")
     add_parts(root, AddOptions(["masks"], masks="red"))
     assert [written_mask(root, name).any() for name in NAMES] == [name not in train for name in NAMES]
+    assert not load_capture(root).estimated_masks  # those of the training frames are given
 
 
 def test_depth_and_points_are_those_of_the_scene(root):

@@ -80,7 +80,9 @@ def overlap(capture, count=24) -> float:
 
 
 def test_the_moving_board_is_masked(made):
-    assert overlap(load_capture(made)) > 0.7
+    capture = load_capture(made)
+    assert overlap(capture) > 0.7
+    assert capture.estimated_masks
 
 
 def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
@@ -301,6 +303,7 @@ def test_given_masks_are_used_unchanged(shots, tmp_path):
     prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), depth="none", lens="SIMPLE_PINHOLE")
     capture = load_capture(tmp_path / "made")
     assert np.array_equal(capture.frame("frame_000010").static_mask.numpy(), ~boards.record(24)[1][10])
+    assert not capture.estimated_masks
     assert np.median(distances(capture)) < 0.01
 
 

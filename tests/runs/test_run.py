@@ -132,6 +132,12 @@ def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
     assert read_config(run) == dataclasses.replace(before, preset=None)
 
 
+@pytest.mark.parametrize(("before", "now"), [(True, "yes"), (False, "no")])
+def test_whether_stage_2_compares_branches_was_a_yes_or_no(run, before, now):
+    edit(run, lambda values: values["loss"].update(branches_in_stage2=before))
+    assert read_config(run).loss.branches_in_stage2 == now
+
+
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))

@@ -133,11 +133,11 @@ def test_the_appearance_network_can_wait_for_stage_2(has_depth):
     assert not iterations_in_phases_where("use_appearance", stage2=False, schedule={"appearance_from": None})
 
 
-@pytest.mark.parametrize("keeps", [True, False])
+@pytest.mark.parametrize("keeps", ["yes", "no"])
 def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
     loss = dataclasses.replace(CONFIG.loss, branches_in_stage2=keeps)
     active = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE2).phase, loss)}
-    assert active == ({"static", "dynamic", "joint", "depth", "depth_dynamic"} if keeps else {"joint"})
+    assert active == ({"static", "dynamic", "joint", "depth", "depth_dynamic"} if keeps == "yes" else {"joint"})
     before = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE1).phase, loss)}
     assert before == {"static", "dynamic", "depth", "depth_dynamic"}
 

@@ -77,6 +77,7 @@ class Capture:
         cache_frames: Number of frames to keep in memory.
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
         read_taken: Reads a frame with the distortion of its lens; None if no lens of the capture distorts.
+        estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
         has_depth: Whether frames have the depth of the files; see ``without_depth``.
@@ -97,6 +98,7 @@ class Capture:
     cache_frames: int = 256
     unmasked: Assumption = "masks"
     metric_depth: bool = False
+    estimated_masks: bool = False
     read_taken: Callable[[str], TakenFrame] | None = None
     assumption: Assumption = field(init=False)
     has_depth: bool = field(init=False, default=True)

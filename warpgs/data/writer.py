@@ -19,6 +19,9 @@ from .units import SceneUnits
 LAYOUT = "nerfds"
 """Loader of what is written here, which dataset.json names."""
 
+GIVEN, ESTIMATED = "given", "estimated"
+"""What dataset.json says of the masks, see ``Capture.estimated_masks``."""
+
 
 def write_image(root: Path, name: str, image: UInt8[np.ndarray, "H W 3"], factors: Sequence[int] = (1,)) -> None:
     """Writes rgb/<factor>x/<name>.png for every downscaling factor.
@@ -163,7 +166,12 @@ def check_holdout(holdout: int) -> None:
 
 
 def write_index(
-    root: Path, time_ids: Mapping[str, int], val: Collection[str] = (), camera_ids: Mapping[str, int] | None = None
+    root: Path,
+    time_ids: Mapping[str, int],
+    val: Collection[str] = (),
+    camera_ids: Mapping[str, int] | None = None,
+    *,
+    estimated_masks: bool = False,
 ) -> None:
     """Writes metadata.json, then dataset.json, which makes the folder a capture.
 
@@ -174,6 +182,7 @@ def write_index(
         time_ids: Time step of every frame, in the order of dataset.json.
         val: Frames to evaluate on; all others are trained on.
         camera_ids: Camera of every frame; all are camera 0 if None.
+        estimated_masks: Whether the masks are estimates, see ``Capture.estimated_masks``.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
@@ -188,7 +197,8 @@ def write_index(
     train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
     counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}
     splits = {"ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids}
-    write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **splits})
+    masks = {"masks": ESTIMATED} if estimated_masks else {}
+    write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **masks, **splits})
 
 
 def _reduced_size(image: np.ndarray, factor: int) -> tuple[int, int]:

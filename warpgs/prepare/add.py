@@ -78,8 +78,11 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     for part in PARTS:
         if part in options.parts:
             getattr(job, f"add_{part}")()
+    said = dict(job.said)
     if recognize(root) != layout:  # masks in full size would make another dataset of it
-        write_json(root / "dataset.json", {**read_json(root / "dataset.json"), "layout": layout})
+        said["layout"] = layout
+    if said:
+        write_json(root / "dataset.json", {**read_json(root / "dataset.json"), **said})
 
 
 def _check_options(options: AddOptions) -> None:
@@ -93,7 +96,10 @@ def _check_options(options: AddOptions) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """One call of ``add_parts``; ``estimated`` holds frames and depth by the method's name."""
+    """One call of ``add_parts``.
+
+    ``estimated`` holds frames and depth by the method's name, ``said`` what dataset.json has to say of the masks.
+    """
 
     root: Path
     layout: str
@@ -102,6 +108,7 @@ class _Job:
     options: AddOptions
     log: Callable[[str], None] | None
     estimated: dict[str, tuple[PosedFrames, Sequence[np.ndarray]]] = field(default_factory=dict)
+    said: dict[str, str] = field(default_factory=dict)
 
     def add_masks(self) -> None:
         """Writes masks of the frames that lack them, and masks.png."""
@@ -133,6 +140,8 @@ class _Job:
         shown = choose_evenly(len(names))
         painted = [overlay_mask(frames.images[k], masks[k]) for k in shown]
         write_png(self.root / "masks.png", contact_sheet(painted, [names[k] for k in shown]))
+        if not set(missing).isdisjoint(self.capture.train):
+            self.said["masks"] = writer.ESTIMATED
         fraction = float(np.mean([mask.mean() for mask in masks]))
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 

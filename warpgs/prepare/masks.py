@@ -54,17 +54,20 @@ class Masks:
         dynamic_fraction: Fraction of the pixels that are dynamic.
         undistorted: Whether the masks belong to undistorted frames. COLMAP uses them with the frames all the same:
             features a few pixels from the outlines do no harm.
+        estimated: Whether a method of ``MASKERS`` found them, instead of the user giving them.
     """
 
     folder: Path | None = None
     dynamic_fraction: float = 0.0
     undistorted: bool = False
+    estimated: bool = False
 
     @staticmethod
     def load(folder: Path) -> "Masks":
         """The masks that ``write_masks`` wrote."""
         index = read_json(folder / INDEX)
-        return Masks(folder, float(index["dynamic_fraction"]), bool(index["undistorted"]))
+        flags = bool(index["undistorted"]), bool(index.get("estimated", False))
+        return Masks(folder, float(index["dynamic_fraction"]), *flags)
 
     def read_dynamic(self, cameras: Cameras) -> list[Bool[np.ndarray, "H W"]]:
         """[H, W] the dynamic mask of each undistorted frame of the cameras, in the size of the lens.
@@ -80,7 +83,12 @@ class Masks:
 
 
 def write_masks(
-    folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]], undistorted: bool = False
+    folder: Path,
+    names: Sequence[str],
+    dynamic: Sequence[Bool[np.ndarray, "H W"]],
+    *,
+    undistorted: bool = False,
+    estimated: bool = False,
 ) -> str:
     """Writes the masks of the frames; returns a summary.
 
@@ -90,7 +98,7 @@ def write_masks(
     for name, mask in zip(names, dynamic, strict=True):
         write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
-    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted})
+    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted, "estimated": estimated})
     return f"{fraction:.1%} of the pixels move"
 
 

@@ -69,7 +69,7 @@ def write_capture(
     if omitted:
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
-    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout)
+    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, masks.estimated)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
     if fraction > DOUBTFUL_FRACTION:
         notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
@@ -151,7 +151,9 @@ def write_frames(
     return images
 
 
-def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: int) -> None:
+def write_scene(
+    root: Path, cameras: Cameras, times: dict[str, int], holdout: int, estimated_masks: bool = False
+) -> None:
     """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
 
     Args:
@@ -159,6 +161,7 @@ def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: in
         cameras: Cameras with static points only.
         times: Time of each frame, see ``SourceFrame``.
         holdout: Every N-th frame is for evaluation; 0 for none.
+        estimated_masks: Whether the masks are estimates.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
@@ -166,7 +169,8 @@ def write_scene(root: Path, cameras: Cameras, times: dict[str, int], holdout: in
     write_world(root, cameras)
     first = times[cameras.names[0]]
     time_ids = {name: times[name] - first for name in cameras.names}
-    writer.write_index(root, time_ids, writer.held_out(cameras.names, holdout))
+    val = writer.held_out(cameras.names, holdout)
+    writer.write_index(root, time_ids, val, estimated_masks=estimated_masks)
 
 
 def write_world(root: Path, cameras: Cameras) -> None:

@@ -183,7 +183,7 @@ class Steps:
             folder, weights, quiet = self.frames.folder, self.options.weights, self.journal.quiet
             dynamic = find_masks(folder, cameras, masker, weights, half_size=half_size, quiet=quiet)
             self._require_space(MASK_BYTES)
-            return write_masks(path, cameras.names, dynamic)
+            return write_masks(path, cameras.names, dynamic, estimated=True)
 
         return self.journal.result(name, Masks.load, make)
 
@@ -194,7 +194,7 @@ class Steps:
             files, undistorted = find_given_masks(Path(self.options.masks), self.frames.taken)
             dynamic = [read_dynamic(file, (self.frames.width, self.frames.height)) for file in files]
             self._require_space(MASK_BYTES)
-            return write_masks(path, self.frames.names, dynamic, undistorted)
+            return write_masks(path, self.frames.names, dynamic, undistorted=undistorted)
 
         return self.journal.result(name, Masks.load, make)
 

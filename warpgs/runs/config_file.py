@@ -51,11 +51,14 @@ def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
     """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
 
     Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
-    is gone is none: the file has all of its values.
+    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no.
     """
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
     loss = values.get("loss")
+    if isinstance(loss, dict) and isinstance(loss.get("branches_in_stage2"), bool):
+        loss = {**loss, "branches_in_stage2": "yes" if loss["branches_in_stage2"] else "no"}
+        values = {**values, "loss": loss}
     if values.get("dap") is False and isinstance(loss, dict) and "depth_gate" not in loss:
         return {**values, "loss": {**loss, "depth": 0.0}}
     return values

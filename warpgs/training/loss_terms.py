@@ -59,7 +59,7 @@ def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
 
 
 def _compares_branches(phase: Phase, config: LossConfig) -> bool:
-    return phase.stage != "stage2" or config.branches_in_stage2
+    return phase.stage != "stage2" or config.branches_in_stage2 != "no"
 
 
 TERMS: dict[str, LossTerm] = {

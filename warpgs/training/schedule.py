@@ -157,7 +157,7 @@ class Protocol:
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth
             and config.loss.depth > 0.0
-            and (stage != "stage2" or config.loss.branches_in_stage2),
+            and (stage != "stage2" or config.loss.branches_in_stage2 != "no"),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
         )
 

@@ -190,10 +190,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
-    bands = fitted_bands(config.model, len(capture.train))
-    if bands < config.model.time_bands:
-        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
+    config = fitted(config, capture, log)
     _compare_ranks(config, capture)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
@@ -218,6 +215,20 @@ def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
     values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
     numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
     ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
+
+
+def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
+    """The config with those values replaced that depend on the capture."""
+    bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
+    if bands < config.model.time_bands:
+        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
+    if loss.branches_in_stage2 == "given-masks":
+        distrusted = capture.estimated_masks and config.assume == "masks"
+        if distrusted:
+            log("the masks are estimates: stage II compares the joint image alone")
+        loss = dataclasses.replace(loss, branches_in_stage2="no" if distrusted else "yes")
+    return dataclasses.replace(config, loss=loss)
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:

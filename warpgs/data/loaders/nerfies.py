@@ -26,6 +26,7 @@ from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, read_units
+from warpgs.data.writer import ESTIMATED, GIVEN
 from warpgs.files import first_file, read_json
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
@@ -96,8 +97,16 @@ class NerfiesLoader(ABC):
             reader.read,
             cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
+            estimated_masks=_has_estimated_masks(root / "dataset.json", dataset),
             read_taken=taken_reader(reader.read_with, lenses),
         )
+
+
+def _has_estimated_masks(path: Path, dataset: dict[str, Any]) -> bool:
+    masks = dataset.get("masks", GIVEN)
+    if masks not in (GIVEN, ESTIMATED):
+        raise ValueError(f"{path}: masks must be {GIVEN!r} or {ESTIMATED!r}, got {masks!r}")
+    return masks == ESTIMATED
 
 
 def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
