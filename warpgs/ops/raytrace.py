@@ -81,8 +81,8 @@ def raytrace(
 
 
 def _check_inputs(tensors: dict[str, Tensor]) -> None:
-    shapes: tuple[tuple[int | str, ...], ...]
-    shapes = (("B",), ("B", 3, 4), ("B", 2, 3), ("B",), ("B", 3), (3, 3), ("S", 4), (4, 4), (3, 3))
+    shapes: list[tuple[int | str, ...]]
+    shapes = [("B",), ("B", 3, 4), ("B", 2, 3), ("B",), ("B", 3), (3, 3), ("S", 4), (4, 4), (3, 3)]
     sizes: dict[str, int] = {}
     for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
         check_tensor(name, tensor, shape, sizes, (torch.int32 if name == "shapes" else torch.float32,))
