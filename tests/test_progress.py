@@ -9,6 +9,14 @@ from warpgs import progress as module
 from warpgs.progress import progress, progress_of_steps
 
 
+def everything_on(screen) -> str:
+    sent = b""
+    while select.select([screen], [], [], 0.2)[0]:  # what was written may come in parts
+        sent += os.read(screen, 1 << 16)
+    os.close(screen)
+    return sent.decode()
+
+
 def shown_on_a_terminal(monkeypatch, **options):
     """The output on a terminal during an iteration over two items."""
     screen, end = os.openpty()
@@ -17,9 +25,7 @@ def shown_on_a_terminal(monkeypatch, **options):
     with open(end, "w") as stream, monkeypatch.context() as patch:
         patch.setattr(module.sys, "stdout", stream)
         list(progress([1, 2], "counting", **options))
-        sent = os.read(screen, 1 << 16).decode() if select.select([screen], [], [], 0.2)[0] else ""
-    os.close(screen)
-    return sent
+        return everything_on(screen)
 
 
 def shown_in_steps(monkeypatch, **options) -> str:
@@ -32,9 +38,7 @@ def shown_in_steps(monkeypatch, **options) -> str:
         with progress_of_steps(**options) as show:
             show("sawing", 1, 4)
             show("planing", 2, 4)
-        sent = os.read(screen, 1 << 16).decode() if select.select([screen], [], [], 0.2)[0] else ""
-    os.close(screen)
-    return sent
+        return everything_on(screen)
 
 
 def test_the_last_step_is_shown_with_its_share(monkeypatch):
