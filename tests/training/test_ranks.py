@@ -115,7 +115,8 @@ def test_the_first_rank_alone_writes_reports_and_evaluates(whole):
     assert any("2 views per iteration" in line for line in first["lines"])
     assert "evaluated" in first["lines"]
     assert second["lines"] == two_ranks.errors(whole, 1) == []
-    assert (whole / "rank1.out").read_text() == ""
+    printed = (whole / "rank1.out").read_text().splitlines()
+    assert [line for line in printed if not line.startswith("[Gloo]")] == []  # torch 2.8 says that ranks are connected
     assert len(list((whole / "run" / "events").iterdir())) == 1
     assert checkpoint.load(checkpoint.path_of(whole / "run", tiny.LENGTH)).metadata.iteration == tiny.LENGTH
 
