@@ -86,6 +86,34 @@ def test_masks_that_are_there_stay(root):
 
 
 @pytest.mark.usefixtures("red")
+def test_masks_that_only_some_training_frames_lack_are_made(root):
+    """Three of twelve frames have masks, in one of two sizes."""
+    drawn = np.full((192, 256), 255, np.uint8)
+    drawn[40:80, 60:100] = 0
+    for name in NAMES[2:5]:
+        captures.write_png(root / f"resized_mask/1x/{name}.png.png", drawn)
+    with pytest.raises(ValueError, match=r"needs its mask; warpgs prepare .*capture --add masks makes those"):
+        load_capture(root)
+    lines = []
+    add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
+    assert lines[0].startswith("masks: 9 frames")
+    for name in NAMES:
+        image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
+        expected = drawn == 0 if name in NAMES[2:5] else is_red(image)
+        assert overlap(written_mask(root, name), expected) > 0.9, name
+        assert overlap(written_mask(root, name, "2x"), cv2.resize(expected.astype(np.uint8), (128, 96)) > 0) > 0.8
+    assert (written_mask(root, NAMES[3]) == (drawn == 0)).all()
+    assert load_capture(root, factor=2).frame(NAMES[3]).static_mask is not None
+
+
+def test_depth_is_not_added_beside_incomplete_masks(root):
+    """What moves in the other frames would count as static."""
+    captures.write_png(root / f"resized_mask/1x/{NAMES[2]}.png.png", np.full((192, 256), 255, np.uint8))
+    with pytest.raises(ValueError, match="every training frame needs its mask"):
+        add_parts(root, AddOptions(["depth"]))
+
+
+@pytest.mark.usefixtures("red")
 def test_masks_are_not_split_over_two_folders(root):
     """Masks of the training frames in mask/, none of the evaluation frames."""
     train = load_capture(root).train

@@ -12,16 +12,18 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from warpgs.config import MaskPerturbation
 from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
+from warpgs.data.images import decode, is_bright
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, load_capture, recognize
 from warpgs.data.loaders.nerfies import NerfiesLoader
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.files import read_json, write_json, write_png
+from warpgs.files import first_file, read_json, write_json, write_png
 from warpgs.progress import progress
 
 from .cameras import are_apart, camera_centers
@@ -72,9 +74,12 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     """
     _check_options(options)
     layout = recognize(root)
-    if not isinstance(LOADERS[layout], NerfiesLoader):
+    loader = LOADERS[layout]
+    if not isinstance(loader, NerfiesLoader):
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
-    job = _Job(root, layout, load_capture(root), read_units(root / "scene.json"), options, log)
+    unchanged = MaskPerturbation()
+    capture = loader.load(root, factor=None, perturbation=unchanged, cache_frames=256, incomplete_masks=True)
+    job = _Job(root, layout, capture, read_units(root / "scene.json"), options, log)
     for part in PARTS:
         if part in options.parts:
             getattr(job, f"add_{part}")()
@@ -113,30 +118,36 @@ class _Job:
     def add_masks(self) -> None:
         """Writes masks of the frames that lack them, and masks.png."""
         names = self._names()
-        missing = [name for name in names if self.capture.frame(name).static_mask is None]
-        if not missing:
-            self._say("masks: all frames have them")
-            return
-        if (self.root / "mask").is_dir() and not (self.root / "resized_mask").is_dir():
-            # The loader reads one of the two folders: those in mask/ would be lost to it.
+        # The loader reads one of the two folders: those in mask/ would be lost to it if new ones went to the other.
+        folder = "resized_mask" if (self.root / "resized_mask").is_dir() else "mask"
+        missing = [name for name in names if not self._mask_files(folder, name)]
+        if missing and (self.root / "mask").is_dir() and folder == "mask":
             raise ValueError(
                 f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
             )
+        if folder == "resized_mask":
+            self._complete_sizes(names)
+        if not missing:
+            self._say("masks: all frames have them")
+            return
         if len(names) < MIN_FOR_MOTION:
             raise ValueError(
                 f"{len(names)} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
             )
+        self._estimate_masks(names, missing)
+
+    def _estimate_masks(self, names: list[str], missing: list[str]) -> None:
+        """Writes masks of the ``missing`` ones of some frames, as all of these together show them."""
         method = MASKERS[self.options.masks]
         assert method is not None
         folder = find_weights(method.network, self.options.weights) if method.network is not None else None
         frames = self._posed(names, WORKING_SIDE)
         masks = method.find(frames, folder, self.log is None)
-        factors = sorted(int(p.name[:-1]) for p in (self.root / "rgb").glob("*x") if p.name[:-1].isdecimal())
         for name, mask in zip(names, masks, strict=True):
             if name in missing:
                 lens = self._lens(name)
                 dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
-                writer.write_mask(self.root, name, ~dynamic, factors)
+                writer.write_mask(self.root, name, ~dynamic, self._factors())
         shown = choose_evenly(len(names))
         painted = [overlay_mask(frames.images[k], masks[k]) for k in shown]
         write_png(self.root / "masks.png", contact_sheet(painted, [names[k] for k in shown]))
@@ -144,6 +155,30 @@ class _Job:
             self.said["masks"] = writer.ESTIMATED
         fraction = float(np.mean([mask.mean() for mask in masks]))
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
+
+    def _factors(self) -> list[int]:
+        """The downscaling factors of the images, the largest images first."""
+        return sorted(int(p.name[:-1]) for p in (self.root / "rgb").glob("*x") if p.name[:-1].isdecimal())
+
+    def _mask_files(self, folder: str, name: str) -> dict[int, Path]:
+        """The mask files of a frame by their downscaling factors."""
+        endings, found = (".png.png", ".png"), {}
+        for factor in self._factors():
+            path = first_file(self.root / folder / f"{factor}x/{name}{ending}" for ending in endings)
+            if path is not None:
+                found[factor] = path
+        return found
+
+    def _complete_sizes(self, names: list[str]) -> None:
+        """Writes masks of frames that have one in another size, from the largest that they have."""
+        for name in names:
+            found = self._mask_files("resized_mask", name)
+            lacking = [factor for factor in self._factors() if factor not in found]
+            if found and lacking:
+                static = is_bright(decode(found[min(found)])).astype(np.uint8)
+                lens = self._lens(name)
+                full = cv2.resize(static, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST) > 0
+                writer.write_mask(self.root, name, full, lacking)
 
     def add_depth(self) -> None:
         """Writes depth of the frames that lack it, and depth.png; not of iPhone captures, whose depth is in metres."""

@@ -68,15 +68,23 @@ class NerfiesLoader(ABC):
         """Whether the inverse depth of files has scene units and no offset."""
         return False
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(
+        self,
+        root: Path,
+        *,
+        factor: int | None,
+        perturbation: MaskPerturbation,
+        cache_frames: int,
+        incomplete_masks: bool = False,
+    ) -> Capture:
+        """Opens a capture, as ``load_capture`` does; ``incomplete_masks``: training frames may lack masks."""
         dataset = read_json(root / "dataset.json", LAYOUT)
         metadata, units = read_json(root / "metadata.json", LAYOUT), read_units(root / "scene.json")
         split = self.split(root, dataset, metadata)
         _check_split(split)
         times = _times(root / "metadata.json", metadata, [*split.train, *split.val])
         factor = factor or self.default_factor
-        files = _find_files(root, factor, split)
+        files = _find_files(root, factor, split, incomplete_masks)
         cameras, lenses = {}, {}
         for name, time in times.items():
             cameras[name], lenses[name] = read_camera(root / f"camera/{name}.json", units, factor, time)
@@ -165,14 +173,17 @@ class _FrameFiles:
     covisible: Path | None
 
 
-def _find_files(root: Path, factor: int, split: Split) -> dict[str, _FrameFiles]:
-    """Files of every frame: every frame has an image, and every training frame a mask if there are any masks."""
+def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -> dict[str, _FrameFiles]:
+    """Files of every frame: every frame has an image, and every training frame a mask if there are any masks.
+
+    Masks of some training frames suffice if they may be incomplete.
+    """
     rgb, size = root / "rgb", f"{factor}x"
     if not (rgb / size).is_dir():
         found = ", ".join(sorted(p.name for p in rgb.glob("*x"))) or "no size"
         raise ValueError(f"{rgb / size} is missing: {LAYOUT}; {rgb} has {found}")
     masks = next((p for p in (root / "resized_mask", root / "mask") if p.is_dir()), None)
-    if masks is not None and not (masks / size).is_dir():
+    if masks is not None and not (masks / size).is_dir() and not incomplete_masks:
         raise ValueError(f"{masks / size} is missing: images are read from {rgb / size}, masks must have the same size")
     # Depth is resized to the image, so the full size serves every factor.
     depths = [root / "depth" / s for s in (size, "1x")]
@@ -186,8 +197,11 @@ def _find_files(root: Path, factor: int, split: Split) -> dict[str, _FrameFiles]
         covisible = first_file([root / "covisible" / size / "val" / f"{name}.png"])
         files[name] = _FrameFiles(image, mask, depth, covisible)
     for name in split.train:
-        if masks is not None and files[name].mask is None:
-            raise ValueError(f"{masks / size / name}.png.png is missing: every training frame needs its mask")
+        if masks is not None and files[name].mask is None and not incomplete_masks:
+            raise ValueError(
+                f"{masks / size / name}.png.png is missing: every training frame needs its mask; "
+                f"warpgs prepare {root} --add masks makes those that are missing"
+            )
     return files
 
 
