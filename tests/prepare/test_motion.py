@@ -167,17 +167,56 @@ def test_a_dynamic_colour_does_not_outvote_proof_that_a_surface_is_static():
     assert unknown.min() > 0.6
 
 
-def test_where_no_far_frame_looks_the_neighbours_prove_a_surface_static(video):
-    lab = cv2.cvtColor(video[0][0], cv2.COLOR_RGB2LAB)
-    shape = lab.shape[:2]
-    residual = np.full(shape, 0.1, np.float32)
-    residual[:, 128:] = 3.0
-    nothing = np.zeros(shape, np.float32)
-    found = gather(lab, Evidence(residual, nothing, np.zeros(shape, np.uint8), np.ones(shape, np.float32)))
-    static = (found.static / found.sizes)[found.labels]
-    assert static[:, :110].mean() > 0.2
-    assert static[:, 160:].max() == pytest.approx(0.0, abs=1e-6)
-    assert not found.dynamic.any()
+def gathered(image: np.ndarray, residual: np.ndarray, witnesses: int = 0) -> Segments:
+    """The evidence on an image, with a residual in pixels and nothing that agrees in the far frames."""
+    nothing = np.zeros(residual.shape, np.float32)
+    seen = np.full(residual.shape, witnesses, np.uint8)
+    return gather(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), Evidence(residual, nothing, seen, nothing + 1.0))
+
+
+def evidence_on(region: tuple, found: Segments) -> tuple[float, float]:
+    """Mean static and dynamic evidence per pixel of a region."""
+    return tuple(float((kind / found.sizes)[found.labels][region].mean()) for kind in (found.static, found.dynamic))
+
+
+def test_where_no_far_frame_looks_the_neighbours_decide(video):
+    """On the left they fit, in the middle they fit badly, on the right not at all."""
+    residual = np.full(video[0][0].shape[:2], 0.1, np.float32)
+    residual[:, 135:], residual[:, 200:] = 1.0, 3.0
+    found = gathered(video[0][0], residual)
+    static, dynamic = evidence_on(np.s_[:, :115], found)
+    assert static > 0.2
+    assert dynamic < 1e-4
+    static, dynamic = evidence_on(np.s_[:, 155:180], found)
+    assert static < 0.02
+    assert dynamic < 1e-4
+    static, dynamic = evidence_on(np.s_[:, 215:], found)
+    assert static == pytest.approx(0.0, abs=1e-6)
+    assert dynamic > 0.1
+
+
+def test_residuals_count_relative_to_the_noise_of_the_frame(video):
+    """Where cameras fit a frame badly everywhere, that is no motion."""
+    residual = np.full(video[0][0].shape[:2], 3.0, np.float32)
+    assert not gathered(video[0][0], residual).dynamic.any()
+    assert not gathered(video[0][0], np.full_like(residual, np.nan)).dynamic.any()
+
+
+@pytest.mark.parametrize("witnesses", [0, 6])
+def test_stripes_are_no_evidence_of_motion(witnesses):
+    """Flow along a stripe is a guess, so what contradicts the cameras there may be that guess."""
+    row, column = np.mgrid[:144, :256]
+    stripes = (128 + 60 * np.sin(row / 3.0)).astype(np.uint8)
+    checks = (128 + 60 * np.sin(row / 3.0) * np.sin(column / 3.0)).astype(np.uint8)
+    residual = np.full((144, 256), 0.1, np.float32)
+    residual[40:100, 80:180] = 5.0
+    inner = np.s_[55:85, 95:165]
+    of_stripes, of_checks = (
+        evidence_on(inner, gathered(np.repeat(image[..., None], 3, 2), residual, witnesses))[1]
+        for image in (stripes, checks)
+    )
+    assert of_checks > 0.2
+    assert of_stripes < 0.02 * of_checks
 
 
 def test_nothing_is_masked_where_nothing_moves():

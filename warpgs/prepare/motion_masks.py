@@ -34,6 +34,16 @@ UNKNOWN_RESIDUAL = 1.5
 LOCAL_TOLERANCE = 0.5
 """Residual of the neighbours of a static surface [px]; slow objects have little more."""
 
+MIN_NOISE, NUM_NOISES = 0.4, 3.0
+"""Minimum of a frame's noise, which is its median residual [px], and how many times the noise a residual may be by
+chance; from twice that on, it is certain evidence of motion."""
+
+PATCH, GRADIENT_NOISE = 9, 0.3
+"""Side of the patches whose directions of texture are compared [px]; noise of gradients [levels per px]."""
+
+MIN_ISOTROPY, FULL_ISOTROPY = 0.1, 0.5
+"""Texture across a patch's main direction over that along it, from which on evidence of motion counts, and in full."""
+
 OWN_VOTE, VOTES = 1.5, (1.0, 0.8, 0.6)
 """Weight of a frame's own mask, and of the masks one, two and three frames away in both directions."""
 
@@ -76,20 +86,46 @@ def gather(lab: UInt8[np.ndarray, "H W 3"], evidence: Evidence) -> Segments:
         lab: [H, W, 3] image in 8-bit Lab.
         evidence: Evidence on its pixels.
     """
-    texture, seen = _texture(lab), evidence.witnesses >= NUM_AGREEING
+    dx, dy = _gradients(lab)
+    texture, seen = _texture(dx, dy), evidence.witnesses >= NUM_AGREEING
     residual = np.nan_to_num(evidence.residual, nan=UNKNOWN_RESIDUAL)
+    contradiction = _contradiction(evidence.residual)
     # A dynamic object also contradicts the neighbours; where they fit well, a mismatch far away is doubtful.
-    dynamic = (1.0 - evidence.agreement) * seen * np.clip(residual - 0.5, 0.15, 1.0)
+    doubt = (1.0 - evidence.agreement) * seen * np.clip(residual - 0.5, 0.15, 1.0)
     # Where no far frame looks, the neighbours alone decide: better than the colours of other places.
-    static = np.where(seen, evidence.agreement, np.exp(-((residual / LOCAL_TOLERANCE) ** 2)))
+    static = np.where(seen, evidence.agreement, np.exp(-((residual / LOCAL_TOLERANCE) ** 2))) * (1.0 - contradiction)
+    # Along an edge or a stripe, flow is a guess: it may contradict the cameras, but not show motion.
+    dynamic = np.maximum(doubt, contradiction) * _isotropy(dx, dy)
     return segment(lab, fill_unknown(evidence.inverse_depth), texture * static, texture * dynamic)
 
 
-def _texture(lab: np.ndarray) -> Float[np.ndarray, "H W"]:
-    """[H, W] in [0, 1], whether a pixel has enough texture to be recognized."""
+def _contradiction(residual: np.ndarray) -> Float[np.ndarray, "H W"]:
+    """[H, W] in [0, 1], how far residuals exceed the frame's noise; 0 where they are unknown."""
+    known = residual[~np.isnan(residual)]
+    noise = max(MIN_NOISE, float(np.median(known))) if known.size else MIN_NOISE
+    return np.clip(np.nan_to_num(residual) / (NUM_NOISES * noise) - 1.0, 0.0, 1.0)
+
+
+def _gradients(lab: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, W] slopes of lightness along x and y [levels per px]."""
     lightness = cv2.GaussianBlur(lab[..., 0], (0, 0), 1.0).astype(np.float32)
-    slope = np.hypot(cv2.Sobel(lightness, -1, 1, 0), cv2.Sobel(lightness, -1, 0, 1)) / 8.0
-    return np.clip((slope - 0.8) / 1.5, 0.0, 1.0)
+    return cv2.Sobel(lightness, -1, 1, 0) / 8.0, cv2.Sobel(lightness, -1, 0, 1) / 8.0
+
+
+def _texture(dx: np.ndarray, dy: np.ndarray) -> Float[np.ndarray, "H W"]:
+    """[H, W] in [0, 1], whether a pixel has enough texture to be recognized."""
+    return np.clip((np.hypot(dx, dy) - 0.8) / 1.5, 0.0, 1.0)
+
+
+def _isotropy(dx: np.ndarray, dy: np.ndarray) -> Float[np.ndarray, "H W"]:
+    """[H, W] in [0, 1], whether the texture around a pixel fixes its position in both directions.
+
+    From the eigenvalues of the structure tensor (Förstner and Gülch 1987), as a ratio: contrast does not matter.
+    """
+    xx, yy, xy = (cv2.blur(plane, (PATCH, PATCH)) for plane in (dx * dx, dy * dy, dx * dy))
+    mean, spread = (xx + yy) / 2.0, np.hypot((xx - yy) / 2.0, xy)
+    ratio = np.sqrt(np.maximum(mean - spread, 0.0) / (mean + spread + GRADIENT_NOISE**2))
+    return np.clip((ratio - MIN_ISOTROPY) / (FULL_ISOTROPY - MIN_ISOTROPY), 0.0, 1.0)
 
 
 def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarray, "H W"]]:
