@@ -191,7 +191,7 @@ def test_where_no_far_frame_looks_the_neighbours_decide(video):
     assert static < 0.02
     assert dynamic < 1e-4
     static, dynamic = evidence_on(np.s_[:, 215:], found)
-    assert static == pytest.approx(0.0, abs=1e-6)
+    assert static < 1e-4
     assert dynamic > 0.1
 
 

@@ -28,6 +28,9 @@ MIN_HOLE = 0.003
 CERTAIN, LIKELY, POSSIBLE = 0.85, 0.5, 0.15
 """Dynamic probabilities above which GrabCut starts from foreground, probable foreground and probable background."""
 
+GRABCUT_ROUNDS = 1
+"""A second round takes a quarter to two thirds more time and changes the intersection over union by at most 0.003."""
+
 UNKNOWN_RESIDUAL = 1.5
 """Residual assumed where it is unknown [px]: in favour of motion, but not certain."""
 
@@ -187,7 +190,7 @@ def outline(image: UInt8[np.ndarray, "H W 3"], probability: Float[np.ndarray, "H
     for threshold, label in ((POSSIBLE, cv2.GC_PR_BGD), (LIKELY, cv2.GC_PR_FGD), (CERTAIN, cv2.GC_FGD)):
         labels[probability > threshold] = label
     cv2.setRNGSeed(0)  # GrabCut initializes its colour clusters at random
-    cv2.grabCut(image, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(image, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     dynamic = (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
     # An object with the colours of the background vanishes: then the evidence alone decides.
     return likely if dynamic.sum() < 0.5 * likely.sum() else dynamic
