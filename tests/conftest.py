@@ -6,7 +6,7 @@ import jaxtyping
 
 import tests.typechecks  # noqa: F401  # named below
 
-# The kernels lie outside this folder and are left out: Warp reads their annotations itself.
+# The kernels lie outside this folder and are omitted: Warp reads their annotations itself.
 PACKAGE = Path(__file__).parent.parent / "warpgs"
 CHECKED = [
     f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if path.stem not in ("__init__", "__pycache__", "kernels")

@@ -98,7 +98,7 @@ PATIENT = dataclasses.replace(
     ),
     checkpoint_every=500,
 )
-"""The networks are small and SSIM is left out, so that two CPU cores do thousands of iterations."""
+"""The networks are small and there is no SSIM, so that two CPU cores do thousands of iterations."""
 
 QUICK = dataclasses.replace(
     PATIENT,

@@ -1,4 +1,4 @@
-"""``warpgs import``: the copy in the own layout is the same capture."""
+"""``warpgs import``: the copy in the layout of warpgs is the same capture."""
 
 import json
 

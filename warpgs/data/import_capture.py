@@ -1,4 +1,4 @@
-"""Copies a capture of any layout into the own one, undistorted and in scene units."""
+"""Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -33,7 +33,7 @@ def import_capture(
     holdout: int | None = None,
     log: Callable[[str], None] | None = None,
 ) -> None:
-    """Writes a copy of a capture in the own layout (docs/capture-format.md).
+    """Writes a copy of a capture in the layout of warpgs (docs/capture-format.md).
 
     Args:
         source: Folder of the capture.

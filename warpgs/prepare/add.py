@@ -63,7 +63,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     """Adds masks, depth or points that a capture lacks; what it has stays as it is.
 
     Args:
-        root: Capture in the own layout, or of NeRF-DS, HyperNeRF or DyCheck.
+        root: Capture in the layout of warpgs, or of NeRF-DS, HyperNeRF or DyCheck.
         options: What to add and how.
         log: Receives a line per part; None shows nothing, progress bars included.
 

@@ -105,7 +105,7 @@ def _check_lens(lens: Lens) -> None:
     except ValueError as error:
         raise NoCamerasError(
             f"the matches determine no possible lens: {error}; give the focal length (--focal PX) or the whole lens "
-            "(--intrinsics FILE), or leave out distortion (--lens SIMPLE_PINHOLE)"
+            "(--intrinsics FILE), or omit distortion (--lens SIMPLE_PINHOLE)"
         ) from error
 
 

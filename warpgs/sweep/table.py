@@ -112,7 +112,7 @@ Peers = Mapping[str, Mapping[str, Mapping[str, Statistic]]]
 def make_tables(cells: Sequence[Measured], labels: Mapping[str, str], peers: Peers) -> list[Table]:
     """The table of means over captures, if there are several, and one for each capture.
 
-    Captures on which nothing has finished are left out. A mean over captures exists for a seed that has finished on
+    Captures on which nothing has finished are omitted. A mean over captures exists for a seed that has finished on
     all others: each capture counts the same.
 
     Args:

@@ -116,7 +116,7 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
         capture: The capture, with the points.
         views: Its training views.
         smooth: Whether to change the views' depth by a smooth factor as well, where that brings it nearer to points
-            that were left out.
+            that were held out.
     """
     smooth = smooth and not capture.metric_depth
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
