@@ -15,6 +15,9 @@ MARKER = "<!-- options -->"
 
 ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 
+LONG = re.compile(r"<td>(?=(?:(?!</td>).){60})")
+"""Start of a cell of a table with at least 60 characters."""
+
 SHOWN = "best"
 """Preset whose values are the defaults of ``train`` in the tables: that of captures."""
 
@@ -24,6 +27,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     filled = markdown.replace(MARKER, "\n".join(sections())) if MARKER in markdown else markdown
     # GitHub needs pipes escaped also in the code of a table, where Python's Markdown shows the backslash.
     return ROW.sub(lambda row: CODE.sub(lambda code: code[0].replace("\\|", "|"), row[0]), filled)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """mkdocs calls this for the HTML of every page; long cells get a class, of which ``site.css`` keeps them wide."""
+    return LONG.sub('<td class="long">', html)
 
 
 def sections() -> Iterator[str]:
@@ -67,7 +75,8 @@ def row(option: Option) -> tuple[str, ...]:
         start, _, end = option.name.rpartition(".")
         name = f"{start}.no-{end}" if start else option.name.replace("--", "--no-", 1)
         return code(name), "on", option.text
-    return code(f"{option.name} {option.metavar}".strip()), value_of(option.default), option.text
+    metavar = option.metavar.replace(",", "`, `")  # so that lines of many choices break between them
+    return code(f"{option.name} {metavar}".strip()), value_of(option.default), option.text
 
 
 def value_of(value: Any) -> str:

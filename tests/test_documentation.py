@@ -146,6 +146,15 @@ def test_pipes_in_the_code_of_tables_are_shown_without_the_backslash_that_github
     assert pages.on_page_markdown(text) == "| `--a b|c` | either \\| or |\n\nnot `d\\|e`"
 
 
+def test_choices_of_an_option_and_long_cells_of_a_table_have_space(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    (layers,) = (option for option in pages.options_of("export") if option.name == "--layers")
+    assert pages.row(layers)[0] == "`--layers {all`, `static`, `dynamic`, `apart}`"
+    long = "a <b>word</b> " * 9
+    assert pages.on_page_content(f"<td>a</td><td>{long}</td>") == f'<td>a</td><td class="long">{long}</td>'
+
+
 SITE = ("mkdocs", "material", "mkdocstrings")
 
 
@@ -163,5 +172,6 @@ def test_the_site_builds_without_a_warning(tmp_path):
     api = (tmp_path / "site" / "api" / "index.html").read_text()
     for public in ("warpgs.open_run", "warpgs.load_capture", "warpgs.train", "warpgs.render"):
         assert f'id="{public}"' in api
+    assert not re.search(r"<code>\w+,</code>", api)  # two names in one line of a docstring are not parsed
     pages = "".join(path.read_text() for path in (tmp_path / "site").rglob("*.html"))
     assert not re.search(r'(?:src|href)="https?://[^"]*\.(?:js|css|woff2?)"', pages)  # loads nothing from elsewhere

@@ -17,7 +17,8 @@ class Camera:
     Attributes:
         viewmat: [4, 4] rigid world-to-camera transform, OpenCV axes (x right, y down, z forward).
         K: [3, 3] intrinsics [px], pixel centres at +0.5, principal point anywhere, no skew.
-        width, height: Size of the image [px].
+        width: Width of the image [px].
+        height: Height of the image [px].
         time: Time in [0, 1].
 
     Raises:

@@ -43,7 +43,8 @@ class Rendering:
 
     Attributes:
         joint: All Gaussians.
-        static, dynamic: The Gaussians of one branch alone; None unless requested.
+        static: The static Gaussians alone; None unless requested.
+        dynamic: The dynamic Gaussians alone; None unless requested.
         radii: [N, 2] half sizes on screen [px]; 0 = culled.
         contributed: [N] whether the Gaussian changed a pixel of the joint image; None unless requested.
         weights: [N] sum of its blend weights over the joint image, not differentiable; None unless requested.

@@ -12,7 +12,7 @@ import torch
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 sync_api = pytest.importorskip(
-    "playwright.sync_api", reason="browser tests need playwright: pip install 'warpgs[browser]'"
+    "playwright.sync_api", reason="browser tests need playwright: pip install -e '.[browser]'"
 )
 
 from tests.viewer import watched  # noqa: E402

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
 
 from tests.campaign.browser import Browser
 from tests.viewer import watched
@@ -188,7 +188,7 @@ def test_an_invalid_port_is_refused_in_one_line(run, capsys, port):
 
 def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert "pip install -e '.[viewer]'" in error_line(capsys, run)
+    assert "pip install 'warpgs[viewer]'" in error_line(capsys, run)
 
 
 def test_a_folder_that_is_not_a_run_is_refused_in_one_line(tmp_path, capsys):

@@ -70,7 +70,8 @@ class Capture:
     Attributes:
         name: For messages and reports.
         cameras: The camera of each id of ``train`` and ``val``.
-        train, val: Ids of the frames to train on and to evaluate on.
+        train: Ids of the frames to train on.
+        val: Ids of the frames to evaluate on.
         points: [P, 3] sparse static points, P may be 0.
         point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.

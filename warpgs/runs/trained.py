@@ -37,9 +37,6 @@ class TrainedScene:
         scene: Gaussians and networks, on the device to render on.
         config: Config of the run.
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
-
-    Attributes:
-        scene, config, metadata: As given.
     """
 
     def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:

@@ -25,7 +25,8 @@ class Status(NamedTuple):
         loss: Mean since the last check.
         psnr: PSNR of the joint training image, mean since the last check [dB].
         terms: Each loss term, weighted, mean since the last check.
-        num_static, num_dynamic: Numbers of Gaussians.
+        num_static: Number of static Gaussians.
+        num_dynamic: Number of dynamic Gaussians.
     """
 
     iteration: int

@@ -48,7 +48,8 @@ class TrainingInterrupted(KeyboardInterrupt):
 
     Attributes:
         folder: Run folder; ``TrainConfig(resume=folder)`` continues it.
-        iteration, num_iterations: Iterations done, and those of the whole run.
+        iteration: Iterations done.
+        num_iterations: Those of the whole run.
     """
 
     def __init__(self, folder: Path, iteration: int, num_iterations: int) -> None:

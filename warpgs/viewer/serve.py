@@ -33,7 +33,7 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
         OSError: If the server cannot listen on the address.
     """
     if importlib.util.find_spec("viser") is None:
-        raise ImportError("the viewer needs viser: pip install -e '.[viewer]'")
+        raise ImportError("the viewer needs viser: pip install 'warpgs[viewer]'")
     from .server import Viewer, check_address
 
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
