@@ -13,6 +13,7 @@ import threading
 
 from tests.video.test_camera_paths import capture
 from warpgs.viewer import path_editor
+from warpgs.viewer.browser_camera import through_training_camera
 from warpgs.viewer.clock import Clock
 from warpgs.viewer.layers import LAYERS
 from warpgs.viewer.panel import Panel
@@ -106,6 +107,20 @@ def test_values_of_sliders_are_clamped_to_their_ranges(sent, time, speed, width)
 @pytest.mark.parametrize("sent", ["no layer", None, [], 3])
 def test_an_unknown_layer_is_replaced_by_the_first(sent):
     assert panel(layer=sent).current_layer == next(iter(LAYERS))
+
+
+def test_the_image_of_a_training_camera_stays_whole_as_the_canvas_changes_until_the_camera_moves():
+    here, view = session((900, 700), view=2), TRAINING.views[1]
+    here._fitted, here._pose = (900, 700), lambda: view.pose
+    camera = here._client.camera
+    camera.image_width = 300
+    here._fit(TRAINING)
+    fitted = camera.fov
+    assert fitted == through_training_camera(TRAINING, 1, 300 / 700).fov > view.pose.fov
+    here._pose = lambda: view.pose._replace(position=(9.0, 9.0, 9.0))
+    camera.image_width = 200
+    here._fit(TRAINING)
+    assert camera.fov == fitted
 
 
 def test_training_cameras_are_shown_while_the_checkbox_is_set():

@@ -54,7 +54,6 @@ NARROW = 600
 KEYFRAME_SCALE = 0.1
 """Size of keyframes in a scene without training cameras [scene units]."""
 
-
 STEPS = 60
 """Steps of the time of a scene without training cameras."""
 
@@ -117,6 +116,7 @@ class Session:
         self._sent: deque[float] = deque(maxlen=200)
         self._cost = ("", 0.0)
         self._note = self._problem = ""
+        self._fitted: tuple[int, int] | None = None  # the canvas that the view of a training camera was fitted to
         self._status_at = 0.0
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
@@ -170,6 +170,7 @@ class Session:
         panel.step.on_click(lambda _: self._step(panel.step.value == FORWARD))
         panel.screenshot.on_click(lambda _: self._ask_for_screenshot())
         if training is not None:
+            self._client.camera.on_update(lambda _: self._fit(training))
             panel.wipe.on_update(lambda _: self._wake.set())
             panel.view.on_update(lambda _: self._snap(training))
             panel.snap.on_click(lambda _: self._snap(training))
@@ -219,14 +220,24 @@ class Session:
         with self._lock:
             index = self._selected(training)
             view, camera = training.views[index], self._client.camera
-            width, height = self._canvas()
+            self._fitted = canvas = self._canvas()
             with self._client.atomic():
-                set_camera(camera, through_training_camera(training, index, width / height))
+                set_camera(camera, through_training_camera(training, index, canvas[0] / canvas[1]))
                 camera.wxyz = np.array(view.pose.wxyz)
             set_value(self.panel.time, view.time)
             is_shown = self._show_thumbnail(training)
             self._note = "" if is_shown else f"the image of {view.name} cannot be read"
         self._wake.set()
+
+    def _fit(self, training: TrainingCameras) -> None:
+        """Shows the whole image of the training camera also when the canvas changes, as long as the camera stays."""
+        with self._lock:
+            index, canvas, now = self._selected(training), self._canvas(), self._pose()
+            pose = training.views[index].pose
+            stays = np.allclose(now.position, pose.position, atol=1e-5) and abs(np.dot(now.wxyz, pose.wxyz)) > 1 - 1e-6
+            if self._fitted not in (None, canvas) and stays:
+                self._fitted = canvas
+                self._client.camera.fov = through_training_camera(training, index, canvas[0] / canvas[1]).fov
 
     def _selected(self, training: TrainingCameras) -> int:
         """Index of the training camera that the slider selects."""
