@@ -22,7 +22,7 @@ h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 table { border-collapse: collapse; } td, th { padding: .15rem .7rem; border-bottom: 1px solid var(--line); }
 th { text-align: left; font-weight: 600; } td { text-align: right; font-variant-numeric: tabular-nums; }
 td.text { text-align: left; } td.best { font-weight: 700; } .note { color: var(--soft); }
-.charts { display: flex; flex-wrap: wrap; gap: 1rem; } .charts svg { width: 440px; max-width: 100%; }
+.charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 24rem), 1fr)); gap: 1rem; }
 svg text { fill: currentColor; font-size: 11px; } svg .title { font-size: 13px; font-weight: 600; }
 svg .tick { fill: var(--soft); } svg line { stroke: var(--line); }
 svg polyline { fill: none; stroke-width: 1.6; }

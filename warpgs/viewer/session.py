@@ -116,7 +116,7 @@ class Session:
         self._sent: deque[float] = deque(maxlen=200)
         self._cost = ("", 0.0)
         self._note = self._problem = ""
-        self._fitted: tuple[int, int] | None = None  # the canvas that the view of a training camera was fitted to
+        self._fitted = (0, 0)  # the canvas that the view of a training camera was fitted to
         self._status_at = 0.0
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
@@ -235,7 +235,7 @@ class Session:
             index, canvas, now = self._selected(training), self._canvas(), self._pose()
             pose = training.views[index].pose
             stays = np.allclose(now.position, pose.position, atol=1e-5) and abs(np.dot(now.wxyz, pose.wxyz)) > 1 - 1e-6
-            if self._fitted not in (None, canvas) and stays:
+            if self._fitted != canvas and stays:
                 self._fitted = canvas
                 self._client.camera.fov = through_training_camera(training, index, canvas[0] / canvas[1]).fov
 
