@@ -367,6 +367,18 @@ def test_the_status_shows_counts_and_fps(page, session):
     page.get_by_text("FPS").wait_for()
 
 
+def test_the_time_of_a_slow_image_moves_no_control(page, session, monkeypatch):
+    """Otherwise a click may hit the button beside the one that was aimed at."""
+    seen(page, session)
+    play = page.get_by_role("button", name="Play", exact=True)
+    before = play.bounding_box()
+    monkeypatch.setattr(session, "_cost", ("1920 × 1306 in 12345 ms", 0.1))
+    session._status_at = 0.0
+    session._update_status()
+    page.get_by_text("12345 ms").wait_for()
+    assert play.bounding_box() == before
+
+
 def test_newer_checkpoints_are_shown(page, session, run):
     before = seen(page, session)
     iteration = session._shown.request.scene.metadata.iteration

@@ -351,7 +351,9 @@ class Session:
             self._resolution.add(width * height, now - start)
         self._shown, self._problem = Shown(request, scale), ""
         self._sent.append(now)
-        self._cost = (f"{width} × {height} rendered in {rendered.seconds * 1e3:.1f} ms", 1.0 / (now - start))
+        milliseconds = 1e3 * rendered.seconds
+        digits = 1 if milliseconds < 100 else 0  # the line must not wrap now and then, which would move all controls
+        self._cost = (f"{width} × {height} in {milliseconds:.{digits}f} ms", 1.0 / (now - start))
 
     def _pose(self) -> Pose:
         camera = self._client.camera
