@@ -72,7 +72,7 @@ def truth(run, camera):
 
 @pytest.mark.parametrize("time", [0.0, 0.7])
 def test_a_ply_file_looks_like_the_run_at_its_time(run, data, tmp_path, time):
-    assert "1 file of " in export(run, tmp_path, time=time)
+    assert f"{tmp_path / 'out' / 'scene.ply'}: " in export(run, tmp_path, time=time)
     camera = view(data, time)
     assert (scenes.image(read_standard(tmp_path / "out" / "scene.ply"), camera) - truth(run, camera)).abs().max() < 1e-4
 

@@ -42,8 +42,9 @@ def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, j
             file = name + suffix if options.frames is None else _numbered(name, suffix, k)
             size += write_cloud(folder / file, cloud.select(rows))
             num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
-    files = "1 file of" if num_files == 1 else f"{num_files} files of up to"
-    return f"{files} {max_count:,} Gaussians in {folder}, {size / 1e6:.1f} MB\n{job.up_note}"
+    one, several = f"{folder / file}: {max_count:,} Gaussians", f"{num_files} files of up to {max_count:,} Gaussians"
+    written = one if num_files == 1 else f"{several} in {folder}"
+    return f"{written}, {size / 1e6:.1f} MB\n{job.up_note}"
 
 
 def _numbered(name: str, suffix: str, number: int) -> str:
