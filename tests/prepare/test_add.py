@@ -13,7 +13,7 @@ from tests.prepare import boards
 from warpgs.cli import main
 from warpgs.data.images import decode, read_depth
 from warpgs.data.loaders import load_capture, recognize
-from warpgs.prepare import masks
+from warpgs.prepare import add, masks
 from warpgs.prepare.add import AddOptions, add_parts
 from warpgs.prepare.methods import Masker
 
@@ -80,7 +80,7 @@ def test_masks_that_are_there_stay(root):
             captures.write_png(root / f"resized_mask/1x/{name}.png.png", mask)
     lines = []
     add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
-    assert lines == ["masks: all frames have them"]
+    assert lines == ["masks: 12 frames had them in some sizes only", "masks: all frames have them"]
     assert not load_capture(root).estimated_masks
     assert not written_mask(root, "shot003").any()
 
@@ -96,7 +96,8 @@ def test_masks_that_only_some_training_frames_lack_are_made(root):
         load_capture(root)
     lines = []
     add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
-    assert lines[0].startswith("masks: 9 frames")
+    assert lines[0] == "masks: 3 frames had them in some sizes only"
+    assert lines[1].startswith("masks: 9 frames")
     for name in NAMES:
         image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
         expected = drawn == 0 if name in NAMES[2:5] else is_red(image)
@@ -104,6 +105,25 @@ def test_masks_that_only_some_training_frames_lack_are_made(root):
         assert overlap(written_mask(root, name, "2x"), cv2.resize(expected.astype(np.uint8), (128, 96)) > 0) > 0.8
     assert (written_mask(root, NAMES[3]) == (drawn == 0)).all()
     assert load_capture(root, factor=2).frame(NAMES[3]).static_mask is not None
+
+
+@pytest.mark.usefixtures("red")
+def test_masks_are_known_as_estimates_if_the_next_part_fails(root, monkeypatch):
+    def fail(*arguments):
+        raise ValueError("no depth here")
+
+    monkeypatch.setattr(add._Job, "add_depth", fail)
+    with pytest.raises(ValueError, match="no depth here"):
+        add_parts(root, AddOptions(["masks", "depth"], masks="red"))
+    assert load_capture(root).estimated_masks
+
+
+@pytest.mark.usefixtures("red")
+def test_masks_of_one_size_in_a_folder_that_gets_no_new_ones_are_refused(root):
+    for name in NAMES:
+        captures.write_png(root / f"mask/2x/{name}.png.png", np.full((96, 128), 255, np.uint8))
+    with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
+        add_parts(root, AddOptions(["masks"], masks="red"))
 
 
 def test_depth_is_not_added_beside_incomplete_masks(root):

@@ -83,11 +83,6 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     for part in PARTS:
         if part in options.parts:
             getattr(job, f"add_{part}")()
-    said = dict(job.said)
-    if recognize(root) != layout:  # masks in full size would make another dataset of it
-        said["layout"] = layout
-    if said:
-        write_json(root / "dataset.json", {**read_json(root / "dataset.json"), **said})
 
 
 def _check_options(options: AddOptions) -> None:
@@ -101,10 +96,7 @@ def _check_options(options: AddOptions) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """One call of ``add_parts``.
-
-    ``estimated`` holds frames and depth by the method's name, ``said`` what dataset.json has to say of the masks.
-    """
+    """One call of ``add_parts``; ``estimated`` holds frames and depth by the method's name."""
 
     root: Path
     layout: str
@@ -113,7 +105,6 @@ class _Job:
     options: AddOptions
     log: Callable[[str], None] | None
     estimated: dict[str, tuple[PosedFrames, Sequence[np.ndarray]]] = field(default_factory=dict)
-    said: dict[str, str] = field(default_factory=dict)
 
     def add_masks(self) -> None:
         """Writes masks of the frames that lack them, and masks.png."""
@@ -121,7 +112,8 @@ class _Job:
         # The loader reads one of the two folders: those in mask/ would be lost to it if new ones went to the other.
         folder = "resized_mask" if (self.root / "resized_mask").is_dir() else "mask"
         missing = [name for name in names if not self._mask_files(folder, name)]
-        if missing and (self.root / "mask").is_dir() and folder == "mask":
+        incomplete = any(len(self._mask_files(folder, name)) < len(self._factors()) for name in names)
+        if incomplete and (self.root / "mask").is_dir() and folder == "mask":
             raise ValueError(
                 f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
             )
@@ -143,6 +135,7 @@ class _Job:
         folder = find_weights(method.network, self.options.weights) if method.network is not None else None
         frames = self._posed(names, WORKING_SIDE)
         masks = method.find(frames, folder, self.log is None)
+        self._keep_layout({} if set(missing).isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
         for name, mask in zip(names, masks, strict=True):
             if name in missing:
                 lens = self._lens(name)
@@ -151,10 +144,16 @@ class _Job:
         shown = choose_evenly(len(names))
         painted = [overlay_mask(frames.images[k], masks[k]) for k in shown]
         write_png(self.root / "masks.png", contact_sheet(painted, [names[k] for k in shown]))
-        if not set(missing).isdisjoint(self.capture.train):
-            self.said["masks"] = writer.ESTIMATED
         fraction = float(np.mean([mask.mean() for mask in masks]))
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
+
+    def _keep_layout(self, entries: dict[str, str]) -> None:
+        """Names the layout in dataset.json, because masks in full size make another dataset of it, and adds entries.
+
+        Call it before masks are written: what comes after it may fail.
+        """
+        path = self.root / "dataset.json"
+        write_json(path, {**read_json(path), "layout": self.layout, **entries})
 
     def _factors(self) -> list[int]:
         """The downscaling factors of the images, the largest images first."""
@@ -171,14 +170,20 @@ class _Job:
 
     def _complete_sizes(self, names: list[str]) -> None:
         """Writes masks of frames that have one in another size, from the largest that they have."""
+        completed = 0
         for name in names:
             found = self._mask_files("resized_mask", name)
             lacking = [factor for factor in self._factors() if factor not in found]
             if found and lacking:
+                if not completed:
+                    self._keep_layout({})
+                completed += 1
                 static = is_bright(decode(found[min(found)])).astype(np.uint8)
                 lens = self._lens(name)
                 full = cv2.resize(static, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST) > 0
                 writer.write_mask(self.root, name, full, lacking)
+        if completed:
+            self._say(f"masks: {completed} frames had them in some sizes only")
 
     def add_depth(self) -> None:
         """Writes depth of the frames that lack it, and depth.png; not of iPhone captures, whose depth is in metres."""

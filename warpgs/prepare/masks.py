@@ -66,8 +66,7 @@ class Masks:
     def load(folder: Path) -> "Masks":
         """The masks that ``write_masks`` wrote."""
         index = read_json(folder / INDEX)
-        flags = bool(index["undistorted"]), bool(index.get("estimated", False))
-        return Masks(folder, float(index["dynamic_fraction"]), *flags)
+        return Masks(folder, float(index["dynamic_fraction"]), bool(index["undistorted"]))
 
     def read_dynamic(self, cameras: Cameras) -> list[Bool[np.ndarray, "H W"]]:
         """[H, W] the dynamic mask of each undistorted frame of the cameras, in the size of the lens.
@@ -83,12 +82,7 @@ class Masks:
 
 
 def write_masks(
-    folder: Path,
-    names: Sequence[str],
-    dynamic: Sequence[Bool[np.ndarray, "H W"]],
-    *,
-    undistorted: bool = False,
-    estimated: bool = False,
+    folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]], undistorted: bool = False
 ) -> str:
     """Writes the masks of the frames; returns a summary.
 
@@ -98,7 +92,7 @@ def write_masks(
     for name, mask in zip(names, dynamic, strict=True):
         write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
-    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted, "estimated": estimated})
+    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted})
     return f"{fraction:.1%} of the pixels move"
 
 

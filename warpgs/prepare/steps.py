@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -183,9 +183,9 @@ class Steps:
             folder, weights, quiet = self.frames.folder, self.options.weights, self.journal.quiet
             dynamic = find_masks(folder, cameras, masker, weights, half_size=half_size, quiet=quiet)
             self._require_space(MASK_BYTES)
-            return write_masks(path, cameras.names, dynamic, estimated=True)
+            return write_masks(path, cameras.names, dynamic)
 
-        return self.journal.result(name, Masks.load, make)
+        return replace(self.journal.result(name, Masks.load, make), estimated=True)
 
     def copy_masks(self, name: str) -> Masks:
         """The masks given by the user, in the size of the frames."""
@@ -194,7 +194,7 @@ class Steps:
             files, undistorted = find_given_masks(Path(self.options.masks), self.frames.taken)
             dynamic = [read_dynamic(file, (self.frames.width, self.frames.height)) for file in files]
             self._require_space(MASK_BYTES)
-            return write_masks(path, self.frames.names, dynamic, undistorted=undistorted)
+            return write_masks(path, self.frames.names, dynamic, undistorted)
 
         return self.journal.result(name, Masks.load, make)
 
