@@ -7,13 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from warpgs.config import LossConfig
 from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import Layer
 
 from . import losses
 from .losses import LossInputs, LossTerm
-from .schedule import Phase
+from .schedule import compares_branches
 
 
 def static(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -58,19 +57,15 @@ def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask)
 
 
-def _compares_branches(phase: Phase, config: LossConfig) -> bool:
-    return phase.stage != "stage2" or config.branches_in_stage2 != "no"
-
-
 TERMS: dict[str, LossTerm] = {
     "static": LossTerm(
         static,
-        is_active=_compares_branches,
+        is_active=lambda phase, config: compares_branches(phase.stage, config),
         weight=lambda plan, config: config.static,
     ),
     "dynamic": LossTerm(
         dynamic,
-        is_active=lambda phase, config: phase.stage != "pretrain" and _compares_branches(phase, config),
+        is_active=lambda phase, config: phase.stage != "pretrain" and compares_branches(phase.stage, config),
         weight=lambda plan, config: config.dynamic,
     ),
     "joint": LossTerm(

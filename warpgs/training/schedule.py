@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from warpgs.config import TrainConfig
+from warpgs.config import LossConfig, TrainConfig
 
 from .optimizer import BRANCHES, exponential
 
@@ -48,6 +48,11 @@ class Phase:
     sh_degree: int
     with_depth: bool
     with_joint: bool
+
+
+def compares_branches(stage: StageName, config: LossConfig) -> bool:
+    """Whether the terms of the single branches count in a stage."""
+    return stage != "stage2" or config.branches_in_stage2 != "no"
 
 
 @dataclass(frozen=True)
@@ -155,9 +160,7 @@ class Protocol:
             use_deformation=in_stage1 >= self._network_starts["deformation"],
             use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
-            with_depth=self.has_depth
-            and config.loss.depth > 0.0
-            and (stage != "stage2" or config.loss.branches_in_stage2 != "no"),
+            with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
         )
 

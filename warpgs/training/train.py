@@ -225,10 +225,10 @@ def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     if loss.branches_in_stage2 == "given-masks":
-        distrusted = capture.estimated_masks and config.assume == "masks"
-        if distrusted:
+        uses_estimates = capture.estimated_masks and config.assume == "masks"
+        if uses_estimates:
             log("the masks are estimates: stage II compares the joint image alone")
-        loss = dataclasses.replace(loss, branches_in_stage2="no" if distrusted else "yes")
+        loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
     return dataclasses.replace(config, loss=loss)
 
 
