@@ -193,7 +193,7 @@ class _Problem:
         def cost(residuals: np.ndarray) -> float:
             return float(np.log1p((residuals**2).sum(1) / SCALE**2).sum())
 
-        # SciPy's least_squares converges slowly here: with a sparse Jacobian, a step is limited to a 2D subspace.
+        # SciPy's least_squares takes many iterations: with a sparse Jacobian, its steps span only two directions.
         x, damping = np.zeros(3 * len(start) - 3 + len(self.free)), 1e-3
         residuals = self.residuals(*state(x))
         for _ in range(MAX_STEPS):
