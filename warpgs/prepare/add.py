@@ -111,14 +111,15 @@ class _Job:
         names = self._names()
         # The loader reads one of the two folders: those in mask/ would be lost to it if new ones went to the other.
         folder = "resized_mask" if (self.root / "resized_mask").is_dir() else "mask"
-        missing = [name for name in names if not self._mask_files(folder, name)]
-        incomplete = any(len(self._mask_files(folder, name)) < len(self._factors()) for name in names)
+        files = {name: self._mask_files(folder, name) for name in names}
+        missing = [name for name in names if not files[name]]
+        incomplete = any(len(found) < len(self._factors()) for found in files.values())
         if incomplete and (self.root / "mask").is_dir() and folder == "mask":
             raise ValueError(
                 f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
             )
         if folder == "resized_mask":
-            self._complete_sizes(names)
+            self._complete_sizes(files)
         if not missing:
             self._say("masks: all frames have them")
             return
@@ -168,11 +169,10 @@ class _Job:
                 found[factor] = path
         return found
 
-    def _complete_sizes(self, names: list[str]) -> None:
-        """Writes masks of frames that have one in another size, from the largest that they have."""
+    def _complete_sizes(self, files: dict[str, dict[int, Path]]) -> None:
+        """Writes masks of frames that have one in another size, from the largest of a frame's ``files``."""
         completed = 0
-        for name in names:
-            found = self._mask_files("resized_mask", name)
+        for name, found in files.items():
             lacking = [factor for factor in self._factors() if factor not in found]
             if found and lacking:
                 if not completed:
