@@ -24,7 +24,7 @@ class Bench:
     graph: bool = False
     """Also measure forward and backward pass as CUDA graphs: one of each pass (torch.cuda.make_graphed_callables), and
     one of both."""
-    against: Literal["gsplat"] | None = None
+    against: Literal["gsplat", "gswarp"] | None = None
     """Also measure another renderer, alternating with this one, and compare images and gradients."""
     json: Path | None = None
     """JSON file to write all measurements to."""

@@ -22,7 +22,7 @@ from warpgs.runtime.profiling import KernelTime, profile
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
-from .workloads import PARAMETERS, Workload, graphed, make_gsplat_workload, make_workload
+from .workloads import OTHERS, PARAMETERS, Workload, graphed, make_workload
 
 WARM_UPS = {"cuda": 50, "cpu": 1}
 """Runs before the first measured one. On CUDA they bring clock rates and threads to a steady state; on CPU, where runs
@@ -60,8 +60,8 @@ def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, li
         branched = dataclasses.replace(settings, branches=True)
         workloads["three_images"] = make_workload(splats, camera, branched)
     own = list(workloads)
-    if options.against == "gsplat":
-        workloads["gsplat"] = make_gsplat_workload(one, camera, options.depth)
+    if options.against:
+        workloads[options.against] = OTHERS[options.against](one, camera, options.depth)
     measured = {name: peak_memory(workload) for name, workload in workloads.items()}
     for (name, metric), median in time_passes(workloads, own if options.graph else [], device, options.repeats).items():
         measured[name][metric] = median
@@ -73,8 +73,8 @@ def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, li
         **measured,
         "ratios_to_one_image": {n: ratios(measured[n], measured["one_image"]) for n in measured if n != "one_image"},
     }
-    if "gsplat" in workloads:
-        result["differences_from_gsplat"] = differences(one, workloads["gsplat"])
+    if options.against:
+        result[f"differences_from_{options.against}"] = differences(one, workloads[options.against])
     with profile() as kernels:
         workloads[own[-1]].forward_backward()
     return result, kernels.times()

@@ -16,10 +16,12 @@ from rich.table import Table
 from warpgs.evaluation.evaluate_run import commit
 from warpgs.runtime.profiling import KernelTime
 
+from .workloads import OTHERS
+
 WIDTH = 120
 """Columns of the output when it is not a terminal."""
 
-WORKLOADS = ("one_image", "three_images", "gsplat")
+WORKLOADS = ("one_image", "three_images", *OTHERS)
 """Workloads in the order of their columns."""
 
 NAMES = {
@@ -95,8 +97,8 @@ def print_result(result: dict[str, Any]) -> None:
     columns = [_flat(result[name]) for name in names]
     for name, column in zip(names, columns, strict=True):
         column |= {f"{_label(k)} over one image": v for k, v in result["ratios_to_one_image"].get(name, {}).items()}
-        if name == "gsplat":
-            column |= {f"difference {k}": v for k, v in _flat(result["differences_from_gsplat"]).items()}
+        if name in OTHERS:
+            column |= {f"difference {k}": v for k, v in _flat(result[f"differences_from_{name}"]).items()}
     title = (
         f"{result['name']}: {result['width']}x{result['height']}, {result['num_gaussians']:,} Gaussians, "
         f"{result['intersections']:,} intersections"

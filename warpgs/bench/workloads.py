@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
@@ -81,3 +82,45 @@ def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
         return (images[0, ..., :-1], images[0, ..., -1]) if depth else (images[0],)
 
     return Workload(run, ours.parameters, ours.v_images)
+
+
+def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
+    """The render of ``ours`` by gswarp, called as the rasterizer of 3DGS (whose near plane is at 0.2)."""
+    import gswarp
+
+    width, height = camera.size
+    focal_x, focal_y = camera.K[0, 0].item(), camera.K[1, 1].item()
+    projection = camera.viewmat.new_zeros(4, 4)  # OpenGL's, without a use of depth; the principal point is the center
+    projection[0, 0], projection[1, 1] = 2 * focal_x / width, 2 * focal_y / height
+    projection[2, 2] = projection[3, 2] = 1.0
+    settings = gswarp.GaussianRasterizationSettings(
+        image_height=height,
+        image_width=width,
+        tanfovx=width / (2 * focal_x),
+        tanfovy=height / (2 * focal_y),
+        bg=camera.viewmat.new_zeros(3),
+        scale_modifier=1.0,
+        viewmatrix=camera.viewmat.T.contiguous(),
+        projmatrix=(projection @ camera.viewmat).T.contiguous(),
+        sh_degree=0,
+        campos=camera.viewmat.inverse()[:3, 3].contiguous(),
+        prefiltered=False,
+        auto_tune_verbose=False,
+    )
+    gswarp.set_compute_depth(depth)
+    rasterizer = gswarp.GaussianRasterizer(settings)  # which expects unit quaternions
+    offsets = torch.zeros_like(ours.parameters[0], requires_grad=True)
+
+    def run() -> tuple[Tensor, ...]:
+        means, quats, scales, opacities, colors = ours.parameters
+        image, _, meta = rasterizer(
+            means, offsets, opacities[:, None], colors_precomp=colors, scales=scales, rotations=normalize(quats)
+        )
+        image = image.movedim(0, -1)
+        return (image, meta.depth[0]) if depth else (image,)
+
+    return Workload(run, ours.parameters, ours.v_images)
+
+
+OTHERS = {"gsplat": make_gsplat_workload, "gswarp": make_gswarp_workload}
+"""Other renderers by the name of their package."""
