@@ -136,6 +136,16 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
     assert lines == (["the masks are estimates: stage II compares the joint image alone"] if distrusted else [])
 
 
+@pytest.mark.parametrize("assume", ["masks", "static"])
+@pytest.mark.parametrize("estimated", [False, True])
+def test_only_masks_that_are_estimates_are_completed(assume, estimated):
+    cameras = {"a": make_camera()}
+    capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
+    config = TrainConfig(assume=assume, loss=LossConfig(mask_tolerance=0.04))
+    tolerance = fitted(config, capture, print).loss.mask_tolerance
+    assert tolerance == (0.04 if estimated and assume == "masks" else 0.0)
+
+
 def test_without_a_minimum_period_all_frequencies_are_used():
     assert fitted_bands(ModelConfig(time_bands=10), 3) == 10
     assert fitted_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0

@@ -32,6 +32,7 @@ PAPER = {
         "loss.dynamic": 1.0,
         "loss.dynamic_background": "black",
         "loss.mask_margin": 0.0,
+        "loss.mask_tolerance": 0.0,
         "assume": "masks",
     },
     "Visibility-Driven Pruning": {"vdp": True},
@@ -51,6 +52,7 @@ PAPER = {
         "loss.branches_in_stage2": "yes",
     },
     "Experimental Setup": {
+        "schedule.half_size_until": 0,
         "schedule.stage1": 30_000,
         "schedule.stage2": 40_000,
         "optim.networks": 8e-4,

@@ -19,6 +19,7 @@ from warpgs.files import write_json
 from warpgs.runs.checkpoint import _hash
 from warpgs.training import command, ranks
 from warpgs.training import train as script
+from warpgs.training.mask_errors import send_from_first
 from warpgs.training.step import Step
 from warpgs.training.trainer import Trainer
 
@@ -169,3 +170,16 @@ def with_differences(folder: Path, config: TrainConfig, what: str) -> int:
         whole = script.open_capture
         script.open_capture = lambda *_: dataclasses.replace(c := whole(*_), points=c.points + 1e-3)
     return command_with(config)
+
+
+def send_masks(folder: Path, config: TrainConfig) -> None:
+    """Each rank marks another block as moving and writes what it has after those of rank 0 were sent."""
+    with ranks.joined():
+        views = script.make_trainer(config).views
+        blocks = views.moving_blocks()
+        blocks[ranks.rank(), 3, 4] = 1.0
+        views.set_moving_blocks(blocks)
+        send_from_first(views)
+        blocks = views.moving_blocks()
+        where = [int(k) for k in blocks.nonzero()[0]]
+        write_json(folder / f"rank{ranks.rank()}.json", {"sum": blocks.sum().item(), "where": where})

@@ -91,12 +91,11 @@ class ModelConfig:
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
     """Number of units per hidden layer."""
     appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = None
-    """Number of hidden layers of the appearance network; that of both networks if None."""
+    """Number of hidden layers of the appearance network; as ``depth`` if None."""
     appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
     """Number of units per hidden layer of the appearance network; that of both networks if None."""
     skip: int = 4
-    """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS); nowhere if it is the last one
-    or beyond."""
+    """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
     deformation: str = "mlp"
     """Deformation model of the dynamic Gaussians (a key of FIELDS in warpgs/model/fields.py)."""
     sh_degree: int = 1
@@ -146,14 +145,15 @@ class LossConfig:
     or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""
     depth_tolerance: float = 0.0
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
-    by 1 + (error / tolerance)², and depth that is hardly better than a constant is not used. If 0, all views have the
-    same weight (paper)."""
+    by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along the borders of masks in which the dynamic image is not compared, as a fraction of
-    the image's larger side; 0 in the paper. Masks are a few pixels off, and the rim of background inside them would be
-    learned as moving."""
+    the image's larger side; 0 in the paper. Masks are a few pixels off; the rim inside them would be learned."""
+    mask_tolerance: Annotated[float, Bounds(max=1)] = 0.0
+    """Where `prepare` made the masks, the colour error of a block of pixels of the static image above which the block
+    becomes dynamic; 0 trusts the masks (paper)."""
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,7 @@ class DensifyConfig:
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
-    """Fraction of the dynamic pixels that no dynamic Gaussian shows, from which on new ones start there when static
-    Gaussians are pruned during densification. 0: never."""
+    """At prunings during densification: new ones start where this fraction of the dynamic pixels is lost; 0: never."""
     weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
@@ -248,9 +247,10 @@ class Schedule:
     joint_from: int | None = None
     """Iteration of stage I from which the joint image is compared; in stage II alone if None (paper)."""
     warmup: int = 1_000
-    """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. At the
-    full rate Adam's first steps, all of the same sign, turn most ReLU units off for good, and may carry all dynamic
-    Gaussians of one object off to another."""
+    """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. Adam's
+    first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
+    half_size_until: int = 0
+    """Iteration of stage I up to which views are compared at half their size, for speed; 0 in the paper."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000

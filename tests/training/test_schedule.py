@@ -142,6 +142,11 @@ def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
     assert before == {"static", "dynamic", "depth", "depth_dynamic"}
 
 
+def test_views_have_half_their_size_up_to_an_iteration_of_stage_1():
+    assert iterations_in_phases_where("half_size", schedule={"half_size_until": 15}) == list(range(STAGE1 + 15))
+    assert iterations_in_phases_where("half_size") == []
+
+
 def test_without_the_appearance_network_stage_2_has_its_joint_term():
     assert iterations_in_phases_where("use_appearance", app=False) == []
     assert iterations_with_joint_term(app=False) == list(range(STAGE2, END))
@@ -297,6 +302,9 @@ def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_netwo
     reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
     assert iterations_where("reseed", densify=reseed, schedule=often) == after(50)
     assert iterations_where("reseed", schedule=often) == []
+    tolerant = LossConfig(mask_tolerance=0.04)
+    assert iterations_where("complete_masks", loss=tolerant, schedule=often) == after(50)
+    assert iterations_where("complete_masks", densify=reseed, schedule=often) == []
 
 
 def test_without_visibility_driven_pruning_nothing_is_pruned():
@@ -368,7 +376,7 @@ def test_zeros_of_a_schedule_stay_zero_when_it_is_rescaled(off, iterations):
     schedule = dataclasses.replace(SHORT, **dict.fromkeys(off, 0))
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
     assert total(after) == iterations
-    assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == set(off)
+    assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == {*off, "half_size_until"}
 
 
 @pytest.mark.parametrize("lengths", [(2_000, 70_000, 1_000), (1, 1, 100_000), (40_000, 1, 40_000), (5, 5, 5)])

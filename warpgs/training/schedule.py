@@ -40,6 +40,7 @@ class Phase:
         sh_degree: Maximum degree of spherical harmonics in use.
         with_depth: Whether depth is rendered and compared.
         with_joint: Whether the joint image is compared.
+        half_size: Whether views have half their size.
     """
 
     stage: StageName
@@ -48,6 +49,7 @@ class Phase:
     sh_degree: int
     with_depth: bool
     with_joint: bool
+    half_size: bool = False
 
 
 def compares_branches(stage: StageName, config: LossConfig) -> bool:
@@ -67,9 +69,9 @@ class IterationPlan:
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, prune_weakest, reseed, realign: What to do after the iteration: densify, reset opacities,
-            prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where none
-            shows what moves, align depth again.
+        densify, reset, prune, prune_weakest, complete_masks, reseed, realign: What to do after the iteration: densify,
+            reset opacities, prune by visibility, prune the Gaussians that contribute least, take for dynamic what
+            static Gaussians cannot show, start new dynamic Gaussians where none shows what moves, align depth again.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
@@ -84,6 +86,7 @@ class IterationPlan:
     reset: bool
     prune: bool
     prune_weakest: bool
+    complete_masks: bool
     reseed: bool
     realign: bool
     remove_large: bool
@@ -96,7 +99,7 @@ class IterationPlan:
     @property
     def adapts(self) -> bool:
         """Whether anything is done after the iteration."""
-        return self.replaces_gaussians or self.reset or self.realign
+        return self.replaces_gaussians or self.reset or self.realign or self.complete_masks
 
 
 def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
@@ -162,6 +165,7 @@ class Protocol:
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
+            half_size=config.schedule.half_size_until > 0 and in_stage1 < config.schedule.half_size_until,
         )
 
     def at(self, iteration: int) -> IterationPlan:
@@ -174,6 +178,7 @@ class Protocol:
         progress = iteration / self.num_iterations
         decay = max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until))
         prunes = self._prunes(iteration)
+        recovers = prunes and self._reseed_from < done < schedule.densify_until
         return IterationPlan(
             phase=phase,
             progress=progress,
@@ -188,7 +193,8 @@ class Protocol:
             prune_weakest=self.config.densify.weakest > 0.0
             and prunes
             and schedule.densify_until <= done <= 2 * schedule.densify_until,
-            reseed=self.config.densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
+            complete_masks=self.config.loss.mask_tolerance > 0.0 and recovers,
+            reseed=self.config.densify.reseed > 0.0 and recovers,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )

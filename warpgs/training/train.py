@@ -224,8 +224,10 @@ def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
+    uses_estimates = capture.estimated_masks and config.assume == "masks"
+    if not uses_estimates:
+        loss = dataclasses.replace(loss, mask_tolerance=0.0)
     if loss.branches_in_stage2 == "given-masks":
-        uses_estimates = capture.estimated_masks and config.assume == "masks"
         if uses_estimates:
             log("the masks are estimates: stage II compares the joint image alone")
         loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")

@@ -22,6 +22,7 @@ from .densify import DensifyLimits, densify, reset_opacities
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
+from .mask_errors import complete_masks, send_from_first
 from .prune import blend_weights, prune_invisible, prune_weakest
 from .reseed import gaussians_that_show, lost_fraction, lost_pixels
 from .sampling import Sampler, random_numbers
@@ -158,6 +159,8 @@ class Trainer:
             self._adapt(plan, logger)
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
         ranks.copy_first_(self.alignments)
+        if plan.complete_masks:
+            send_from_first(self.views)
         if plan.replaces_gaussians:
             self.step.reset_statistics()
 
@@ -178,6 +181,8 @@ class Trainer:
                 scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
             )
             logger.log(f"iteration {self.iteration + 1}: {removed}")
+        if plan.complete_masks and (completed := complete_masks(scene, self.views, plan.phase, self.config)):
+            logger.log(f"iteration {self.iteration + 1}: {completed}")
         if plan.reseed:
             self._reseed(plan.phase, logger)
         if plan.prune_weakest:
@@ -304,6 +309,8 @@ class Trainer:
                 tensors[f"adam.{part}.{name}"] = value
         tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
         tensors["alignments"] = self.alignments
+        if self.config.loss.mask_tolerance:
+            tensors["masks.moving"] = self.views.moving_blocks()
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
 
@@ -338,6 +345,8 @@ class Trainer:
         if loaded.metadata.views != self.capture.train:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
+        if self.config.loss.mask_tolerance:
+            self.views.set_moving_blocks(loaded.tensor("masks.moving", self.views.moving_blocks().shape))
         if self.views.poses is not None:
             self.views.poses.load_state_dict(checkpoint.load_poses(loaded, self.capture.extent).state_dict())
         self._set_scene(checkpoint.load_scene(loaded, self.config.model))

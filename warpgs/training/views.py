@@ -13,6 +13,8 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.poses import PoseCorrections
 
+from .blocks import GRID, from_blocks, num_blocks
+
 
 class View(NamedTuple):
     """One training view on the device.
@@ -32,6 +34,30 @@ class View(NamedTuple):
     static_mask: Bool[Tensor, "H W"]
     mask_border: Bool[Tensor, "H W"] | None
     inverse_depth: Float[Tensor, "H W"]
+
+    def halved(self) -> "View":
+        """The view at half the size; the last row and column of odd sizes are left out.
+
+        A pixel is static if the four that it covers are, lies on a border if one of them does, and has the inverse
+        depth of the first.
+        """
+        camera = self.camera
+        height, width = camera.height // 2, camera.width // 2
+        blocks = [self.image, self.static_mask[..., None], self.inverse_depth[..., None]]
+        if self.mask_border is not None:
+            blocks.append(self.mask_border[..., None])
+        image, mask, depth, *border = (
+            block[: 2 * height, : 2 * width].unflatten(1, (width, 2)).unflatten(0, (height, 2)) for block in blocks
+        )
+        K = torch.cat([camera.K[:2] / 2, camera.K[2:]])
+        return View(
+            Camera(camera.viewmat, K, width, height),
+            self.time,
+            image.mean((1, 3)),
+            mask[..., 0].all(3).all(1),
+            border[0][..., 0].any(3).any(1) if border else None,
+            depth[:, 0, :, 0, 0].contiguous(),
+        )
 
 
 def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
@@ -100,6 +126,7 @@ class Views:
         self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
         self._capture = capture
         self._depth_factors: dict[str, tuple[Tensor, Tensor]] = {}
+        self._moving: dict[str, Tensor] = {}
         first = self._store(capture.frame(capture.train[0]))
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -131,6 +158,30 @@ class Views:
         if self.resident:
             self._all.inverse_depth[index] = self._store(self._capture.frame(name)).inverse_depth
             del self._depth_factors[name]
+
+    def moving_blocks(self) -> Float[Tensor, "T h w"]:
+        """1 for the blocks that are dynamic whatever the mask says, 0 for all others and beyond an image."""
+        blocks = torch.zeros(len(self), GRID, GRID)
+        for index, name in enumerate(self._capture.train):
+            if name in self._moving:
+                rows, columns = self._moving[name].shape
+                blocks[index, :rows, :columns] = self._moving[name].float()
+        return blocks
+
+    def set_moving_blocks(self, blocks: Float[Tensor, "T h w"]) -> None:
+        """Takes blocks for dynamic, as ``moving_blocks`` returns them, and follows the masks everywhere else."""
+        for index, (name, own) in enumerate(zip(self._capture.train, blocks.cpu() > 0, strict=True)):
+            width, height = self._capture.cameras[name].size
+            rows, columns = num_blocks(height, width)
+            before, own = self._moving.get(name), own[:rows, :columns]
+            if torch.equal(own, torch.zeros_like(own) if before is None else before):
+                continue
+            self._moving[name] = own
+            if self.resident:
+                stored = self._store(self._capture.frame(name))
+                self._all.static_mask[index] = stored.static_mask
+                if self._all.mask_border is not None and stored.mask_border is not None:
+                    self._all.mask_border[index] = stored.mask_border
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
@@ -166,7 +217,10 @@ class Views:
             (scale, offset), factor = self._depth_factors[frame.name]
             depth = ((scale * depth + offset) * factor - offset) / scale
         time = torch.tensor([camera.time])
+        static_mask = frame.static_mask
+        if frame.name in self._moving:
+            static_mask = static_mask & ~from_blocks(self._moving[frame.name], *size)
         margin = round(self._mask_margin * max(size))
-        border = mask_border(frame.static_mask, margin) if margin else None
-        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())
+        border = mask_border(static_mask, margin) if margin else None
+        tensors = (camera.viewmat, camera.K, time, frame.image, static_mask, depth.half())
         return _Stored(*tensors, border, self._gains.get(frame.name))
