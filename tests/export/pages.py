@@ -7,24 +7,24 @@ import re
 
 import numpy as np
 
-from warpgs.export.baking import Baked, Bounds, Branch
+from warpgs.export.baking import PARTS, Baked, Branch
+from warpgs.export.cosines import Levels
 from warpgs.export.packing import from_planes
-
-TYPES = {"geometry": np.dtype("<u4"), "colors": np.dtype("u1"), "rest": np.dtype("u1")}
 
 
 def read_page(path):
-    blocks = dict(re.findall(r'<script type="[^"]+" id="([a-z-]+)">([^<]*)</script>', path.read_text("utf-8")))
+    blocks = dict(re.findall(r'<script type="[^"]+" id="([a-z_-]+)">([^<]*)</script>', path.read_text("utf-8")))
     metadata = json.loads(blocks["scene"])
-    return Baked(
-        metadata["keys"], *(branch(blocks, name, metadata["branches"][name]) for name in ("static", "dynamic"))
-    )
+    branches = [
+        Branch(**{part: levels(blocks[f"{name}-{part}"], part, metadata["branches"][name][part]) for part in PARTS})
+        for name in ("static", "dynamic")
+    ]
+    return Baked(metadata["keys"], *branches)
 
 
-def branch(blocks, name, metadata):
-    bounds = {bound: np.array(metadata[bound], np.float64) for bound in ("means", "log_scales", "colors", "rest")}
-    arrays = {}
-    for array, dtype in TYPES.items():
-        data = gzip.decompress(base64.b64decode(blocks[f"{name}-{array}"]))
-        arrays[array] = from_planes(np.frombuffer(data, np.uint8), tuple(metadata["shapes"][array]), dtype)
-    return Branch(Bounds(**bounds), **arrays)
+def levels(block, part, metadata):
+    planes = np.frombuffer(gzip.decompress(base64.b64decode(block)), np.uint8)
+    values = from_planes(planes, tuple(metadata["shape"]))
+    if part == "means":
+        values[0] = np.cumsum(values[0], 0, np.int32)
+    return Levels(values, np.array(metadata["steps"], np.float64))

@@ -68,10 +68,15 @@ def test_rotations_about_an_axis_are_restored(axis, sign):
     assert angles_between(quats, unpack_rotations(pack_rotations(quats)))[0] < 3e-3
 
 
-@pytest.mark.parametrize("dtype", ["u1", "<u4"])
+@pytest.mark.parametrize("largest", [0, 100, 30_000, 2**31 - 1])
 @pytest.mark.parametrize("shape", [(1, 7, 4), (5, 7, 4), (3, 0, 4), (1, 1, 1)])
-def test_planes_are_lossless(dtype, shape):
-    keys = RANDOM.integers(0, 2**32, shape, dtype=np.uint64).astype(dtype)
-    planes = to_planes(keys)
+def test_planes_are_lossless(largest, shape):
+    levels = RANDOM.integers(-largest, largest, shape, dtype=np.int32, endpoint=True)
+    planes = to_planes(levels)
     assert planes.dtype == np.uint8
-    assert (from_planes(planes, shape, np.dtype(dtype)) == keys).all()
+    assert (from_planes(planes, shape) == levels).all()
+
+
+def test_small_integers_take_one_byte():
+    assert len(to_planes(np.full((2, 3, 4), -128, np.int32))) == 24
+    assert len(to_planes(np.full((2, 3, 4), 128, np.int32))) == 48

@@ -1,55 +1,49 @@
 """A dynamic scene at several key times, quantised to integers: what a page plays.
 
 Static Gaussians have one geometry, and a colour and an opacity per key time; dynamic Gaussians have a geometry per key
-time and one colour. Between key times, means, colours and logarithms of scales are interpolated linearly; rotations
-too, and are then normalised. The geometry of a Gaussian takes four 32-bit words: its mean with 21 bits per axis over
-the bounds of its branch (x and the upper bits of y, then the lower bits of y and z), its rotation as in compressed PLY,
-and its log-scales with 10 bits each.
+time and one colour. Both are stored as cosine coefficients over the key times (``cosines``), along a Morton curve,
+colours as luma and two chroma (YCoCg). Between key times, means, colours and logarithms of scales are interpolated
+linearly; rotations too, and are then normalised.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64, UInt8, UInt32
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from warpgs.model.gaussians import SH_C0
 
 from .cloud import ARRAYS, Cloud, logit, sigmoid
-from .packing import dequantise, pack_rotations, quantise, unpack, unpack_rotations
+from .compressed import morton_order
+from .cosines import Levels
 
-MEAN_BITS = 21
-SCALE_BITS = 10
+STEPS = {"rotations": 1 / 64, "log_scales": 1 / 16, "colors": 1 / 48, "opacities": 1 / 256, "rest": 1 / 64}
+"""Steps of quantisation; those of chroma are twice as coarse. With them images have about 40 dB and more
+against the scene (docs/viewing.md)."""
+
+MEAN_STEP = 1 / 8
+"""Step of a mean, as a fraction of the size of small Gaussians (10th percentile of the longest standard deviation)."""
+
 SCALE_SPAN = 16.0
 """Range of log-scales below the largest one; a Gaussian that is e¹⁶ times thinner is flat."""
 
 COLORS = (-1.0, 2.0)
 REST = (-2.0, 2.0)
-"""Bounds of colours and of coefficients of degree 1 and higher, far beyond what a screen shows: otherwise a few
-outliers would cost all others their precision."""
+"""Bounds of colours and of coefficients of degree 1 and higher, far beyond what a screen shows."""
 
-WORDS = 4
-"""Words per geometry."""
+YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
+"""From red, green and blue to luma and two chroma, which neighbours share more of."""
 
-UPPER_Y_BITS = 11
-"""Bits of y that share the first word with x; the other ten share the second with z."""
+CHROMA = (1.0, 2.0, 2.0)
+"""Factors of the steps of luma and chroma."""
 
+TEXEL = {"geometry": 16, "colors": 4, "rest": 4}
+"""Bytes that the player's textures take per Gaussian: of one time, of one time, and of one coefficient."""
 
-@dataclass(frozen=True)
-class Bounds:
-    """The ranges over which a branch is quantised.
-
-    Attributes:
-        means: [2, 3] minimum and maximum mean [scene units].
-        log_scales: [2] minimum and maximum over all axes.
-        colors: [2] minimum and maximum over all channels.
-        rest: [2] minimum and maximum of the coefficients of degree 1 and higher.
-    """
-
-    means: Float64[np.ndarray, "2 3"]
-    log_scales: Float64[np.ndarray, "2"]
-    colors: Float64[np.ndarray, "2"]
-    rest: Float64[np.ndarray, "2"]
+PARTS = ("means", "rotations", "log_scales", "colors", "opacities", "rest")
 
 
 @dataclass(frozen=True)
@@ -57,41 +51,55 @@ class Branch:
     """The static or the dynamic Gaussians.
 
     Attributes:
-        bounds: Ranges of the quantised arrays.
-        geometry: [1 or K, N, 4] means, rotations and scales.
-        colors: [K or 1, N, 4] red, green, blue (of the constant coefficient) and opacity.
-        rest: [N, R, 3] coefficients of degree 1 and higher, the same at all times.
+        means: [1 or K, N, 3] centres [scene units].
+        rotations: [K, N, 4] quaternions, of any length, whose signs agree over time; or [1, N, 3] x, y, z of unit
+            quaternions with w ≥ 0.
+        log_scales: [1 or K, N, 3].
+        colors: [K or 1, N, 3] luma and chroma of the constant coefficient.
+        opacities: [K or 1, N, 1].
+        rest: [1, N, 3 R] luma and chroma of the coefficients of degree 1 and higher, the same at all times.
     """
 
-    bounds: Bounds
-    geometry: UInt32[np.ndarray, "G N 4"]
-    colors: UInt8[np.ndarray, "C N 4"]
-    rest: UInt8[np.ndarray, "N R 3"]
+    means: Levels
+    rotations: Levels
+    log_scales: Levels
+    colors: Levels
+    opacities: Levels
+    rest: Levels
 
     def __len__(self) -> int:
-        return self.geometry.shape[1]
+        return self.means.levels.shape[1]
+
+    @cached_property
+    def _values(self) -> dict[str, np.ndarray]:
+        """The values of all parts, rotations with four components."""
+        values = {name: getattr(self, name).values for name in PARTS}
+        rotations = values["rotations"]
+        if rotations.shape[2] == 3:
+            w = np.sqrt(np.maximum(0.0, 1.0 - (rotations**2).sum(2, keepdims=True)))
+            values["rotations"] = np.concatenate([w, rotations], 2)
+        return values
 
     def at(self, position: float, is_dynamic: bool) -> Cloud:
         """The Gaussians at a position between key times, where key k is at position k."""
-        geometry = [_unpack_geometry(self.bounds, words) for words in _neighbours(self.geometry, position)]
-        color, next_color = (_unpack_colors(self.bounds, values) for values in _neighbours(self.colors, position))
-        fraction = position - int(position)
-        (means, quats, log_scales), (next_means, next_quats, next_scales) = geometry
-        means, log_scales = _lerp(means, next_means, fraction), _lerp(log_scales, next_scales, fraction)
-        # q and -q are the same rotation: interpolate towards the closer one
-        closer = np.where((quats * next_quats).sum(1, keepdims=True) < 0, -next_quats, next_quats)
-        quats = _lerp(quats, closer, fraction)
-        color = _lerp(color, next_color, fraction)
-        constant = (color[:, None, :3] - 0.5) / SH_C0
-        rest = dequantise(self.rest.astype(np.uint32), self.bounds.rest, 8)
+        now = {name: _interpolated(values, position) for name, values in self._values.items()}
+        constant = (now["colors"] @ np.linalg.inv(YCOCG).T - 0.5) / SH_C0
+        rest = now["rest"].reshape(len(self), now["rest"].shape[1] // 3, 3) @ np.linalg.inv(YCOCG).T
         return Cloud(
-            means=means.astype(np.float32),
-            quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
-            log_scales=log_scales.astype(np.float32),
-            logit_opacities=logit(color[:, 3]).astype(np.float32),
-            sh=np.concatenate([constant, rest], 1).astype(np.float32),
+            means=now["means"].astype(np.float32),
+            quats=_normalized(now["rotations"]).astype(np.float32),
+            log_scales=now["log_scales"].astype(np.float32),
+            logit_opacities=logit(now["opacities"][:, 0]).astype(np.float32),
+            sh=np.concatenate([constant[:, None], rest], 1).astype(np.float32),
             is_dynamic=np.full(len(self), is_dynamic),
         )
+
+    @property
+    def texture_bytes(self) -> int:
+        """Memory of the player's textures [bytes]."""
+        geometry, colors = self.means.levels.shape[0], self.colors.levels.shape[0]
+        rest = self.rest.levels.shape[2] // 3
+        return len(self) * (geometry * TEXEL["geometry"] + colors * TEXEL["colors"] + rest * TEXEL["rest"])
 
 
 @dataclass(frozen=True)
@@ -109,12 +117,13 @@ class Baked:
         return parts[0].replaced(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS})
 
 
-def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float]) -> Baked:
+def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float], precision: float = 1.0) -> Baked:
     """Quantises a scene at key times; Gaussians with values that are not finite at any of them are omitted.
 
     Args:
         cloud_at: The scene at a time, in the same rows at every time.
         times: At least one, evenly spaced over [0, 1].
+        precision: All steps of quantisation are divided by it.
     """
     static_colors, dynamic_geometry, finite = [], [], np.ones(1, bool)
     for time in times:
@@ -129,15 +138,15 @@ def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float]) -> Baked:
     geometry = [part[None] for part in (static.means, static.quats, static.log_scales)]
     return Baked(
         len(dynamic_geometry),
-        _branch(geometry, np.stack(static_colors)[:, finite[~is_dynamic]], static.sh[:, 1:]),
-        _branch(tracks, _color(dynamic)[None], dynamic.sh[:, 1:]),
+        _branch(geometry, np.stack(static_colors)[:, finite[~is_dynamic]], static.sh[:, 1:], precision),
+        _branch(tracks, _color(dynamic)[None], dynamic.sh[:, 1:], precision),
     )
 
 
-def baked_bytes(num_static: int, num_dynamic: int, keys: int, rest: int) -> int:
-    """Memory of the Gaussians of a page before compression [bytes], with ``rest`` coefficients beyond degree 0."""
-    geometry, color = 4 * WORDS, 4
-    return num_static * (geometry + keys * color + 3 * rest) + num_dynamic * (keys * geometry + color + 3 * rest)
+def texture_bytes(num_static: int, num_dynamic: int, keys: int, rest: int) -> int:
+    """Memory of the player's textures for a page [bytes], with ``rest`` coefficients beyond degree 0."""
+    geometry, color, rest = TEXEL["geometry"], TEXEL["colors"], TEXEL["rest"] * rest
+    return num_static * (geometry + keys * color + rest) + num_dynamic * (keys * geometry + color + rest)
 
 
 def _color(cloud: Cloud) -> np.ndarray:
@@ -145,62 +154,67 @@ def _color(cloud: Cloud) -> np.ndarray:
     return np.concatenate([np.clip(0.5 + SH_C0 * cloud.sh[:, 0], *COLORS), sigmoid(cloud.logit_opacities[:, None])], 1)
 
 
-def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray) -> Branch:
-    means, quats, log_scales = geometry
-    rest = np.clip(rest, *REST)
-    scale_range = _range(log_scales)
-    bounds = Bounds(
-        np.stack([_range(means[..., a]) for a in range(3)], 1),
-        np.maximum(scale_range, scale_range[1] - SCALE_SPAN),
-        _range(colors[..., :3]),
-        _range(rest),
-    )
-    values = quantise(means, bounds.means, MEAN_BITS)
-    x, y, z = (values[..., a] for a in range(3))
-    scales = quantise(np.maximum(log_scales, bounds.log_scales[0]), bounds.log_scales, SCALE_BITS)
-    words = [
-        x << np.uint32(UPPER_Y_BITS) | y >> np.uint32(MEAN_BITS - UPPER_Y_BITS),
-        (y & np.uint32((1 << (MEAN_BITS - UPPER_Y_BITS)) - 1)) << np.uint32(MEAN_BITS) | z,
-        pack_rotations(quats.reshape(-1, 4)).reshape(x.shape),
-        scales[..., 0] << np.uint32(20) | scales[..., 1] << np.uint32(10) | scales[..., 2],
-    ]
-    rgb = quantise(colors[..., :3].astype(np.float64), bounds.colors, 8)
-    opacity = quantise(colors[..., 3:].astype(np.float64), (0.0, 1.0), 8)
+def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray, precision: float) -> Branch:
+    order = morton_order(geometry[0][0])
+    means, quats, log_scales = (part[:, order].astype(np.float64) for part in geometry)
+    colors, rest = colors[:, order].astype(np.float64), np.clip(rest[order], *REST).astype(np.float64)
+    size = np.quantile(np.exp(log_scales[0].max(1)), 0.1) if len(order) else 1.0
+    if len(log_scales) == 1:
+        turned, axes = nearest_to_identity(quats[0])
+        rotations, log_scales = turned[None, :, 1:], np.take_along_axis(log_scales, axes[None], 2)
+    else:
+        rotations = _signs_aligned(quats)
+    log_scales = np.maximum(log_scales, log_scales.max(initial=-np.inf) - SCALE_SPAN)
+    values = {
+        "means": means,
+        "rotations": rotations,
+        "log_scales": log_scales,
+        "colors": colors[..., :3] @ YCOCG.T,
+        "opacities": colors[..., 3:],
+        "rest": (rest @ YCOCG.T).reshape(1, len(rest), 3 * rest.shape[1]),
+    }
+    steps: Mapping[str, float] = {"means": MEAN_STEP * size, **STEPS}
+    factors = {"colors": CHROMA, "rest": CHROMA * rest.shape[1]}
     return Branch(
-        bounds,
-        np.stack(words, -1),
-        np.concatenate([rgb, opacity], -1).astype(np.uint8),
-        quantise(rest, bounds.rest, 8).astype(np.uint8),
+        **{
+            name: Levels.of(array, np.array(factors.get(name, (1.0,) * array.shape[2])) * steps[name] / precision)
+            for name, array in values.items()
+        }
     )
 
 
-def _range(values: np.ndarray) -> np.ndarray:
-    """Minimum and maximum; zeros for an empty array."""
-    return np.array([values.min(), values.max()], np.float64) if values.size else np.zeros(2)
+def nearest_to_identity(quats: Float64[np.ndarray, "N 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Names the axes of ellipsoids so that their rotations are as small as possible.
+
+    Args:
+        quats: Unit quaternions (w, x, y, z).
+
+    Returns:
+        [N, 4] unit quaternions with w ≥ 0.85, and the [N, 3] axis of the given one that each new axis is.
+    """
+    cube = Rotation.create_group("O")  # what maps axes to axes
+    group = np.roll(cube.as_quat(), 1, axis=1)
+    best = np.abs(quats @ (group * (1.0, -1.0, -1.0, -1.0)).T).argmax(1) if len(quats) else np.zeros(0, np.int64)
+    axes = np.abs(cube.as_matrix()).argmax(1)[best]
+    (a, *u), (b, *v) = quats.T, group[best].T
+    u, v = np.stack(u, 1), np.stack(v, 1)
+    w = a * b - (u * v).sum(1)
+    turned = np.concatenate([w[:, None], a[:, None] * v + b[:, None] * u + np.cross(u, v)], 1)
+    return turned * np.where(w < 0, -1.0, 1.0)[:, None], axes
 
 
-def _neighbours(keys: np.ndarray, position: float) -> tuple[np.ndarray, np.ndarray]:
-    """The keys before and after a position; the same one twice if there is only one."""
+def _signs_aligned(quats: Float64[np.ndarray, "K N 4"]) -> Float64[np.ndarray, "K N 4"]:
+    """The same rotations, each quaternion on the side of the one before: q and −q are the same rotation."""
+    turns = np.where((quats[1:] * quats[:-1]).sum(2, keepdims=True) < 0, -1.0, 1.0)
+    return quats * np.concatenate([np.ones_like(quats[:1, :, :1]), np.cumprod(turns, 0)])
+
+
+def _interpolated(keys: np.ndarray, position: float) -> np.ndarray:
+    """Values at a position between keys, or the only ones."""
     before = min(int(position), len(keys) - 1)
-    return keys[before], keys[min(before + 1, len(keys) - 1)]
+    fraction = position - before if len(keys) > 1 else 0.0
+    return keys[before] * (1 - fraction) + keys[min(before + 1, len(keys) - 1)] * fraction
 
 
-def _lerp(a: np.ndarray, b: np.ndarray, fraction: float) -> np.ndarray:
-    return a * (1 - fraction) + b * fraction
-
-
-def _unpack_geometry(bounds: Bounds, words: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, quaternions and log-scales from their words."""
-    high, low = (
-        unpack(words[:, 0], (MEAN_BITS, UPPER_Y_BITS)),
-        unpack(words[:, 1], (MEAN_BITS - UPPER_Y_BITS, MEAN_BITS)),
-    )
-    y = high[:, 1] << np.uint32(MEAN_BITS - UPPER_Y_BITS) | low[:, 0]
-    means = dequantise(np.stack([high[:, 0], y, low[:, 1]], 1), bounds.means, MEAN_BITS)
-    scales = dequantise(unpack(words[:, 3], (SCALE_BITS,) * 3), bounds.log_scales, SCALE_BITS)
-    return means, unpack_rotations(words[:, 2]).astype(np.float64), scales
-
-
-def _unpack_colors(bounds: Bounds, values: np.ndarray) -> np.ndarray:
-    rgb = dequantise(values[:, :3].astype(np.uint32), bounds.colors, 8)
-    return np.concatenate([rgb, values[:, 3:] / 255.0], 1)
+def _normalized(quats: np.ndarray) -> np.ndarray:
+    return quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)  # 1e-12: of opposite rotations

@@ -36,6 +36,8 @@ class Export:
     """Export at most this many Gaussians: those that the training cameras see most of."""
     max_megabytes: float | None = None
     """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
+    precision: float | None = None
+    """Divide the quantisation steps of a page by this; 1 by default, for about 40 dB against the scene itself."""
     data: Path | None = None
     """Current folder of the capture, if it was moved; a page starts at one of its cameras."""
     quiet: bool = False

@@ -16,7 +16,7 @@ from .writers import WRITERS
 COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
 """Options that are counts, and their maxima."""
 
-POSITIVE = ("seconds", "max_megabytes")
+POSITIVE = ("seconds", "max_megabytes", "precision")
 """Options that are positive numbers."""
 
 

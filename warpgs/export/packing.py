@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Float32, UInt8, UInt32
+from jaxtyping import Float32, Int32, UInt8, UInt32
 
 Range = tuple[float, float] | tuple[np.ndarray, np.ndarray] | np.ndarray
 """A minimum and a maximum, each of a shape that broadcasts with the values."""
@@ -74,14 +74,23 @@ def _smaller(largest: np.ndarray) -> np.ndarray:
     return np.arange(4) != largest[:, None]
 
 
-def to_planes(keys: np.ndarray) -> UInt8[np.ndarray, " bytes"]:
-    """Differences between consecutive keys of integers, all lowest bytes first: gzip compresses this form better."""
-    differences = keys.copy()
-    differences[1:] -= keys[:-1]  # wraps around, and so does the sum in ``from_planes``
-    return np.ascontiguousarray(differences.reshape(-1, 1).view(np.uint8).T).reshape(-1)
+def to_planes(levels: Int32[np.ndarray, "K N C"]) -> UInt8[np.ndarray, " bytes"]:
+    """Integers around zero as bytes, all lowest bytes first, without the highest ones that are zero.
+
+    A sign becomes the lowest bit: 0, −1, 1, −2 … are 0, 1, 2, 3 … Values of one key and channel are next to each other.
+    """
+    values = np.ascontiguousarray(levels.transpose(0, 2, 1)).reshape(-1)
+    unsigned = ((values << 1) ^ (values >> 31)).view(np.uint32)
+    used = -(-int(unsigned.max(initial=1)).bit_length() // 8)
+    return np.ascontiguousarray(unsigned.astype("<u4").view(np.uint8).reshape(-1, 4).T[:used]).reshape(-1)
 
 
-def from_planes(planes: UInt8[np.ndarray, " bytes"], shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """The keys that ``to_planes`` encoded."""
-    differences = np.ascontiguousarray(planes.reshape(dtype.itemsize, -1).T).view(dtype).reshape(shape)
-    return np.add.accumulate(differences, axis=0, dtype=dtype)
+def from_planes(planes: UInt8[np.ndarray, " bytes"], shape: tuple[int, int, int]) -> Int32[np.ndarray, "K N C"]:
+    """The integers of shape [K, N, C] that ``to_planes`` encoded."""
+    keys, num, channels = shape
+    count = keys * num * channels
+    unsigned = np.zeros(count, np.uint32)
+    for k, plane in enumerate(planes.reshape(-1, count) if count else ()):
+        unsigned |= plane.astype(np.uint32) << np.uint32(8 * k)
+    values = (unsigned >> np.uint32(1)).astype(np.int32) ^ -(unsigned & np.uint32(1)).astype(np.int32)
+    return np.ascontiguousarray(values.reshape(keys, channels, num).transpose(0, 2, 1))

@@ -2,14 +2,14 @@
 
 The player is in ``player/``: the page, its style sheet, two shaders, and two scripts, one of which sorts in a worker.
 The data are in the page as elements ``<script type="application/gzip;base64">`` next to a JSON object with their
-shapes; browsers do not run scripts of this type.
+shapes and steps; browsers do not run scripts of this type. The player restores the values and packs them for the GPU.
 """
 
 import base64
-import gzip
 import html
 import json
 import re
+import zlib
 from collections.abc import Mapping
 from dataclasses import fields
 from importlib import resources
@@ -20,12 +20,13 @@ from warpgs.files import write_bytes
 from warpgs.progress import progress
 from warpgs.video.camera_paths import evenly_spaced
 
-from .baking import Baked, Bounds, Branch, bake, baked_bytes
+from .baking import PARTS, Baked, Branch, bake, texture_bytes
+from .cosines import Levels
 from .job import Job, Writer
 from .packing import to_planes
 from .start_camera import StartView, start_view
 
-VERSION = 1
+VERSION = 2
 KEYS, SECONDS, MAX_MEGABYTES = 30, 5.0, 256.0
 """Defaults of the options."""
 
@@ -35,7 +36,9 @@ MAX_KEYS = 256
 MAX_GAUSSIANS = 1 << 22
 """Maximum number of Gaussians per branch: texels of a 2048 × 2048 texture, which every browser with WebGL2 supports."""
 
-ARRAYS = ("geometry", "colors", "rest")
+DIFFERENCES = "means"
+"""The part whose lowest coefficients are stored as differences: neighbours along the Morton curve are close."""
+
 PLACEHOLDER = re.compile(r"\[\[([a-z.]+)\]\]")
 """Marks where the player's page includes another of its files, the title or the scene."""
 
@@ -57,10 +60,10 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -
         "branches": {name: _metadata(branch) for name, branch in branches.items()},
     }
     blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
-    parts = [(name, array) for name in branches for array in ARRAYS]
-    for name, array in progress(parts, "compressing", quiet):
-        packed = gzip.compress(to_planes(getattr(branches[name], array)).tobytes(), 6, mtime=0)
-        blocks.append(_block("application/gzip;base64", f"{name}-{array}", base64.b64encode(packed).decode()))
+    parts = [(name, part) for name in branches for part in PARTS]
+    for name, part in progress(parts, "compressing", quiet):
+        content = base64.b64encode(_packed(part, getattr(branches[name], part))).decode()
+        blocks.append(_block("application/gzip;base64", f"{name}-{part}", content))
     return write_bytes(path, [_player(start.title, "\n".join(blocks)).encode()])
 
 
@@ -98,8 +101,17 @@ def _block(mime_type: str, name: str, content: str) -> str:
 
 
 def _metadata(branch: Branch) -> dict[str, Any]:
-    shapes = {array: getattr(branch, array).shape for array in ARRAYS}
-    return {"shapes": shapes, **{f.name: getattr(branch.bounds, f.name).tolist() for f in fields(Bounds)}}
+    parts: dict[str, Levels] = {name: getattr(branch, name) for name in PARTS}
+    return {name: {"shape": part.levels.shape, "steps": part.steps.tolist()} for name, part in parts.items()}
+
+
+def _packed(name: str, part: Levels) -> bytes:
+    """A part as gzip; run lengths alone compress planes that are mostly zero better than repeated strings do."""
+    levels = part.levels.copy()
+    if name == DIFFERENCES:
+        levels[0, 1:] -= part.levels[0, :-1]
+    compressor = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS, strategy=zlib.Z_RLE)
+    return compressor.compress(to_planes(levels).tobytes()) + compressor.flush()
 
 
 def _check_memory(job: Job, keys: int) -> None:
@@ -107,7 +119,7 @@ def _check_memory(job: Job, keys: int) -> None:
     cloud = job.clouds.at(0.0)
     num_static, num_dynamic = int((~cloud.is_dynamic).sum()), int(cloud.is_dynamic.sum())
     check_size({"static": num_static, "dynamic": num_dynamic}, keys)
-    size = baked_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1)
+    size = texture_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1)
     maximum = job.options.max_megabytes or MAX_MEGABYTES
     if size > maximum * 1e6:
         fitting = int(len(cloud) * maximum * 1e6 / size)
@@ -122,11 +134,12 @@ def _write(job: Job) -> str:
     keys = options.keys or KEYS
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
-    baked = bake(job.clouds.at, progress(evenly_spaced(keys), "baking", options.quiet))
+    times = progress(evenly_spaced(keys), "baking", options.quiet)
+    baked = bake(job.clouds.at, times, options.precision or 1.0)
     size = write_page(path, baked, start, options.quiet)
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
     return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.capture_note}"
 
 
-PAGE = Writer(_write, ("keys", "seconds", "max_megabytes"))
+PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"))
 """The format "html"."""

@@ -12,39 +12,96 @@ function fail(text) {
 
 // Data ---------------------------------------------------------------------------------------------------------------
 
-async function unpacked(name, array, TypedArray) {
-  const text = atob(element(`${name}-${array}`).textContent), packed = new Uint8Array(text.length);
+async function unpacked(name, part) {
+  // Values as [key][channel][Gaussian], from quantised cosine coefficients.
+  const block = element(`${name}-${part}`), text = atob(block.textContent), packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
-  element(`${name}-${array}`).remove();
+  block.remove();
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
-  const size = TypedArray.BYTES_PER_ELEMENT, count = planes.length / size, values = new TypedArray(count);
-  for (let p = 0; p < size; p++) for (let i = 0; i < count; i++) values[i] |= planes[p * count + i] << (8 * p);
-  const shape = SCENE.branches[name].shapes[array], frame = shape[1] * shape[2];
-  for (let i = frame; i < count; i++) values[i] += values[i - frame]; // wraps around
+  const {shape: [keys, num, channels], steps} = SCENE.branches[name][part], frame = num * channels, count = keys * frame;
+  const levels = new Uint32Array(count); // the lowest bit is the sign
+  for (let p = 0; p * count < planes.length; p++) for (let i = 0; i < count; i++) levels[i] |= planes[p * count + i] << (8 * p);
+  const values = new Float32Array(count);
+  for (let key = 0; key < keys; key++) {
+    const weights = Array.from({length: keys}, (_, t) =>
+      key ? Math.sqrt(2 / keys) * Math.cos(Math.PI * (t + 0.5) * key / keys) : Math.sqrt(1 / keys));
+    for (let c = 0; c < channels; c++) for (let i = 0, sum = 0; i < num; i++) {
+      const bits = levels[(key * channels + c) * num + i], level = (bits >>> 1) ^ -(bits & 1);
+      sum = part === 'means' && !key ? sum + level : level; // differences along the curve
+      if (sum) for (let t = 0; t < keys; t++) values[t * frame + c * num + i] += weights[t] * sum * steps[c];
+    }
+  }
   return values;
 }
 
-function meansOf(geometry, {shapes, means}) {
+function boundsOf(values) {
+  let low = Infinity, high = -Infinity;
+  for (const value of values) { low = Math.min(low, value); high = Math.max(high, value); }
+  return low < high ? [low, high] : [Number.isFinite(low) ? low : 0, (Number.isFinite(low) ? low : 0) + 1];
+}
+
+const quantised = (value, [low, high], steps) => Math.min(steps, Math.max(0, Math.round((value - low) / (high - low) * steps)));
+
+function toColors(values, num) {
+  // From luma and chroma to red, green and blue, in place.
+  for (let plane = 0; plane < values.length; plane += 3 * num) for (let i = plane; i < plane + num; i++) {
+    const y = values[i], co = values[i + num], cg = values[i + 2 * num];
+    values[i] = y - cg + co;
+    values[i + num] = y + cg;
+    values[i + 2 * num] = y - cg - co;
+  }
+}
+
+const ROTATIONS = [-Math.SQRT1_2, Math.SQRT1_2]; // of what is not the largest
+function packedRotation(q) {
+  // As in compressed PLY: the index of the largest of w, x, y and z, then the others with 10 bits each.
+  let largest = 0;
+  for (let k = 1; k < 4; k++) if (Math.abs(q[k]) > Math.abs(q[largest])) largest = k;
+  const scale = (q[largest] < 0 ? -1 : 1) / (Math.hypot(q[0], q[1], q[2], q[3]) || 1);
+  let word = largest;
+  for (let k = 0; k < 4; k++) if (k !== largest) word = word << 10 | quantised(q[k] * scale, ROTATIONS, 1023);
+  return word;
+}
+
+function geometryOf({means, rotations, log_scales: scales}, [keys, num]) {
+  // Four words per Gaussian: 21 bits per axis of the mean over its bounds, the rotation, and 10 bits per log-scale.
+  const words = new Uint32Array(4 * keys * num), implied = rotations.length < 4 * keys * num, q = [0, 0, 0, 0];
+  const ranges = [0, 1, 2].map((axis) => boundsOf(axisOf(means, num, axis))), sizes = boundsOf(scales);
+  for (let key = 0, out = 0; key < keys; key++) for (let i = 0; i < num; i++, out += 4) {
+    const at = 3 * key * num + i; // of the first of three channels
+    const y = quantised(means[at + num], ranges[1], 2097151);
+    words[out] = quantised(means[at], ranges[0], 2097151) << 11 | y >>> 10;
+    words[out + 1] = (y & 1023) << 21 | quantised(means[at + 2 * num], ranges[2], 2097151);
+    for (let k = implied ? 1 : 0; k < 4; k++) q[k] = rotations[implied ? at + (k - 1) * num : (4 * key + k) * num + i];
+    if (implied) q[0] = Math.sqrt(Math.max(0, 1 - q[1] ** 2 - q[2] ** 2 - q[3] ** 2));
+    words[out + 2] = packedRotation(q);
+    for (let k = 0; k < 3; k++) words[out + 3] = words[out + 3] << 10 | quantised(scales[at + k * num], sizes, 1023);
+  }
+  return {words, ranges, sizes};
+}
+
+function axisOf(values, num, axis) {
+  const out = new Float32Array(values.length / 3);
+  for (let k = 0; k * num < out.length; k++) out.set(values.subarray((3 * k + axis) * num, (3 * k + axis + 1) * num), k * num);
+  return out;
+}
+
+function meansOf(means, [keys, num]) {
   // One Float32Array per key time, for the sorter.
-  const [keys, count] = shapes.geometry, [low, high] = means, step = low.map((v, k) => (high[k] - v) / 2097151);
   return Array.from({length: keys}, (_, key) => {
-    const out = new Float32Array(3 * count);
-    for (let i = 0, w = key * count * 4; i < count; i++, w += 4) {
-      const a = geometry[w], b = geometry[w + 1];
-      out[3 * i] = low[0] + (a >>> 11) * step[0];
-      out[3 * i + 1] = low[1] + (((a & 2047) << 10) | (b >>> 21)) * step[1];
-      out[3 * i + 2] = low[2] + (b & 2097151) * step[2];
-    }
+    const out = new Float32Array(3 * num);
+    for (let i = 0; i < num; i++) for (let c = 0; c < 3; c++) out[3 * i + c] = means[(3 * key + c) * num + i];
     return out;
   });
 }
 
-function layersOfRest(rest, [count, bases]) {
-  // Texels (R, G, B, unused), one layer per coefficient.
-  const out = new Uint8Array(bases * count * 4);
-  for (let i = 0; i < count; i++) for (let k = 0; k < bases; k++) for (let c = 0; c < 3; c++) {
-    out[(k * count + i) * 4 + c] = rest[(i * bases + k) * 3 + c];
+function texelsOf(values, num, bounds, opacities = null) {
+  // Texels (R, G, B, opacity), one layer per key time or coefficient.
+  const layers = values.length / (3 * num) || 0, out = new Uint8Array(layers * num * 4);
+  for (let k = 0; k < layers; k++) for (let i = 0; i < num; i++) {
+    for (let c = 0; c < 3; c++) out[(k * num + i) * 4 + c] = quantised(values[(3 * k + c) * num + i], bounds, 255);
+    if (opacities) out[(k * num + i) * 4 + 3] = quantised(opacities[k * num + i], [0, 1], 255);
   }
   return out;
 }
@@ -95,19 +152,21 @@ function texture(unit, name, values, count, layers, isInteger) {
 async function upload() {
   const means = [];
   for (const [branch, name] of NAMES.entries()) {
-    const metadata = BRANCHES[branch], {shapes} = metadata, count = shapes.geometry[1];
-    const geometry = await unpacked(name, 'geometry', Uint32Array);
-    means.push(meansOf(geometry, metadata));
-    texture(branch, `${name}Geometry`, geometry, count, shapes.geometry[0], true);
-    texture(2 + branch, `${name}Colors`, await unpacked(name, 'colors', Uint8Array), count, shapes.colors[0], false);
-    const rest = layersOfRest(await unpacked(name, 'rest', Uint8Array), shapes.rest);
-    texture(4 + branch, `${name}Rest`, rest, count, shapes.rest[1], false);
-    gl.uniform3fv(uniform(`lowest[${branch}]`), metadata.means[0]);
-    gl.uniform3fv(uniform(`span[${branch}]`), metadata.means[1].map((v, k) => v - metadata.means[0][k]));
-    gl.uniform2fv(uniform(`sizes[${branch}]`), metadata.log_scales);
-    gl.uniform2fv(uniform(`colors[${branch}]`), metadata.colors);
-    gl.uniform2fv(uniform(`rests[${branch}]`), metadata.rest);
-    gl.uniform1i(uniform(`restBases[${branch}]`), shapes.rest[1]);
+    const {means: {shape}, colors: {shape: [colorKeys]}, rest: {shape: [, , channels]}} = BRANCHES[branch], num = shape[1];
+    const parts = {};
+    for (const part of Object.keys(BRANCHES[branch])) parts[part] = await unpacked(name, part);
+    for (const part of ['colors', 'rest']) toColors(parts[part], num);
+    const {words, ranges, sizes} = geometryOf(parts, shape), colors = boundsOf(parts.colors), rests = boundsOf(parts.rest);
+    means.push(meansOf(parts.means, shape));
+    texture(branch, `${name}Geometry`, words, num, shape[0], true);
+    texture(2 + branch, `${name}Colors`, texelsOf(parts.colors, num, colors, parts.opacities), num, colorKeys, false);
+    texture(4 + branch, `${name}Rest`, texelsOf(parts.rest, num, rests), num, channels / 3, false);
+    gl.uniform3fv(uniform(`lowest[${branch}]`), ranges.map((range) => range[0]));
+    gl.uniform3fv(uniform(`span[${branch}]`), ranges.map((range) => range[1] - range[0]));
+    gl.uniform2fv(uniform(`sizes[${branch}]`), sizes);
+    gl.uniform2fv(uniform(`colors[${branch}]`), colors);
+    gl.uniform2fv(uniform(`rests[${branch}]`), rests);
+    gl.uniform1i(uniform(`restBases[${branch}]`), channels / 3);
   }
   gl.uniform1i(uniform('lastKey'), lastKey);
   gl.uniform1i(uniform('compensate'), START.antialias);
