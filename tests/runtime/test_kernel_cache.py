@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
 from warpgs.runtime import kernel_cache
@@ -128,3 +129,30 @@ def test_without_a_writable_home_kernels_are_cached_in_a_temporary_folder(tmp_pa
     assert "set WARP_CACHE_PATH to a folder that can be written" in lines[0]
     assert done.stdout.startswith(str(tmp_path / "warpgs-kernels-"))
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]  # removed at the end
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="about machines without a GPU")
+def test_nothing_is_printed_where_there_is_no_cuda_driver():
+    done = subprocess.run([sys.executable, "-c", "import warpgs.runtime.launch"], capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
+
+
+FAILING_START = """
+import sys
+import warp
+from warpgs.runtime import kernel_cache
+
+def init():
+    sys.stderr.write("before\\n" + kernel_cache.NO_DRIVER.decode() + " GPU execution …\\nafter\\n")
+    raise RuntimeError("no start")
+
+warp.init = init
+kernel_cache.init_warp()
+"""
+
+
+def test_other_messages_of_a_start_are_kept():
+    done = subprocess.run([sys.executable, "-c", FAILING_START], capture_output=True, text=True, check=False)
+    lines = done.stderr.splitlines()
+    assert lines[:2] == ["before", "after"]
+    assert lines[-1] == "RuntimeError: no start"

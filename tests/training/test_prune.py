@@ -1,6 +1,7 @@
 """Pruning by visibility (paper Eq. 15), and of the Gaussians that contribute least."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from tests.scenes import error, make_camera, make_splats
 from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.prune import Pruned, blend_weights, prune_invisible, prune_weakest, visibility
 from warpgs.training.schedule import Phase
@@ -231,3 +233,14 @@ def test_if_no_gaussian_contributes_all_stay():
     scene, optimizer = make_scene_and_optimizer(random_gaussians())
     assert prune_weakest(scene, optimizer, torch.zeros(60), 0.02) == 0
     assert len(scene.static) == 60
+
+
+@pytest.mark.parametrize(("removed", "lines"), [(Pruned(0, 0, 0), 0), (Pruned(1, 0, 0), 1)])
+def test_only_a_pruning_that_removes_something_is_logged(tmp_path, monkeypatch, removed, lines):
+    trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", tiny.CONFIG)
+    monkeypatch.setattr("warpgs.training.trainer.prune_invisible", lambda *_: removed)
+    nothing = dict.fromkeys(("densify", "complete_masks", "prune_weakest", "reseed", "reset", "realign"), False)
+    plan = dataclasses.replace(trainer.protocol.at(0), prune=True, **nothing)
+    logger = Mock(spec=TrainingLogger)
+    trainer._adapt(plan, logger)
+    assert logger.log.call_count == lines

@@ -12,6 +12,7 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import warp as wp
@@ -25,17 +26,49 @@ MAX_SEAL, MAX_BYTES = 1 << 16, 1 << 28
 """Maximum size of this file and of a compiled module [bytes]; modules have less than a MiB."""
 
 
+STDERR = 2
+"""File descriptor of standard error, to which native libraries print."""
+
+NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver."
+
+
 def init_warp() -> None:
     """Initializes Warp, with its kernel cache in a temporary folder if the usual one cannot be written."""
     wp.config.log_level = wp.LOG_WARNING
-    try:
-        wp.init()
-    except OSError as error:
-        _use_temporary_folder(error)
-        wp.init()
+    with _without_driver_warning():
+        try:
+            wp.init()
+        except OSError as error:
+            _use_temporary_folder(error)
+            wp.init()
     folder = Path(wp.config.kernel_cache_dir)
     if not os.access(folder, os.W_OK) and not any(folder.iterdir()):  # a filled one may be part of an image
         _use_temporary_folder(f"{folder} cannot be written")
+
+
+@contextlib.contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Drops what Warp's library says about a missing CUDA driver: a machine without a GPU needs none.
+
+    Whoever asks for CUDA there is told so by ``choose_device``. Everything else on standard error is passed on.
+    """
+    sys.stderr.flush()
+    try:
+        stderr = os.dup(STDERR)
+    except OSError:  # closed: nothing is printed
+        yield
+        return
+    with tempfile.TemporaryFile() as printed:
+        os.dup2(printed.fileno(), STDERR)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(stderr, STDERR)
+            os.close(stderr)
+            printed.seek(0)
+            others = [line for line in printed if not line.startswith(NO_DRIVER)]
+            os.write(STDERR, b"".join(others))
 
 
 def _use_temporary_folder(reason: object) -> None:

@@ -176,11 +176,10 @@ class Trainer:
         if plan.densify:
             self._densify(plan.remove_large)
         if plan.prune:
-            threshold = self.config.densify.visibility
-            removed = prune_invisible(
-                scene, self.step.optimizer, self.views.cameras(), sh_degree, threshold, self.config.antialias
-            )
-            logger.log(f"iteration {self.iteration + 1}: {removed}")
+            cameras, threshold = self.views.cameras(), self.config.densify.visibility
+            options = (sh_degree, threshold, self.config.antialias)
+            if any(removed := prune_invisible(scene, self.step.optimizer, cameras, *options)):
+                logger.log(f"iteration {self.iteration + 1}: {removed}")
         if plan.complete_masks and (completed := complete_masks(scene, self.views, plan.phase, self.config)):
             logger.log(f"iteration {self.iteration + 1}: {completed}")
         if plan.reseed:
