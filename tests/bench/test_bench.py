@@ -11,12 +11,14 @@ from warpgs.bench import measure
 from warpgs.bench.command import Bench
 from warpgs.bench.measure import STAGES, time_in_turn
 from warpgs.bench.run_bench import bench
-from warpgs.bench.scenes import SCENES, Scene, random_splats
-from warpgs.bench.training import measure_steps, random_scene
+from warpgs.bench.scenes import SCENES, Scene, in_disc, random_splats
+from warpgs.bench.training import measure_steps, plain_phase, random_scene
 from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.cli import main
 from warpgs.config import RenderSettings
+from warpgs.presets import PRESETS
 from warpgs.runs.run import Run
+from warpgs.training.schedule import Protocol
 
 TINY = Scene("tiny", 48, 32, 100, 3.0)
 REPEATS = 2
@@ -183,11 +185,25 @@ def test_steps_of_both_stages_are_measured():
     assert (measured["gaussians"], measured["width"], measured["height"]) == (300, 48, 32)
     assert measured["stage1_ms"] > 0
     assert measured["stage2_ms"] > 0
+    assert measured["3dgs_ms"] > 0
+
+
+def test_a_plain_step_has_neither_networks_nor_depth():
+    protocol = Protocol(PRESETS["paper"], has_depth=True)
+    phase = protocol.phase_at(protocol.stage2.start)
+    assert phase.use_deformation
+    assert phase.use_appearance
+    assert phase.with_depth
+    plain = plain_phase(phase)
+    assert not (plain.use_deformation)
+    assert not (plain.use_appearance)
+    assert not (plain.with_depth)
+    assert plain.with_joint
 
 
 def test_the_scene_for_step_times_has_both_branches_and_the_networks_of_the_paper():
     splats, camera = random_splats(1000, 64, 48, 3.0, 0)
-    scene = random_scene(splats, camera)
+    scene = random_scene(splats, in_disc(splats.means, camera))
     assert 100 < len(scene.dynamic) < 300
     assert len(scene.static) + len(scene.dynamic) == 1000
     assert len(scene.deformation.trunk.sizes) == 9

@@ -50,6 +50,7 @@ NAMES = {
     "relative_gradients": "of gradients, relative:",
     "stage1_ms": "step of stage I [ms]",
     "stage2_ms": "step of stage II [ms]",
+    "3dgs_ms": "step of 3DGS [ms]",
     "frames_per_second": "frames per second",
 }
 """Names of keys in JSON; others are shown as they are, without underscores."""

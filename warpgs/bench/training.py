@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
@@ -19,7 +21,7 @@ from warpgs.presets import PRESETS
 from warpgs.runs.run import Run
 from warpgs.runtime.graphs import WARM_UPS
 from warpgs.training.point_cloud import scene_box
-from warpgs.training.schedule import IterationPlan, Protocol
+from warpgs.training.schedule import IterationPlan, Phase, Protocol
 from warpgs.training.step import Sample, Step
 from warpgs.training.views import Views
 
@@ -33,7 +35,7 @@ STEPS = {
         *((num, MIN_SIZE) for num in (50_000, 100_000, 133_000, 200_000, 400_000, 800_000, 1_600_000)),
         *((100_000, size) for size in ((960, 540), (1920, 1080), (3840, 2160))),
     ],
-    "cpu": [(num, (240, 136)) for num in (5_000, 10_000)],
+    "cpu": [*((num, (240, 136)) for num in (5_000, 10_000)), (5_000, MIN_SIZE)],
 }
 """Numbers of Gaussians and image sizes to measure; Deformable-3DGS ends with 133,000 on a capture of this size."""
 
@@ -61,11 +63,10 @@ def random_capture(splats: Splats, camera: Camera) -> Capture:
     return Capture("noise", cameras, list(cameras), [], splats.means, None, read)
 
 
-def random_scene(splats: Splats, camera: Camera) -> SplitScene:
-    """The Gaussians before activation, dynamic within a disc in the image center, with the networks of the paper."""
+def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"]) -> SplitScene:
+    """The Gaussians before activation, with the networks of the paper."""
     config = PRESETS["paper"].model
     assert splats.colors is not None
-    dynamic = in_disc(splats.means, camera)
     parts = []
     for part in (~dynamic, dynamic):
         parts.append(
@@ -89,13 +90,18 @@ def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
 
 
 def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int) -> dict[str, Any]:
-    """Median time [ms] of a step of stage I and of stage II, and on CUDA the maximum memory of tensors [MB]."""
+    """Median time [ms] of a step of stage I, of stage II and of 3DGS, and on CUDA the maximum memory of tensors [MB].
+
+    That of 3DGS has no networks, no depth and no dynamic Gaussians, and compares the joint image alone; the static and
+    the dynamic image are rendered, too.
+    """
     splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / MIN_SIZE[0], SEED)
     config = dataclasses.replace(PRESETS["paper"], device="cuda" if device == "cuda" else "cpu")
     capture = random_capture(splats, camera)
     views = Views(capture, torch.device(device), config.resident_bytes)
     alignments = torch.tensor([[1.0, 0.0]], device=device).repeat(NUM_VIEWS, 1)
-    scene = random_scene(splats, camera).to(device)
+    dynamic = in_disc(splats.means, camera)
+    scene = random_scene(splats, dynamic).to(device)
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
     protocol = Protocol(config, has_depth=True)
@@ -104,9 +110,20 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
         step = Step(config, scene, views, alignments, torch.ones(NUM_VIEWS, device=device), capture.extent)
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
+    scene = random_scene(splats, torch.zeros_like(dynamic)).to(device)
+    loss = dataclasses.replace(config.loss, branches_in_stage2="no")
+    plain_config = dataclasses.replace(config, static_geometry=True, loss=loss)
+    step = Step(plain_config, scene, views, alignments, torch.ones(NUM_VIEWS, device=device), capture.extent)
+    plain = dataclasses.replace(plan, phase=plain_phase(plan.phase))
+    result["3dgs_ms"] = statistics.median(_times(step, plain, device, repeats))
     if device == "cuda":
         result["peak_memory_mb"] = torch.cuda.max_memory_allocated() // 10**6
     return result
+
+
+def plain_phase(phase: Phase) -> Phase:
+    """A phase of stage II without networks and depth, in which the joint image alone is compared: a step of 3DGS."""
+    return dataclasses.replace(phase, use_deformation=False, use_appearance=False, with_depth=False)
 
 
 def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterable[float]:
