@@ -41,8 +41,13 @@ def test_psnr_averages_squares_over_pixels_and_channels_before_the_logarithm(pai
     assert metrics.psnr(image, truth) == pytest.approx(-10 * math.log10(math.fsum(errors) / len(errors)), abs=1e-4)
 
 
-def test_psnr_of_equal_images_is_infinite(pair):
-    assert metrics.psnr(pair[1], pair[1]) == math.inf
+def test_psnr_is_at_most_that_of_rounding_the_truth_to_8_bits(pair):
+    levels = (torch.arange(10_000) / 9_999).double()
+    rounding = (levels - (255.0 * levels).round() / 255.0).square().mean()
+    limit = -10.0 * math.log10(rounding)
+    assert metrics.psnr(pair[1], pair[1]) == pytest.approx(limit, abs=0.05)
+    assert metrics.psnr(gray(1e-5), gray(0.0)) == metrics.psnr(pair[1], pair[1])
+    assert metrics.psnr(gray(2e-3), gray(0.0)) < metrics.psnr(pair[1], pair[1]) - 1.0
 
 
 def test_psnr_within_a_region_is_that_of_its_pixels_alone(pair, region):

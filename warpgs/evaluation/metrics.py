@@ -15,6 +15,10 @@ WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 """The constants of SSIM for values in [0, 1]."""
 
+MIN_SQUARED_ERROR = 1.0 / (12.0 * 255.0**2)
+"""Variance of the rounding error of a ground truth of 8 bits: smaller errors cannot be measured with it. So PSNR is at
+most 58.9 dB, also where an image has no error at all, as white does in front of a white background."""
+
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the scales of MS-SSIM (Wang et al. 2003), from the finest on."""
 
@@ -25,15 +29,15 @@ MIN_MS_SSIM_SIDE = (WINDOW - 1) * 2 ** (len(SCALE_WEIGHTS) - 1) + 1
 def psnr(
     image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], region: Bool[Tensor, "H W"] | None = None
 ) -> float:
-    """−10 log₁₀ of the mean squared error of images in [0, 1], within a region [dB].
+    """−10 log₁₀ of the mean squared error of images in [0, 1], within a region [dB]; at most 58.9 (see above).
 
-    NaN if the region is empty, infinite if the images are equal there.
+    NaN if the region is empty.
     """
     error = (image - truth).square().mean(-1)
     if region is not None:
         error = error[region]
     mean = error.double().mean().item()
-    return math.inf if mean == 0.0 else -10.0 * math.log10(mean)
+    return -10.0 * math.log10(max(mean, MIN_SQUARED_ERROR))
 
 
 def ssim(

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
@@ -182,6 +183,6 @@ class Step:
     @torch.no_grad()
     def _add_to_sums(self, terms: dict[str, Tensor], rendering: Rendering, view: View) -> None:
         """Adds the terms and the PSNR to the sums since the last check, without waiting for the device."""
-        error = mse_loss(rendering.joint.image.clamp(0, 1), view.image)
+        error = mse_loss(rendering.joint.image.clamp(0, 1), view.image).clamp_min(MIN_SQUARED_ERROR)
         values = [terms.get(name, self._zero) for name in TERMS]
         self._sums.addcmul_(torch.stack([*values, error.log10(), self._one]), self._inputs.scales)
