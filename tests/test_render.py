@@ -325,6 +325,23 @@ def test_an_empty_scene_is_background(settings):
     assert torch.equal(behind.grad, torch.full((3,), float(images * WIDTH * HEIGHT)))
 
 
+def test_the_background_of_splats_is_that_of_their_renders():
+    splats = make_splats()
+    held = dataclasses.replace(splats, background=background())
+    for settings in (RenderSettings(), EVERYTHING):
+        expected = render(splats, CAMERA, background(), settings).joint.image
+        assert torch.equal(render(held, CAMERA, settings=settings).joint.image, expected)
+        other = torch.zeros(3)
+        assert torch.equal(render(held, CAMERA, other, settings).joint.image, render(splats, CAMERA, other).joint.image)
+
+
+def test_the_background_of_splats_is_that_of_three_channels_alone():
+    splats = dataclasses.replace(make_splats(), background=background())
+    weights = dataclasses.replace(splats, colors=torch.ones(60, 1), sh=None, sh_degree=None)
+    rendering = render(weights, CAMERA)
+    assert torch.allclose(rendering.joint.image[..., 0], rendering.joint.alpha)
+
+
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_splats_of_one_branch_leave_the_other_image_background(dynamic):
     splats = dataclasses.replace(make_splats(), is_dynamic=torch.full((60,), dynamic))

@@ -84,8 +84,7 @@ class ModelConfig:
     raw_input: bool = True
     """Whether the networks get position and time beside their encodings, as in Deformable-3DGS; not in paper Eq. 6."""
     min_period: float = 0.0
-    """Minimum period of these frequencies, in training frames; higher frequencies are dropped, because they overfit to
-    the training times. 0: none are dropped (paper)."""
+    """Minimum period of these frequencies [training frames]; higher ones overfit and are dropped. 0: none (paper)."""
     depth: Annotated[int, Bounds(min=1, max=64)] = 8
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
@@ -130,8 +129,7 @@ class LossConfig:
     joint: float = 1.0
     """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
     dynamic_background: Literal["black", "random"] = "random"
-    """Background of the dynamic image: black (paper), or a random colour per iteration, so that black Gaussians cannot
-    hide in front of it."""
+    """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
     depth: float = 2.0
     """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14)."""
     depth_dynamic: float = 1.0
@@ -149,8 +147,8 @@ class LossConfig:
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
-    """Half width of the band along the borders of masks in which the dynamic image is not compared, as a fraction of
-    the image's larger side; 0 in the paper. Masks are a few pixels off; the rim inside them would be learned."""
+    """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
+    image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""
     mask_tolerance: Annotated[float, Bounds(max=1)] = 0.0
     """Where `prepare` made the masks, the colour error of a block of pixels of the static image above which the block
     becomes dynamic; 0 trusts the masks (paper)."""
@@ -316,6 +314,8 @@ class TrainConfig:
     """Joint optimization; without it, its iterations are added to stage I."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
+    background: Literal["capture", "black", "white"] = "capture"
+    """Colour behind all Gaussians; that of the capture is white if D-NeRF's images have alpha, else black."""
     static_geometry: bool = False
     """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
     static_appearance: bool = False

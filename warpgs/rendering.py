@@ -110,8 +110,8 @@ def render(
     Args:
         splats: N Gaussians; N may be 0.
         camera: On the device of the splats.
-        background: [C] colour behind everything, black by default; with branches also [3, C], one for each of the
-            joint, the static and the dynamic image.
+        background: [C] colour behind everything; with branches also [3, C], one for each of the joint, the static and
+            the dynamic image. By default that of the splats, which is black if they have none or C is not 3.
         settings: What to compute besides the joint image.
         screen_offsets: [N, 2] offsets of the Gaussians' means on screen in normalised device coordinates (halves of the
             image size), as a rule zeros. The length of their gradient is the densification statistic of 3DGS.
@@ -124,6 +124,8 @@ def render(
             ``RenderSettings.max_intersections``.
     """
     settings = settings or DEFAULTS
+    if background is None and splats.num_channels == 3:
+        background = splats.background
     _check_inputs(splats, camera, background, settings, screen_offsets)
     inputs = _inputs(splats, camera, background, settings, screen_offsets)
     outputs = differentiable(partial(_forward, _request(splats, camera, settings)), *inputs)

@@ -13,6 +13,7 @@ from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json, write_png
 from warpgs.config import MaskPerturbation
 from warpgs.data.colmap import lens_of
+from warpgs.data.images import has_alpha
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.loaders.posed import plain_names, times_of_names
@@ -97,7 +98,7 @@ def test_images_are_those_of_their_cameras(written, layout):
 def test_static_masks_are_false_where_something_moves(written, layout):
     frame = load_capture(written[layout]).frame("train_r_000" if layout == "blender" else load_first(written[layout]))
     if layout == "blender":
-        assert not frame.static_mask.any()
+        assert np.array_equal(frame.static_mask.numpy(), ~layouts.static_mask(0))  # the masks are its alpha
     elif layout == "megasam":
         assert frame.static_mask is None
     else:
@@ -151,6 +152,53 @@ def test_dnerf_is_evaluated_on_its_test_frames_at_the_times_of_the_file(written)
     assert capture.cameras["test_r_002"].time == 5 / layouts.COUNT
     assert capture.assumption == capture.assuming("masks").assumption == "dynamic"
     assert capture.assuming("static").assumption == "static"
+
+
+def test_dnerf_is_empty_where_it_is_transparent_and_white_there(written):
+    capture = load_capture(written["blender"])
+    assert capture.background == "white"
+    frame = capture.frame("test_r_002")
+    assert np.array_equal(frame.empty.numpy(), ~layouts.static_mask(5))
+    assert (frame.image[frame.empty] == 255).all()
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_a_reduced_pixel_is_empty_if_all_of_it_is(written, factor):
+    width, height = (side // factor for side in layouts.SIZE)
+    parts = layouts.static_mask(5).reshape(height, factor, width, factor)
+    frame = load_capture(written["blender"], factor=factor).frame("test_r_002")
+    assert np.array_equal(frame.empty.numpy(), ~parts.any((1, 3)))
+
+
+def test_images_without_alpha_have_a_black_background_and_no_empty_pixels(edited):
+    root = edited("blender")
+    for path in root.rglob("*.png"):
+        write_png(path, layouts.image(0))
+    capture = load_capture(root)
+    assert capture.background == "black"
+    assert capture.frame("train_r_000").empty is None
+    assert not capture.frame("train_r_000").static_mask.any()
+
+
+def test_over_another_colour_nothing_is_known_to_be_empty(written):
+    capture = load_capture(written["blender"])
+    other = capture.over("black")
+    assert (capture.background, other.background) == ("white", "black")
+    assert other.frame("train_r_000").empty is None
+    assert not other.frame("train_r_000").static_mask.any()
+    assert torch.equal(other.frame("train_r_000").image, capture.frame("train_r_000").image)
+    assert capture.over("white").frame("train_r_000").empty.any()
+
+
+def test_alpha_is_found_in_the_header_alone(written, tmp_path):
+    path = written["blender"] / "train/r_000.png"
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(path.read_bytes()[:30])
+    assert has_alpha(cut)
+    write_png(cut, layouts.image(0))
+    assert not has_alpha(cut)
+    with pytest.raises(ValueError, match=r"nothing\.png is missing"):
+        has_alpha(tmp_path / "nothing.png")
 
 
 def test_dnerf_with_masks_is_split_by_them(edited):

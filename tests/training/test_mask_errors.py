@@ -95,6 +95,18 @@ def test_a_view_that_is_not_learned_yet_is_left_as_it_is(trainer):
     assert complete(trainer) == ""
 
 
+def test_the_static_image_is_compared_over_the_background_of_the_capture(trainer):
+    stored = trainer.views._all
+    stored.image[:] = 0
+    stored.image[2, 4:7, 5:9] = 255  # wrong where little is over black, and too much over white
+    with torch.no_grad():
+        trainer.scene.static.logit_opacities.fill_(-20.0)
+    trainer.views.background = "white"
+    assert complete(trainer) == ""
+    trainer.views.background = "black"
+    assert complete(trainer) != ""
+
+
 def test_what_the_mask_calls_dynamic_is_not_compared(trainer):
     stored = trainer.views._all
     stored.static_mask[2, 4:7, 5:9] = False

@@ -30,6 +30,7 @@ def make_inputs():
 def send(inputs, **changes):
     values = {
         "time_noise": 0.5,
+        "background": [0.7, 0.8, 0.9],
         "dynamic_background": [0.1, 0.2, 0.3],
         "scales": {"psnr": -10.0, "static": 2.0},
         "learning_rates": {"networks": 4.0, "means": 3.0},
@@ -41,7 +42,7 @@ def test_inputs_reach_the_tensors_of_their_names():
     inputs = make_inputs()
     send(inputs)
     assert inputs.time_noise.tolist() == [0.5]
-    assert torch.equal(inputs.backgrounds, torch.tensor([[0.0] * 3, [0.0] * 3, [0.1, 0.2, 0.3]]))
+    assert torch.equal(inputs.backgrounds, torch.tensor([[0.7, 0.8, 0.9], [0.7, 0.8, 0.9], [0.1, 0.2, 0.3]]))
     assert {name: value.item() for name, value in inputs.scale.items()} == {"static": 2.0, "psnr": -10.0}
     assert inputs.scales.tolist() == [2.0, -10.0]
     assert {name: value.item() for name, value in inputs.learning_rates.items()} == {"means": 3.0, "networks": 4.0}

@@ -5,7 +5,7 @@ from typing import Any
 
 PREFIX = "builtin:"
 
-NAMES = ("builtin:room", "builtin:studio", "builtin:studio?depth=exact", "…=network", "…=none")
+NAMES = ("builtin:room", "builtin:balls", "builtin:studio", "builtin:studio?depth=exact", "…=network", "…=none")
 DEPTHS = ("exact", "network", "none")
 
 
@@ -31,6 +31,10 @@ def builtin_folder(data: Path | str, quiet: bool = False) -> Path:
         from .synthetic import builtin_capture  # imports torch
 
         return builtin_capture(quiet=quiet)
+    if name == "balls" and not query:
+        from .balls import balls_capture
+
+        return balls_capture(quiet=quiet)
     if name == "studio" and depth in DEPTHS and query in ("", f"depth={depth}"):
         from .studio import studio_capture
 

@@ -25,6 +25,9 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 Assumption = Literal["masks", "static", "dynamic"]
 """What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
+Background = Literal["black", "white"]
+"""Colour behind all Gaussians."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -38,6 +41,7 @@ class Frame:
         inverse_depth: [H, W] inverse depth up to a scale and an offset per frame, NaN where unknown; None if the frame
             has no depth.
         covisible: [H, W] true where masked metrics are computed (iPhone captures); None if the frame has no such mask.
+        empty: [H, W] true where the image shows the capture's ``background`` alone; None if that is not known.
     """
 
     name: str
@@ -46,6 +50,7 @@ class Frame:
     static_mask: Bool[Tensor, "H W"] | None = None
     inverse_depth: Float[Tensor, "H W"] | None = None
     covisible: Bool[Tensor, "H W"] | None = None
+    empty: Bool[Tensor, "H W"] | None = None
 
 
 @dataclass(frozen=True)
@@ -79,9 +84,11 @@ class Capture:
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
         read_taken: Reads a frame with the distortion of its lens; None if no lens of the capture distorts.
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
+        background: Colour behind everything; black is also that of captures whose images show no background.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
         has_depth: Whether frames have the depth of the files; see ``without_depth``.
+        has_empty: Whether frames may say where they are empty: not over black; see ``over``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
             unit of 3DGS's position learning rate and densification thresholds [scene units].
 
@@ -101,8 +108,10 @@ class Capture:
     metric_depth: bool = False
     estimated_masks: bool = False
     read_taken: Callable[[str], TakenFrame] | None = None
+    background: Background = "black"
     assumption: Assumption = field(init=False)
     has_depth: bool = field(init=False, default=True)
+    has_empty: bool = field(init=False)
     extent: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -110,15 +119,16 @@ class Capture:
             raise ValueError(f"{self.name} has no frames to train on")
         self.train, self.val = tuple(self.train), tuple(self.val)
         self.extent = extent_of([self.cameras[name] for name in self.train])
-        self.assumption = self.unmasked
+        self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()
         self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
 
     def assuming(self, assumption: Assumption) -> "Capture":
         """The same capture with static masks as in the files ("masks"), all true ("static") or all false ("dynamic").
 
-        The captures have one cache of frames. ``assuming("masks")`` restores the masks of the files for evaluation, or
-        ``unmasked`` if that is what the capture says of itself.
+        Under "dynamic", masks are true where frames are known to be empty. ``assuming("masks")`` restores the masks of
+        the files for evaluation, or ``unmasked`` if that is what the capture says of itself. The captures have one
+        cache of frames.
         """
         capture = copy.copy(self)
         capture.assumption = self.unmasked if assumption == "masks" else assumption
@@ -128,6 +138,15 @@ class Capture:
         """The same capture as if its files had no depth; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.has_depth = False
+        return capture
+
+    def over(self, background: Background) -> "Capture":
+        """The same capture with another colour behind everything, over which no pixel is known to be empty.
+
+        The captures have one cache of frames.
+        """
+        capture = copy.copy(self)
+        capture.background, capture.has_empty = background, self.has_empty and background == self.background
         return capture
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> "Capture":
@@ -150,6 +169,9 @@ class Capture:
             frame = replace(frame, camera=self.cameras[name])
         if not self.has_depth:
             frame = replace(frame, inverse_depth=None)
+        if frame.empty is not None and not self.has_empty:
+            frame = replace(frame, empty=None)
         if self.assumption == "masks":
             return frame
-        return replace(frame, static_mask=torch.full(frame.image.shape[:2], self.assumption == "static"))
+        static = torch.full(frame.image.shape[:2], self.assumption == "static")
+        return replace(frame, static_mask=static if frame.empty is None else static | frame.empty)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from warpgs.files import read_array, read_bounded
+from warpgs.files import read_array, read_bounded, read_start
 
 MAX_SIDE = 16_384
 """Maximum side of an image [px]; larger ones are refused before memory is allocated for them."""
@@ -35,6 +35,8 @@ FILL_RADIUS = 3
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _START_OF_SCAN = 0xDA
+_PNG_COLOR_TYPE = 25
+"""Offset of the byte that says whether a PNG image has colours (2), a palette (1) and alpha (4)."""
 
 
 def decode(
@@ -82,6 +84,16 @@ def _decode(path: Path, data: bytes, flags: int) -> Shaped[np.ndarray, "H W ..."
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of a PNG or JPEG file, without decoding it; raises as ``decode``."""
     return _read_checked(path, MAX_PIXELS)[1]
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether a file is a PNG image with an alpha channel; only its header is read.
+
+    Raises:
+        ValueError: If it is missing, not a regular file or cannot be read.
+    """
+    header = read_start(path, _PNG_COLOR_TYPE + 1)
+    return header.startswith(_PNG) and header[_PNG_COLOR_TYPE:] in (b"\x04", b"\x06")
 
 
 def _read_checked(

@@ -13,28 +13,45 @@ from .images import MAX_PIXELS, decode, fill_transparent, is_bright, to_8_bits
 WHITE = 255
 
 
-def read_resized_image(path: Path, size: tuple[int, int], background: int | None = None) -> UInt8[np.ndarray, "H W 3"]:
-    """8-bit RGB image, resized to ``size`` (width, height).
+def read_resized_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """8-bit RGB image, resized to ``size`` (width, height); transparent pixels are inpainted.
 
     Args:
         path: PNG or JPEG file.
         size: Width and height of the result; the file may have any size of about the same shape.
-        background: Level in front of which transparent pixels are composited; None inpaints them.
 
     Raises:
         ValueError: If the file is missing, damaged or of another shape.
     """
+    return resize(_filled(_read(path, size)), size)
+
+
+def read_resized_over_white(
+    path: Path, size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 4"]:
+    """As ``read_resized_image``, but composited over white if the file has alpha.
+
+    Then there is a fourth channel: 0 where a pixel is entirely transparent, and 255 elsewhere.
+    """
+    stored = _read(path, size)
+    if stored.ndim == 2 or stored.shape[2] < 4:
+        return resize(_filled(stored), size)
+    alpha = stored[..., 3:].astype(np.float32) / 255.0
+    blended = stored[..., 2::-1] * alpha + WHITE * (1.0 - alpha)
+    is_empty = resize_mask(stored[..., 3] == 0, size)
+    return np.dstack([resize(blended.round().astype(np.uint8), size), np.where(is_empty, 0, 255).astype(np.uint8)])
+
+
+def _read(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w ..."]:
+    """The stored image with 8 bits per channel, in OpenCV's order, if it has the shape of ``size``."""
     stored = to_8_bits(decode(path))
     check_shape(path, "the image", (stored.shape[1], stored.shape[0]), size)
-    if stored.ndim == 2:
-        image = cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
-    elif stored.shape[2] == 4 and background is not None:
-        alpha = stored[..., 3:].astype(np.float32) / 255.0
-        blended = stored[..., 2::-1] * alpha + background * (1.0 - alpha)
-        image = blended.round().astype(np.uint8)
-    else:
-        image = fill_transparent(stored)
-    return resize(image, size)
+    return stored
+
+
+def _filled(stored: UInt8[np.ndarray, "h w ..."]) -> UInt8[np.ndarray, "h w 3"]:
+    """RGB of a stored image, with transparent pixels inpainted."""
+    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB) if stored.ndim == 2 else fill_transparent(stored)
 
 
 def read_resized_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:

@@ -34,6 +34,7 @@ class StartView:
         track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
         seconds: Duration of the scene [s].
         antialias: Whether opacities compensate for the low-pass filter.
+        background: Colour behind everything, in [0, 1].
     """
 
     title: str
@@ -44,6 +45,7 @@ class StartView:
     track: list[list[list[float]]]
     seconds: float
     antialias: bool
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
@@ -85,6 +87,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         track=[c.viewmat.tolist() for c in track],
         seconds=seconds,
         antialias=config.antialias,
+        background=(1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0),
     )
 
 

@@ -24,6 +24,8 @@ class Splats:
         sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
         sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
+        background: [3] colour behind them, black if None; not used if ``colors`` have another number of channels, which
+            are composited over 0.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -37,6 +39,7 @@ class Splats:
     sh: Float[Tensor, "N bases 3"] | None = None
     is_dynamic: Bool[Tensor, " N"] | None = None
     sh_degree: int | None = None
+    background: Float[Tensor, "3"] | None = None
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -54,11 +57,14 @@ class Splats:
             check_coefficients(sizes, self.sh, self.sh_degree)
         if self.is_dynamic is not None:
             check_tensor("is_dynamic", self.is_dynamic, ("N",), sizes, (torch.bool,))
-        check_same_device({name: getattr(self, name) for name in self.tensor_names()})
+        if self.background is not None:
+            check_tensor("background", self.background, (3,), {})
+        tensors = {name: getattr(self, name) for name in self.tensor_names()}
+        check_same_device({**tensors, "background": self.background})
 
     @staticmethod
     def tensor_names() -> tuple[str, ...]:
-        """Names of the attributes that are tensors."""
+        """Names of the attributes that are tensors of all Gaussians."""
         return ("means", "quats", "scales", "opacities", "colors", "sh", "is_dynamic")
 
     @property
@@ -68,5 +74,6 @@ class Splats:
 
     def to(self, device: torch.device | str) -> "Splats":
         """A copy on another device."""
-        tensors = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
+        names = (*self.tensor_names(), "background")
+        tensors = {n: t.to(device) for n in names if (t := getattr(self, n)) is not None}
         return dataclasses.replace(self, **tensors)

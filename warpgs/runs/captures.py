@@ -10,7 +10,7 @@ from warpgs.data.synthetic import builtin_capture
 
 
 def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
-    """The capture of a config; without one the built-in scene, which is rendered on the first call.
+    """The capture of a config, over its background; without one the built-in scene, rendered on the first call.
 
     Raises:
         ValueError: If a file of the capture is missing or damaged; the message names it.
@@ -21,4 +21,5 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     else:
         root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     factor, vrig_factor = config.factor, config.vrig_factor
-    return load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
+    capture = load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
+    return capture if config.background == "capture" else capture.over(config.background)

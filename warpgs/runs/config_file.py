@@ -50,9 +50,11 @@ def read_config(folder: Path) -> TrainConfig:
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
     """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
 
-    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
-    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no.
+    Before there was ``background``, it was always black. Before there was ``loss.depth_gate``, runs without depth-aware
+    pretraining had no depth loss at all. A preset that is gone is none: the file has all of its values.
+    ``loss.branches_in_stage2`` was a yes or no.
     """
+    values = {"background": "black", **values}
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
     loss = values.get("loss")

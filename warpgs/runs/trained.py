@@ -1,5 +1,6 @@
 """A trained scene: splats at any time, rendered images, and fast playback."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -37,12 +38,16 @@ class TrainedScene:
         scene: Gaussians and networks, on the device to render on.
         config: Config of the run.
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
+
+    Attributes:
+        background: [3] colour behind all Gaussians, on the scene's device; None is black.
     """
 
     def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:
         self.scene, self.config, self.metadata = scene, config, metadata
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
+        self.background = torch.ones(3, device=self.device) if config.background == "white" else None
 
     @property
     def device(self) -> torch.device:
@@ -76,8 +81,12 @@ class TrainedScene:
             time: Time in [0, 1].
             residual: Whether the appearance network changes the static Gaussians (paper Eq. 8).
         """
+        return self._splats(torch.tensor([time], device=self.device), residual)
+
+    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
         flags = self.metadata.use_deformation, self.metadata.use_appearance and residual
-        return self.scene.splats(torch.tensor([time], device=self.device), *flags, self.metadata.sh_degree)
+        splats = self.scene.splats(time, *flags, self.metadata.sh_degree)
+        return replace(splats, background=self.background)
 
     def render(self, camera: Camera, time: float | None = None, branches: bool = False) -> Rendering:
         """Renders the scene through a camera.
@@ -112,6 +121,4 @@ class TrainedScene:
     @torch.no_grad()
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
         settings = RenderSettings(branches=branches, antialias=self.config.antialias)
-        flags = self.metadata.use_deformation, self.metadata.use_appearance
-        splats = self.scene.splats(time, *flags, self.metadata.sh_degree)
-        return render(splats, camera, settings=settings)
+        return render(self._splats(time), camera, settings=settings)

@@ -36,9 +36,10 @@ def complete_masks(scene: SplitScene, views: Views, phase: Phase, config: TrainC
     """
     blocks, added, changed = views.moving_blocks(), 0, 0
     settings = RenderSettings(branches=True, antialias=config.antialias)
+    background = torch.full((3,), float(views.background == "white"), device=views.device)
     for index in range(len(views)):
         view = views[index]
-        errors = _errors(scene, view, phase, settings).cpu()
+        errors = _errors(scene, view, phase, background, settings).cpu()
         rows, columns = errors.shape
         found = (errors > config.loss.mask_tolerance) & (blocks[index, :rows, :columns] == 0)
         if 0 < int(found.sum()) <= MAX_ADDED * found.numel():
@@ -51,10 +52,12 @@ def complete_masks(scene: SplitScene, views: Views, phase: Phase, config: TrainC
 
 
 @torch.no_grad()
-def _errors(scene: SplitScene, view: View, phase: Phase, settings: RenderSettings) -> Float[Tensor, "h w"]:
+def _errors(
+    scene: SplitScene, view: View, phase: Phase, background: Float[Tensor, "3"], settings: RenderSettings
+) -> Float[Tensor, "h w"]:
     """Colour error of the static image in each block, over its static pixels."""
     splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
-    layer = render(splats, view.camera, settings=settings).static
+    layer = render(splats, view.camera, background, settings).static
     assert layer is not None
     static = view.static_mask[..., None].float()
     fraction = block_means(static)[..., 0]

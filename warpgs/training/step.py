@@ -26,6 +26,8 @@ from .views import View, Views
 DECIBELS = -10.0
 """PSNR is this times the base-10 logarithm of the mean squared error."""
 
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
 
 class Sample(NamedTuple):
     """The random choices of an iteration.
@@ -33,7 +35,7 @@ class Sample(NamedTuple):
     Attributes:
         view: Index of the training view.
         time_noise: Added to the time that the deformation network sees.
-        background: [3] colour behind the dynamic image.
+        background: [3] colour behind the dynamic image, unless the capture's is white.
     """
 
     view: int
@@ -114,9 +116,11 @@ class Step:
         progress = (plan.progress, plan.means_progress, plan.network_progress)
         rates = optim.learning_rates(self.config.optim, self.extent, *progress, plan.warmup_factors)
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
+        background = WHITE if self.views.background == "white" else None
         self._inputs.send(
             time_noise=sample.time_noise,
-            dynamic_background=sample.background.tolist(),
+            background=background or BLACK,
+            dynamic_background=background or sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
         )

@@ -34,14 +34,16 @@ class StepInputs:
         self,
         *,
         time_noise: float,
+        background: Sequence[float],
         dynamic_background: Sequence[float],
         scales: Mapping[str, float],
         learning_rates: Mapping[str, float],
     ) -> None:
-        """Fills all tensors by one copy from the host. The joint and the static image keep a black background.
+        """Fills all tensors by one copy from the host.
 
         Args:
             time_noise: Added to the time.
+            background: Red, green and blue behind the joint and the static image.
             dynamic_background: Red, green and blue behind the dynamic image.
             scales: Scale of every sum by name.
             learning_rates: Learning rate of every parameter group by name.
@@ -49,8 +51,7 @@ class StepInputs:
         Raises:
             KeyError: If a name is missing.
         """
-        black = [0.0] * 3
-        numbers = [time_noise, *black, *black, *dynamic_background]
+        numbers = [time_noise, *background, *background, *dynamic_background]
         numbers += [scales[name] for name in self.scale]
         numbers += [learning_rates[name] for name in self.learning_rates]
         self._buffer.copy_(torch.tensor(numbers), non_blocking=True)

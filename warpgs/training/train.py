@@ -231,7 +231,8 @@ def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
         if uses_estimates:
             log("the masks are estimates: stage II compares the joint image alone")
         loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
-    return dataclasses.replace(config, loss=loss)
+    background = capture.background if config.background == "capture" else config.background
+    return dataclasses.replace(config, loss=loss, background=background)
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:

@@ -50,12 +50,12 @@ class Trainer:
     schedule depends on their number, as in gsplat, whose users shorten it by ``--steps_scaler``.
 
     Args:
-        config: Resolved config: schedule rescaled, device chosen.
+        config: Resolved config: schedule rescaled, device and background chosen.
         capture: Capture to train on.
         run: Run folder, for the checkpoints.
 
     Attributes:
-        capture: The capture, with the masks that ``config.assume`` implies, without depth if ``config.depth`` is off.
+        capture: The capture, with the masks, background and depth that the config implies.
         scene: What is trained.
         iteration: Iterations done.
         gains: [T, 3] what the colours of each training frame are divided by.
@@ -72,7 +72,7 @@ class Trainer:
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
         self.config, self.run = config, run
         capture = capture if config.depth else capture.without_depth()
-        self.capture = capture.assuming(config.assume)
+        self.capture = capture.assuming(config.assume).over("white" if config.background == "white" else "black")
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
@@ -214,7 +214,7 @@ class Trainer:
     def _reseed(self, phase: Phase, logger: TrainingLogger) -> None:
         """Adds dynamic Gaussians where none shows what moves."""
         if self.capture.assumption == "dynamic":
-            return  # the masks are the whole image then, and its background may be empty
+            return  # the masks do not say what moves then: they mark all that is seen
         config, scene, views = self.config, self.scene, self.views
         mask_of = lost_pixels(scene, phase, config.antialias)
         fraction = lost_fraction(views, mask_of)

@@ -99,12 +99,14 @@ class Views:
         capture: Source of the frames.
         device: Device of the views.
         resident_bytes: Maximum memory for views on the device [bytes].
-        mask_margin: Half width of the borders of masks, as a fraction of the image's larger side.
+        mask_margin: Half width of the borders of masks, as a fraction of the image's larger side. Masks that are where
+            frames are not empty have none: they are exact.
         gains: [T, 3] what images are divided by, per channel; nothing if None.
         poses: Corrections of the cameras; none if None.
 
     Attributes:
         poses: The corrections.
+        background: Colour behind everything.
         resident: Whether all views are on the device.
         num_pixels: Number of pixels of all views.
 
@@ -124,7 +126,7 @@ class Views:
         self.device, self._mask_margin = device, mask_margin
         self.poses = poses
         self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
-        self._capture = capture
+        self._capture, self.background = capture, capture.background
         self._depth_factors: dict[str, tuple[Tensor, Tensor]] = {}
         self._moving: dict[str, Tensor] = {}
         first = self._store(capture.frame(capture.train[0]))
@@ -221,6 +223,7 @@ class Views:
         if frame.name in self._moving:
             static_mask = static_mask & ~from_blocks(self._moving[frame.name], *size)
         margin = round(self._mask_margin * max(size))
-        border = mask_border(static_mask, margin) if margin else None
+        is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
+        border = mask_border(static_mask, 0 if is_exact else margin) if margin else None
         tensors = (camera.viewmat, camera.K, time, frame.image, static_mask, depth.half())
         return _Stored(*tensors, border, self._gains.get(frame.name))

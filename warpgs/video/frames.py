@@ -74,14 +74,15 @@ def _images(
         return [_averaged(rendering.joint.alpha[..., None].expand(-1, -1, 3), options.supersample)]
     by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
     layers = [by_name[name] for name in (COLORED if options.layers == "all" else (options.layers,))]
-    return [_pixels(layer, options) for layer in layers if layer is not None]
+    return [_pixels(layer, options, scene.background) for layer in layers if layer is not None]
 
 
-def _pixels(layer: Layer, options: Render) -> Float[Tensor, "H W C"]:
-    """RGB over black; with transparency RGBA, whose colour is not multiplied by its alpha."""
-    image = layer.image.clamp(0, 1)
+def _pixels(layer: Layer, options: Render, background: Float[Tensor, "3"] | None) -> Float[Tensor, "H W C"]:
+    """RGB over the scene's background; with transparency RGBA, whose colour is not multiplied by its alpha."""
     if not options.transparent:
-        return _averaged(image, options.supersample)
+        return _averaged(layer.image.clamp(0, 1), options.supersample)
+    image = layer.image if background is None else layer.image - (1.0 - layer.alpha[..., None]) * background
+    image = image.clamp(0, 1)
     image = _averaged(torch.cat([image, layer.alpha[..., None]], -1), options.supersample)
     alpha = image[..., 3:]
     return torch.cat([image[..., :3] / alpha.clamp_min(1 / 255), alpha], -1).clamp(0, 1)

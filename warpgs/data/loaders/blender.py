@@ -8,7 +8,8 @@ import numpy as np
 
 from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
-from warpgs.data.resized import WHITE, read_metric_depth, read_resized_image, read_resized_mask
+from warpgs.data.images import has_alpha
+from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resized_over_white
 from warpgs.data.units import SceneUnits
 from warpgs.files import read_numbers
 
@@ -24,7 +25,8 @@ HALF_SIZE = 1.3
 class BlenderLoader:
     """Loads the training frames, and for evaluation the test frames, or those of validation if there are none.
 
-    Transparent pixels are white. Everything is dynamic unless frames have a mask_path.
+    Transparent pixels are white, and so is the background if training images have alpha. Everything is dynamic, except
+    where nothing but the background is seen, unless frames have a mask_path.
     """
 
     def recognizes(self, root: Path) -> bool:
@@ -34,15 +36,19 @@ class BlenderLoader:
     def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
         """Opens a capture; arguments and errors as for ``load_capture``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
-        train = _frames(Transforms(root / TRAIN), "train")
+        transforms = Transforms(root / TRAIN)
+        paths = [transforms.image(entry) for entry in transforms.frames]
+        train = _frames(transforms, "train")
         val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
+        is_transparent = any(has_alpha(path) for path in paths)
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
             assumption="masks" if masked else "dynamic",
             own_times=True,
+            background="white" if is_transparent else "black",
         )
         options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
@@ -67,7 +73,7 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
                 transforms.lens({"w": size[0], "h": size[1], **entry}, image),
                 transforms.pose(entry),
                 time,
-                partial(read_resized_image, image, background=WHITE),
+                partial(read_resized_over_white, image),
                 None if mask is None else partial(read_resized_mask, mask),
                 None if depth is None else partial(read_metric_depth, depth, unit=1.0),
             )

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data.camera_files import is_rotation
-from warpgs.data.capture import Assumption, Capture, Frame
+from warpgs.data.capture import Assumption, Background, Capture, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
@@ -43,7 +43,7 @@ class PosedFrame:
         lens: Intrinsics of the full-size image.
         pose: [3, 4] world to camera, OpenCV axes, in world units.
         time: Time in any unit.
-        image: Reads the RGB image in a size.
+        image: Reads the RGB image in a size; a fourth channel is 0 where it shows the world's background alone.
         static_mask: Reads the static mask; None if the frame has none.
         inverse_depth: Reads inverse depth, NaN where unknown; None if the frame has none.
     """
@@ -52,7 +52,7 @@ class PosedFrame:
     lens: Lens
     pose: Float[np.ndarray, "3 4"]
     time: float
-    image: Callable[[Size], UInt8[np.ndarray, "H W 3"]]
+    image: Callable[[Size], UInt8[np.ndarray, "H W C"]]
     static_mask: Callable[[Size], Bool[np.ndarray, "H W"]] | None = None
     inverse_depth: Callable[[Size], Float[np.ndarray, "H W"]] | None = None
 
@@ -72,6 +72,7 @@ class World:
         units: Scene units; around points and cameras if None.
         assumption: What is dynamic where the frames have no masks.
         own_times: Whether times are in [0, 1] already.
+        background: Colour behind everything; see ``Capture``.
     """
 
     points: Float[np.ndarray, "P 3"]
@@ -79,6 +80,7 @@ class World:
     units: SceneUnits | None = None
     assumption: Assumption = "masks"
     own_times: bool = False
+    background: Background = "black"
 
 
 @dataclass(frozen=True)
@@ -116,19 +118,18 @@ def posed_capture(
     cameras, lenses = _cameras(root, frames, units, world.own_times, options.factor or 1)
     train = [name for name in by_name if name not in val]
     reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
-    points = torch.tensor(units.from_world(world.points), dtype=torch.float32)
-    colors = None if world.colors is None else torch.tensor(world.colors)
     return Capture(
         root.resolve().name,
         cameras,
         train,
         [name for name in by_name if name in val],
-        points,
-        colors,
+        torch.tensor(units.from_world(world.points), dtype=torch.float32),
+        None if world.colors is None else torch.tensor(world.colors),
         reader.read,
         options.cache_frames,
         world.assumption,
         read_taken=taken_reader(reader.read_with, lenses),
+        background=world.background,
     )
 
 
@@ -213,7 +214,7 @@ def _depth_view(frame: PosedFrame) -> DepthView:
     lens = reduced(frame.lens, max(1, round(max(frame.lens.width, frame.lens.height) / DEPTH_SIDE)))
     size = lens.width, lens.height
     static = np.ones(size[::-1], bool) if frame.static_mask is None else frame.static_mask(size)
-    parts = (undistort(part, lens) for part in (frame.image(size), frame.inverse_depth(size), static))
+    parts = (undistort(part, lens) for part in (frame.image(size)[..., :3], frame.inverse_depth(size), static))
     image, inverse_depth, static = parts
     return DepthView(image, inverse_depth, static, pinhole_matrix(lens), frame.pose)
 
@@ -248,7 +249,9 @@ class _FrameReader:
     def read_with(self, name: str, lens: Lens) -> Frame:
         """The frame, undistorted as for a lens."""
         frame, size = self.frames[name], self.cameras[name].size
-        image = undistort(frame.image(size), lens)
+        stored = frame.image(size)
+        image = undistort(np.ascontiguousarray(stored[..., :3]), lens)
+        empty = None if stored.shape[2] < 4 else torch.from_numpy(undistort(stored[..., 3] == 0, lens))
         mask = None if frame.static_mask is None else undistort(frame.static_mask(size), lens)
         if mask is not None and name in self.train:
             mask = perturb(mask, self.perturbation, name)
@@ -259,4 +262,5 @@ class _FrameReader:
             torch.from_numpy(np.require(image, requirements=("C", "W"))),
             None if mask is None else torch.from_numpy(mask),
             None if depth is None else torch.from_numpy(depth / np.float32(self.scale)),
+            empty=empty,
         )

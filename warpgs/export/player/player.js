@@ -207,7 +207,7 @@ function render(camera, position) {
   const zoom = Math.min(canvas.width / width, canvas.height / height);
   const r = camera.rotation, t = r.map((row) => -dot(row, camera.position));
   gl.viewport(0, 0, canvas.width, canvas.height);
-  gl.clearColor(0, 0, 0, 1);
+  gl.clearColor(...START.background, 1);
   gl.clear(gl.COLOR_BUFFER_BIT);
   gl.uniform1f(uniforms.position, position);
   gl.uniform2f(uniforms.viewport, canvas.width, canvas.height);

@@ -1,0 +1,167 @@
+"""The white behind a capture is composited in training, and whatever opens the run has the run's background."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests import tiny
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.config import TrainConfig
+from warpgs.data.balls import BallsSize, balls_capture
+from warpgs.data.loaders import load_capture
+from warpgs.evaluation import evaluate_run
+from warpgs.export.clouds import Clouds
+from warpgs.export.start_camera import start_view
+from warpgs.files import write_png
+from warpgs.rendering import Layer
+from warpgs.runs.run import Run, open_run
+from warpgs.training.train import fitted, make_trainer, train
+from warpgs.training.views import Views
+from warpgs.video import frames
+from warpgs.video.command import Render
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, quickly):  # noqa: F811
+    """A finished run on a small capture over white; its folder has the capture as well."""
+    folder = tmp_path_factory.mktemp("run")
+    data = balls_capture(folder / "cache", BallsSize(side=16, num_frames=8, num_val=2), quiet=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+        train(dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run", checkpoint_every=30))
+    return folder / "run"
+
+
+@pytest.fixture
+def opaque(run, tmp_path):
+    """A copy of the run whose capture has lost its alpha."""
+    data = shutil.copytree(Run.open(run, "cpu").config.data, tmp_path / "balls")
+    for path in data.rglob("*.png"):
+        write_png(path, np.ascontiguousarray(cv2.imread(str(path))[..., ::-1]))
+    return edited(shutil.copytree(run, tmp_path / "run"), lambda values: values.update(data=str(data)))
+
+
+def edited(run, change):
+    """The run after a change of its config."""
+    values = json.loads((run / "config.json").read_text())
+    change(values)
+    (run / "config.json").write_text(json.dumps(values))
+    return run
+
+
+@pytest.fixture
+def older(run, tmp_path):
+    """A copy of the run as if it had been made before runs had a background."""
+    return edited(shutil.copytree(run, tmp_path / "older"), lambda values: values.pop("background"))
+
+
+def backgrounds(trainer):
+    """What the next step composites behind the joint, the static and the dynamic image."""
+    trainer.step(trainer.protocol.at(trainer.iteration), trainer._sample(trainer.protocol.at(trainer.iteration)))
+    return trainer.step._inputs.backgrounds
+
+
+def resumed(run):
+    """A trainer that continues the run, two iterations before its end."""
+    (run / "checkpoints" / f"{tiny.LENGTH:07d}.safetensors").unlink()
+    return make_trainer(TrainConfig(resume=run, device="cpu"))
+
+
+def test_a_run_renders_over_the_background_of_its_capture(run):
+    scene = open_run(run, "cpu")
+    assert scene.config.background == "white"
+    capture = load_capture(scene.config.data)
+    rendering = scene.render(capture.cameras[capture.val[0]], branches=True)
+    for layer in (rendering.joint, rendering.static, rendering.dynamic):
+        clear = layer.alpha < 1e-3
+        assert clear.any()
+        assert (layer.image[clear] > 0.99).all()
+
+
+def test_metrics_are_finite_where_the_background_is_all_there_is(run):
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert 0 < metrics["psnr_dynamic"] < metrics["psnr_static"] < 59
+
+
+def test_a_run_keeps_its_background_when_the_capture_has_lost_its_alpha(opaque):
+    capture = Run.open(opaque, "cpu").open_capture()
+    assert load_capture(Run.open(opaque, "cpu").config.data).background == "black"
+    assert capture.background == "white"
+    assert torch.equal(backgrounds(resumed(opaque)), torch.ones(3, 3))
+
+
+def test_a_run_without_a_background_stays_over_black_with_empty_pixels_to_paint(older):
+    scene = open_run(older, "cpu")
+    capture = scene.open_capture()
+    layer = scene.render(capture.cameras[capture.val[0]]).joint
+    clear = layer.alpha < 1e-3
+    assert clear.any()
+    assert (layer.image[clear] < 0.01).all()
+    frame = capture.frame(capture.val[0])
+    assert frame.empty is None
+    assert not frame.static_mask.any()
+    trainer = resumed(older)
+    assert torch.equal(backgrounds(trainer)[:2], torch.zeros(2, 3))
+    assert not trainer.views[0].static_mask.any()
+
+
+def test_a_resumed_run_goes_on_as_it_would_have(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "run")
+    trainer = resumed(copy)
+    assert trainer.iteration < tiny.LENGTH
+    assert tiny.train(trainer)
+    assert tiny.differences(tiny.state(copy), tiny.state(run)) == []
+
+
+@pytest.mark.parametrize("asked", ["black", "white"])
+def test_an_option_overrides_the_background_of_the_capture(run, asked):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    config = fitted(TrainConfig(background=asked), capture, print)
+    assert config.background == asked
+    assert fitted(TrainConfig(), capture, print).background == "white"
+    assert (capture.over(asked).frame("train_r_000").empty is None) == (asked == "black")
+
+
+def test_exact_masks_have_no_margin(run):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    frame = capture.frame("train_r_000")
+    given = dataclasses.replace(capture, read=lambda name: frame, unmasked="masks")  # the same masks, from files
+    for source, has_border in ((capture, False), (given, True)):
+        view = Views(source, torch.device("cpu"), 1 << 30, mask_margin=0.1)[0]
+        assert torch.equal(view.static_mask, frame.static_mask)
+        assert bool(view.mask_border.any()) == has_border
+
+
+def test_a_transparent_image_has_none_of_the_background():
+    color, alpha = torch.rand(4, 5, 3), 0.2 + 0.8 * torch.rand(4, 5)
+    over_white = Layer(color * alpha[..., None] + (1.0 - alpha[..., None]), alpha, None)
+    rgba = frames._pixels(over_white, Render(Path("run"), transparent=True), torch.ones(3))
+    assert torch.allclose(rgba, torch.cat([color, alpha[..., None]], -1), atol=1e-5)
+    assert torch.equal(frames._pixels(over_white, Render(Path("run")), torch.ones(3)), over_white.image)
+
+
+def test_a_page_starts_over_the_background(run):
+    assert start_view(Clouds(open_run(run, "cpu")), None, keys=2, seconds=1.0).background == WHITE
+
+
+def test_a_capture_without_a_background_has_black_behind_it(tmp_path):
+    trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run")
+    assert trainer.capture.background == "black"
+    assert torch.equal(backgrounds(trainer)[:2], torch.zeros(2, 3))
+
+
+def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
+    trainer = resumed(shutil.copytree(run, tmp_path / "run"))
+    trainer.views._all.image.fill_(255)
+    with torch.no_grad():
+        trainer.scene.dynamic.logit_opacities.fill_(-20.0)
+    backgrounds(trainer)
+    assert trainer.step.take_means().psnr == pytest.approx(58.9, abs=0.05)
