@@ -10,12 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 
 from tests.prepare import boards
 from warpgs.data.lens import Lens
 from warpgs.prepare import colmap, sfm
 from warpgs.prepare.cameras import Cameras, NoCamerasError
+from warpgs.prepare.colmap import Job, _map_globally
 from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
 
@@ -198,6 +200,63 @@ def test_refinement_uses_the_features_of_the_first_pass(tmp_path):
     assert refined.names == names
     assert refined.error < 0.4  # that of the first pass, which what moves misleads, is 0.17 to 0.5: not deterministic
     assert abs(refined.lens.focal[0] / boards.FOCAL - 1.0) < 0.03
+
+
+def wide_database(path: Path) -> list[str]:
+    """A database of a wide lens, 240 px of 480, for which COLMAP guesses 576; returns the names of the frames."""
+    scene = pycolmap.SyntheticDatasetOptions()
+    scene.num_rigs, scene.num_frames_per_rig, scene.num_points3D = 1, 6, 100
+    scene.camera_width, scene.camera_height, scene.camera_params = 480, 270, [240.0, 240.0, 135.0, 0.0]
+    opened = pycolmap.Database.open(path)
+    pycolmap.synthesize_dataset(scene, opened)
+    set_focal(opened, 576.0)
+    names = [Path(image.name).stem for image in opened.read_all_images()]
+    opened.close()
+    return names
+
+
+def set_focal(opened: pycolmap.Database, focal: float) -> None:
+    (camera,) = opened.read_all_cameras()
+    camera.params = [focal, 240.0, 135.0, 0.0]
+    opened.update_camera(camera)
+
+
+@pytest.mark.parametrize(
+    ("agreed", "found", "starts", "kept"),
+    [
+        (400.0, {576.0: (300.0, 0.6)}, [576.0], 300.0),  # near the guess: it serves as well
+        (250.0, {250.0: (240.0, 0.3)}, [250.0], 240.0),
+        (150.0, {150.0: (240.0, 0.3), 576.0: (400.0, 0.6)}, [150.0, 576.0], 240.0),  # doubtful: the better one
+        (150.0, {150.0: (90.0, 0.9), 576.0: (240.0, 0.3)}, [150.0, 576.0], 240.0),
+    ],
+)
+def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
+    agreed, found, starts, kept, tmp_path, monkeypatch
+):
+    """``found``: by start, the focal length and the reprojection error that mapping ends with."""
+    names, started = wide_database(tmp_path / "features.db"), []
+
+    def calibrate(path: Path, options: object) -> bool:
+        opened = pycolmap.Database.open(path)
+        set_focal(opened, agreed)
+        opened.close()
+        return True
+
+    def map_globally(path: Path, *rest: object) -> dict[int, SimpleNamespace]:
+        opened = pycolmap.Database.open(path)
+        started.append(opened.read_all_cameras()[0].params[0])
+        opened.close()
+        focal, error = found[started[-1]]
+        camera = SimpleNamespace(mean_focal_length=lambda: focal)
+        measures = {"num_reg_images": lambda: 6, "compute_mean_reprojection_error": lambda: error}
+        return {0: SimpleNamespace(images={}, cameras={1: camera}, **measures)}
+
+    monkeypatch.setattr(pycolmap, "calibrate_view_graph", calibrate)
+    monkeypatch.setattr(pycolmap, "global_mapping", map_globally)
+    job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
+    model = _map_globally(job, tmp_path / "features.db", lambda *progress: None)
+    assert started == starts
+    assert model.cameras[1].mean_focal_length() == kept
 
 
 def test_a_known_focal_length_is_kept(tmp_path):

@@ -25,6 +25,7 @@ from warpgs.data.lens import Lens
 from warpgs.data.turning import find_turning
 
 from .cameras import MISLED, Cameras, NoCamerasError
+from .focal_guess import calibrated, confirms
 from .matches import all_pairs, keep_static, revisit_pairs, sequence_pairs, verified_matches
 from .model import cameras_of_model
 from .rotations import find_directions
@@ -274,6 +275,16 @@ def _mapping_options(job: Job) -> Any:
 
 def _map_globally(job: Job, database: Path, report: Report) -> Any:
     report("cameras", 0, len(job.names))
+    start = calibrated(database) if job.finds_focal and job.lens != FISHEYE else database
+    model = _map_from(job, start)
+    if start == database or (model is not None and confirms(model, start)):
+        return model
+    found = [m for m in (model, _map_from(job, database)) if m is not None]
+    return min(found, key=lambda m: (-_size(m), m.compute_mean_reprojection_error()), default=None)
+
+
+def _map_from(job: Job, database: Path) -> Any:
+    """The reconstruction by global mapping that starts from the database's focal length."""
     options = pycolmap.GlobalPipelineOptions()
     options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS
     options.mapper.bundle_adjustment.refine_focal_length = job.finds_focal
