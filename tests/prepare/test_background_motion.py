@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from tests.prepare import boards
-from warpgs.prepare.background_motion import off_background
+from warpgs.prepare.background_motion import SIDE, off_background
 from warpgs.prepare.cameras import Cameras, NoCamerasError
+from warpgs.prepare.images import resize_to_side
 from warpgs.prepare.masks import Masks
 from warpgs.prepare.options import Options
 from warpgs.prepare.steps import Steps
@@ -39,11 +40,17 @@ def followed(count: int, step: int) -> list[np.ndarray]:
     return frames
 
 
+def off(frames: list[np.ndarray]) -> list[np.ndarray]:
+    """What is off the background, in the size of the frames, compared at the size that a preparation does it at."""
+    found = off_background([resize_to_side(frame, SIDE) for frame in frames])
+    return [cv2.resize(mask.astype(np.uint8), SIZE, interpolation=cv2.INTER_NEAREST) > 0 for mask in found]
+
+
 def test_what_the_camera_follows_is_off_the_background():
-    off = off_background(followed(6, 5))
+    found = off(followed(6, 5))
     true = np.zeros(SIZE[::-1], bool)
     true[BOX] = True
-    for mask in off:
+    for mask in found:
         assert (mask & true).sum() > 0.9 * true.sum()
         assert (mask & ~true).sum() < 0.06 * mask.size
 
@@ -51,7 +58,7 @@ def test_what_the_camera_follows_is_off_the_background():
 def test_nothing_is_off_a_background_alone():
     background = noise(0, SIZE[1], SIZE[0] + 30)
     frames = [background[:, 5 * k : 5 * k + SIZE[0]].copy() for k in range(6)]
-    assert not any(mask.any() for mask in off_background(frames))
+    assert not any(mask.any() for mask in off(frames))
 
 
 def test_nothing_is_off_where_no_plane_dominates():
@@ -60,11 +67,11 @@ def test_nothing_is_off_where_no_plane_dominates():
     for frame in frames:
         frame[:33] = other[:33]
         frame[72:105] = other[72:105]
-    assert not any(mask.any() for mask in off_background(frames)[1:-1])  # the others have fewer votes
+    assert not any(mask.any() for mask in off(frames)[1:-1])  # the others have fewer votes
 
 
 def test_a_single_frame_has_no_background():
-    assert not off_background(followed(1, 5))[0].any()
+    assert not off(followed(1, 5))[0].any()
 
 
 CAMERAS = Cameras(["a"], boards.lens(), boards.poses(2)[:1], boards.points(), 0.1, 10.0)

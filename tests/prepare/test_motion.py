@@ -126,10 +126,11 @@ def test_expected_flow_is_exact_on_a_plane_at_the_median_depth():
 
 
 @pytest.mark.parametrize("estimate", ["masks", "depth"])
-def test_every_flow_is_computed_once(estimate, video, frames, monkeypatch):
-    compute, pairs = Flows.compute, []
+def test_every_flow_is_computed_once_at_half_the_size(estimate, video, frames, monkeypatch):
+    compute, pairs, shapes = Flows.compute, [], set()
 
     def counted(self, a, b, *start):
+        shapes.add(a.shape)
         indices = [next((k for k, plane in enumerate(self.planes) if plane is image), None) for image in (a, b)]
         if None not in indices:  # else the image is warped, see ``Revisits``
             pairs.append(tuple(indices))
@@ -138,6 +139,14 @@ def test_every_flow_is_computed_once(estimate, video, frames, monkeypatch):
     monkeypatch.setattr(Flows, "compute", counted)
     find_dynamic(frames) if estimate == "masks" else static_depth(frames, video[1])
     assert len(pairs) == len(set(pairs)) > 100
+    assert shapes == {(96, 128)}
+
+
+def test_errors_of_halved_frames_are_in_pixels_of_the_whole_ones(frames):
+    small = frames.halved()
+    assert (small.lens.width, small.lens.height, small.focal) == (128, 96, frames.lens.focal[0])
+    assert small.neighbours == frames.neighbours
+    assert np.allclose(2.0 * small.expected_flow(2, 6), frames.expected_flow(2, 6)[::2, ::2], atol=0.5)
 
 
 def test_the_moving_board_is_masked(video, frames):
@@ -172,6 +181,19 @@ def gathered(image: np.ndarray, residual: np.ndarray, witnesses: int = 0) -> Seg
     nothing = np.zeros(residual.shape, np.float32)
     seen = np.full(residual.shape, witnesses, np.uint8)
     return gather(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), Evidence(residual, nothing, seen, nothing + 1.0))
+
+
+def test_evidence_at_half_the_size_counts_where_it_is():
+    image = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
+    residual = np.zeros((48, 64), np.float32)
+    residual[12:36, 32:] = 10.0
+    moves = np.zeros(image.shape[:2], bool)
+    moves[32:64, 72:] = True  # inner superpixels
+    found = gathered(cv2.GaussianBlur(image, (0, 0), 1.5), residual)
+    _, dynamic = evidence_on(moves, found)
+    _, elsewhere = evidence_on((slice(None), slice(0, 40)), found)
+    assert dynamic > 0.1
+    assert elsewhere == 0.0
 
 
 def evidence_on(region: tuple, found: Segments) -> tuple[float, float]:

@@ -17,25 +17,25 @@ from jaxtyping import Bool, Float, UInt8
 from .flow import Flows
 from .parallel import map_frames
 
-SIDE = 256
+SIDE = 128
 """Longest side of the images that are compared [px]."""
 
 OFFSETS = (-2, -1, 1, 2)
 """Frames that a frame is compared with."""
 
-SPACING = 6
+SPACING = 3
 """Distance of the pixels that the homography is fitted to [px]; evenly, so that area counts and not texture."""
 
-INLIER = 0.75
+INLIER = 0.375
 """Distance from the homography within which a pixel supports it [px]."""
 
 MIN_PIXELS = 50
 """Minimum number of pixels to fit a homography to."""
 
-MIN_DISTANCE, MIN_RELATIVE = 1.5, 0.2
+MIN_DISTANCE, MIN_RELATIVE = 0.75, 0.2
 """Distance from the homography [px], and relative to the displacement that it predicts, beyond which a pixel is off."""
 
-MARGIN = 5
+MARGIN = 3
 """Width of the square that the region is dilated with [px]."""
 
 MAX_FRACTION = 0.4

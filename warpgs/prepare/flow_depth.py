@@ -38,19 +38,33 @@ def static_depth(
         dynamic: [H, W] dynamic mask of each frame.
         quiet: Whether to show no progress.
     """
-    flows, indices = Flows(brighten(frames.images), frames.expected_flow), range(len(frames.images))
+    height, width = frames.images[0].shape[:2]
+    frames, indices = frames.halved(), range(len(frames.images))  # flow tells no more at full size
+    flows, size = Flows(brighten(frames.images), frames.expected_flow), (frames.lens.width, frames.lens.height)
 
     def local(frame: int) -> LocalGeometry:
-        found = triangulate(frames.observations(frame, flows), frames.lens.focal[0])
+        found = triangulate(frames.observations(frame, flows), frames.focal)
         flows.release(frame)
+        moves = cv2.resize(dynamic[frame].astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0
         with np.errstate(invalid="ignore"):
-            bad = dynamic[frame] | ~(found.residual < MAX_RESIDUAL)
+            bad = moves | ~(found.residual < MAX_RESIDUAL)
             bad |= ~(found.sigma < MAX_RELATIVE_SIGMA * found.inverse_depth)
         found.inverse_depth[bad] = np.nan
         return found
 
     geometry = map_frames(local, indices, "depth", quiet)
-    return map_frames(lambda frame: _confirmed(frames, geometry, frame), indices, "depth: cross-checks", quiet)
+    confirmed = map_frames(lambda frame: _confirmed(frames, geometry, frame), indices, "depth: cross-checks", quiet)
+    planes = [_enlarged(plane, width, height) for plane in confirmed]
+    for plane, moving in zip(planes, dynamic, strict=True):
+        plane[moving] = np.nan
+    return planes
+
+
+def _enlarged(plane: np.ndarray, width: int, height: int) -> Float[np.ndarray, "H W"]:
+    """[H, W] the plane at another size, interpolated where all is known around."""
+    smooth = cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR)
+    nearest = cv2.resize(plane, (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.where(np.isnan(smooth), nearest, smooth)
 
 
 def _confirmed(frames: PosedFrames, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:

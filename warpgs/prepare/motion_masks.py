@@ -60,7 +60,6 @@ Carried = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class _Finder:
-    frames: PosedFrames
     flows: Flows
     labs: list[np.ndarray]
     revisits: Revisits
@@ -74,9 +73,14 @@ class _Finder:
 
     def _carried(self, frame: int) -> Carried:
         """The pixels that flow carries to the next frame, and their indices there."""
-        x, y, visible = self.flows.track(frame, frame + 1)
-        height, width = visible.shape
-        column, row = x.round().astype(np.int64), y.round().astype(np.int64)
+        column, row, visible = self.flows.track(frame, frame + 1)
+        height, width = self.labs[frame].shape[:2]
+        across, down = width / column.shape[1], height / column.shape[0]
+        # Interpolated, at pixel centres of the larger size.
+        column = (cv2.resize(column, (width, height)) + 0.5) * across - 0.5
+        row = (cv2.resize(row, (width, height)) + 0.5) * down - 0.5
+        column, row = column.round().astype(np.int64), row.round().astype(np.int64)
+        visible = cv2.resize(visible.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
         visible = visible & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixels = visible.ravel().nonzero()[0]
         return pixels.astype(np.int32), (row * width + column).ravel()[pixels].astype(np.int32)
@@ -87,19 +91,21 @@ def gather(lab: UInt8[np.ndarray, "H W 3"], evidence: Evidence) -> Segments:
 
     Args:
         lab: [H, W, 3] image in 8-bit Lab.
-        evidence: Evidence on its pixels.
+        evidence: Evidence on its pixels, at this size or a smaller one.
     """
     dx, dy = _gradients(lab)
     texture, seen = _texture(dx, dy), evidence.witnesses >= NUM_AGREEING
     residual = np.nan_to_num(evidence.residual, nan=UNKNOWN_RESIDUAL)
+    size = lab.shape[1::-1]
     contradiction = _contradiction(evidence.residual)
     # A dynamic object also contradicts the neighbours; where they fit well, a mismatch far away is doubtful.
     doubt = (1.0 - evidence.agreement) * seen * np.clip(residual - 0.5, 0.15, 1.0)
     # Where no far frame looks, the neighbours alone decide: better than the colours of other places.
     static = np.where(seen, evidence.agreement, np.exp(-((residual / LOCAL_TOLERANCE) ** 2))) * (1.0 - contradiction)
     # Along an edge or a stripe, flow is a guess: it may contradict the cameras, but not show motion.
-    dynamic = np.maximum(doubt, contradiction) * _isotropy(dx, dy)
-    return segment(lab, fill_unknown(evidence.inverse_depth), texture * static, texture * dynamic)
+    dynamic = cv2.resize(np.maximum(doubt, contradiction), size) * _isotropy(dx, dy)
+    inverse_depth = cv2.resize(fill_unknown(evidence.inverse_depth), size)
+    return segment(lab, inverse_depth, texture * cv2.resize(static, size), texture * dynamic)
 
 
 def _contradiction(residual: np.ndarray) -> Float[np.ndarray, "H W"]:
@@ -139,9 +145,10 @@ def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarra
         quiet: Whether to show no progress.
     """
     images, indices = brighten(frames.images), range(len(frames.images))
-    flows = Flows(images, frames.expected_flow)
+    small = frames.halved()  # flow tells no more at full size
+    flows = Flows(brighten(small.images), small.expected_flow)
     labs = [cv2.cvtColor(image, cv2.COLOR_RGB2LAB) for image in images]
-    found = map_frames(_Finder(frames, flows, labs, Revisits(frames, flows)).find, indices, "motion", quiet)
+    found = map_frames(_Finder(flows, labs, Revisits(small, flows)).find, indices, "motion", quiet)
     segments, carried = [s for s, _ in found], [c for _, c in found if c is not None]
     probabilities = Graph(segments, carried).dynamic_probabilities()
     outlines = map_frames(lambda k: outline(images[k], probabilities[k]), indices, "outlines", quiet)

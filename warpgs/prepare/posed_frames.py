@@ -34,6 +34,7 @@ class PosedFrames:
         lens: The lens.
         poses: [F, 3, 4] world to camera.
         points: [P, 3] some points of the scene.
+        focal: Focal length in the pixels that errors are counted in.
         rays: [H, W, 2] x, y on the plane z = 1 of every pixel's centre.
         neighbours: Up to six frames near each frame, see ``_neighbours``.
     """
@@ -44,12 +45,32 @@ class PosedFrames:
         lens: Lens,
         poses: Float[np.ndarray, "F 3 4"],
         points: Float[np.ndarray, "P 3"],
+        focal: float | None = None,
     ) -> None:
+        """Chooses the neighbours.
+
+        Args:
+            images: [H, W, 3] of every frame.
+            lens: The lens.
+            poses: [F, 3, 4] world to camera.
+            points: [P, 3] some points of the scene; a few hundred are used.
+            focal: Focal length in the pixels that errors are counted in; that of the lens if None.
+        """
         self.images, self.lens, self.poses = images, lens, poses
         self.points = points[:: max(1, len(points) // 400)]
+        self.focal = lens.focal[0] if focal is None else focal
         self.rays = pixel_rays(lens)
         self._ray_planes = np.ascontiguousarray(self.rays.transpose(2, 0, 1))
+        self._columns = np.arange(0.5, lens.width, dtype=np.float32)
+        self._rows = np.arange(0.5, lens.height, dtype=np.float32)[:, None]
         self.neighbours = [self._neighbours(frame) for frame in range(len(poses))]
+
+    def halved(self) -> "PosedFrames":
+        """The frames at half the size, whose errors are still counted in pixels of this one."""
+        height, width = self.images[0].shape[:2]
+        size = max(1, round(width / 2)), max(1, round(height / 2))
+        images = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images]
+        return PosedFrames(images, self.lens.resized(*size), self.poses, self.points, self.focal)
 
     def relative(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation and translation from the camera of a to that of b."""
@@ -112,9 +133,9 @@ class PosedFrames:
         depth[~front] = 1.0
         x, y = (rotated[0] + rho * translation[0]) / depth, (rotated[1] + rho * translation[1]) / depth
         column, row = self.lens.image(x, y)
-        start = np.meshgrid(np.arange(self.lens.width) + 0.5, np.arange(self.lens.height) + 0.5)
-        flow = np.where(front[..., None], np.stack([column - start[0], row - start[1]], -1), 0.0)
-        return np.clip(flow, -self.lens.width, self.lens.width).astype(np.float32)
+        flow = np.stack([column - self._columns, row - self._rows], -1)
+        flow[~front] = 0.0
+        return np.clip(flow, -self.lens.width, self.lens.width, out=flow)
 
     def observations(self, frame: int, flows: Flows) -> list[Observation]:
         """Where the frame's neighbours observe its pixels, by optical flow between the images."""

@@ -36,7 +36,7 @@ TOLERANCE = 2.0
 TIE_BREAK = 1e-7
 """Cost of a far frame next to another one [radians]; only a camera on a tripod has viewpoints so equal."""
 
-PATCH = 9
+PATCH = 5
 """Side of the patches that are compared [px]."""
 
 PIXEL_NOISE = 1.5
@@ -72,7 +72,7 @@ class Revisits:
 
     def __init__(self, frames: PosedFrames, flows: Flows) -> None:
         self._frames, self._flows = frames, flows
-        self._grey = [cv2.GaussianBlur(plane, (0, 0), 1.0).astype(np.float32) for plane in flows.grey]
+        self._grey = [cv2.GaussianBlur(plane, (0, 0), 0.7).astype(np.float32) for plane in flows.grey]
         self._centers = camera_centers(frames.poses)
 
     def far_frames(self, frame: int, inverse_depth: float) -> list[int]:
@@ -93,7 +93,7 @@ class Revisits:
 
     def evidence(self, frame: int) -> Evidence:
         """The evidence of the neighbours and the far frames on a frame."""
-        focal = self._frames.lens.focal[0]
+        focal = self._frames.focal
         near = self._frames.observations(frame, self._flows)
         local = triangulate(near, focal)
         rho = fill_unknown(local.inverse_depth)
