@@ -24,8 +24,9 @@ NUM_FAR = 6
 NUM_AGREEING = 3
 """Number of far frames that must agree for a surface to be static; it may be occluded in the others."""
 
-MIN_GAP = 10
-"""Minimum number of frames between a frame and its far frames."""
+MIN_GAP = 8
+"""Minimum number of frames between a frame and its far frames. With 6, of a hand that moves slowly less is found; with
+10, a camera that passes shares too little with them (docs/prepare.md has the figures)."""
 
 MIN_SPACING = 3
 """Minimum number of frames between far frames."""
