@@ -85,7 +85,7 @@ def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
 
 
 def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
-    """The render of ``ours`` by gswarp, called as the rasterizer of 3DGS (whose near plane is at 0.2)."""
+    """The render of ``ours`` by gswarp, called as the rasterizer of 3DGS: near plane at 0.2, alpha at most 0.99."""
     import gswarp
 
     width, height = camera.size
@@ -117,7 +117,8 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
             means, offsets, opacities[:, None], colors_precomp=colors, scales=scales, rotations=normalize(quats)
         )
         image = image.movedim(0, -1)
-        return (image, meta.depth[0]) if depth else (image,)
+        # Its depth is a sum; that of the others is divided by alpha.
+        return (image, meta.depth[0] / meta.alpha[0].clamp_min(1e-10)) if depth else (image,)
 
     return Workload(run, ours.parameters, ours.v_images)
 
