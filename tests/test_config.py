@@ -142,8 +142,11 @@ def test_only_masks_that_are_estimates_are_completed(assume, estimated):
     cameras = {"a": make_camera()}
     capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
     config = TrainConfig(assume=assume, loss=LossConfig(mask_tolerance=0.04))
-    tolerance = fitted(config, capture, print).loss.mask_tolerance
-    assert tolerance == (0.04 if estimated and assume == "masks" else 0.0)
+    lines: list[str] = []
+    tolerance = fitted(config, capture, lines.append).loss.mask_tolerance
+    is_used = estimated and assume == "masks"
+    assert tolerance == (0.04 if is_used else 0.0)
+    assert is_used == (lines == [])
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():

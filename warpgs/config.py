@@ -208,7 +208,7 @@ class DensifyConfig:
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
-    """At prunings during densification: new ones start where this fraction of the dynamic pixels is lost; 0: never."""
+    """At prunings during densification: new dynamic Gaussians start where so many dynamic pixels are lost; 0: never."""
     weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
@@ -248,7 +248,7 @@ class Schedule:
     """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. Adam's
     first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
     half_size_until: int = 0
-    """Iteration of stage I up to which views are compared at half their size, for speed; 0 in the paper."""
+    """Up to this iteration, also of stage II, views are compared at half their size, for speed; 0 in the paper."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000

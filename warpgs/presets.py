@@ -39,7 +39,6 @@ BEST = TrainConfig(
         depth_tolerance=0.03,
         depth_smooth=True,
         mask_margin=0.008,
-        mask_tolerance=0.04,
         branches_in_stage2="given-masks",
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
@@ -78,12 +77,7 @@ PATIENT = dataclasses.replace(
         dynamic_points=3_000,
     ),
     loss=dataclasses.replace(
-        BEST.loss,
-        ssim=0.0,
-        depth=LossConfig.depth,
-        depth_dynamic=LossConfig.depth_dynamic,
-        depth_smooth=False,
-        mask_tolerance=0.0,
+        BEST.loss, ssim=0.0, depth=LossConfig.depth, depth_dynamic=LossConfig.depth_dynamic, depth_smooth=False
     ),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8, reseed=0.05),

@@ -20,13 +20,14 @@ MIN_STATIC = 0.25
 """Blocks of which the mask calls less than this fraction static are left as they are."""
 
 MAX_ADDED = 0.25
-"""A view of which more than this fraction of the blocks would be added is not learned well enough yet."""
+"""A view of whose static blocks more than this fraction would be added in all is not learned well enough yet."""
 
 
 def complete_masks(scene: SplitScene, views: Views, phase: Phase, config: TrainConfig) -> str:
     """Adds to ``views.moving_blocks`` what the static image does not show; says what, or nothing.
 
-    Colours are compared after the mean over a block, so that details that are not learned yet do not count.
+    Colours are compared after the mean over a block, so that details that are not learned yet do not count. Blocks stay
+    dynamic once they are.
 
     Args:
         scene: The scene.
@@ -41,10 +42,11 @@ def complete_masks(scene: SplitScene, views: Views, phase: Phase, config: TrainC
         view = views[index]
         errors = _errors(scene, view, phase, background, settings).cpu()
         rows, columns = errors.shape
-        found = (errors > config.loss.mask_tolerance) & (blocks[index, :rows, :columns] == 0)
-        if 0 < int(found.sum()) <= MAX_ADDED * found.numel():
-            blocks[index, :rows, :columns] += found
-            added, changed = added + int(found.sum()), changed + 1
+        found, before = errors > config.loss.mask_tolerance, blocks[index, :rows, :columns]
+        num, earlier = int(found.sum()), int(before.sum())
+        if 0 < num <= MAX_ADDED * (int(errors.isfinite().sum()) + earlier) - earlier:
+            before += found
+            added, changed = added + num, changed + 1
     if not added:
         return ""
     views.set_moving_blocks(blocks)
@@ -55,14 +57,14 @@ def complete_masks(scene: SplitScene, views: Views, phase: Phase, config: TrainC
 def _errors(
     scene: SplitScene, view: View, phase: Phase, background: Float[Tensor, "3"], settings: RenderSettings
 ) -> Float[Tensor, "h w"]:
-    """Colour error of the static image in each block, over its static pixels."""
+    """Colour error of the static image in each block, over its static pixels; NaN where there are too few."""
     splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
     layer = render(splats, view.camera, background, settings).static
     assert layer is not None
     static = view.static_mask[..., None].float()
     fraction = block_means(static)[..., 0]
     error = block_means((layer.image - view.image) * static).abs().mean(-1) / fraction.clamp(min=MIN_STATIC)
-    return torch.where(fraction >= MIN_STATIC, error, 0.0)
+    return torch.where(fraction >= MIN_STATIC, error, torch.nan)
 
 
 def send_from_first(views: Views) -> None:

@@ -193,11 +193,16 @@ class Protocol:
             prune_weakest=self.config.densify.weakest > 0.0
             and prunes
             and schedule.densify_until <= done <= 2 * schedule.densify_until,
-            complete_masks=self.config.loss.mask_tolerance > 0.0 and recovers,
+            complete_masks=self.config.loss.mask_tolerance > 0.0 and recovers and not self._was_just_reset(done),
             reseed=self.config.densify.reseed > 0.0 and recovers,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
+
+    def _was_just_reset(self, done: int) -> bool:
+        """Whether the images are still too dark because opacities were reset within the last quarter of an interval."""
+        every = self.config.schedule.reset_every
+        return done >= every and done % every < every // 4
 
     def _means_progress(self, iteration: int) -> dict[str, float]:
         """By branch, fraction done of the iterations over which the rate of its positions decays."""

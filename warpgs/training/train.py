@@ -225,7 +225,8 @@ def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     uses_estimates = capture.estimated_masks and config.assume == "masks"
-    if not uses_estimates:
+    if loss.mask_tolerance and not uses_estimates:
+        log("the masks are not estimates of warpgs prepare: loss.mask_tolerance is not used")
         loss = dataclasses.replace(loss, mask_tolerance=0.0)
     if loss.branches_in_stage2 == "given-masks":
         if uses_estimates:

@@ -167,6 +167,9 @@ class Trainer:
     def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Changes the alignment of depth and the sets of Gaussians as planned."""
         scene, sh_degree = self.scene, plan.phase.sh_degree
+        # First, because new Gaussians change the images until they are trained.
+        if plan.complete_masks and (completed := complete_masks(scene, self.views, plan.phase, self.config)):
+            logger.log(f"iteration {self.iteration + 1}: {completed}")
         if plan.realign and not self.capture.metric_depth:
             # In place, because CUDA graphs read them.
             aligned = initialize.align_to_rendering(
@@ -180,8 +183,6 @@ class Trainer:
             options = (sh_degree, threshold, self.config.antialias)
             if any(removed := prune_invisible(scene, self.step.optimizer, cameras, *options)):
                 logger.log(f"iteration {self.iteration + 1}: {removed}")
-        if plan.complete_masks and (completed := complete_masks(scene, self.views, plan.phase, self.config)):
-            logger.log(f"iteration {self.iteration + 1}: {completed}")
         if plan.reseed:
             self._reseed(plan.phase, logger)
         if plan.prune_weakest:

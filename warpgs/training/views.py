@@ -36,12 +36,14 @@ class View(NamedTuple):
     inverse_depth: Float[Tensor, "H W"]
 
     def halved(self) -> "View":
-        """The view at half the size; the last row and column of odd sizes are left out.
+        """The view at half the size; the last row and column of odd sizes are left out. One pixel is not halved.
 
         A pixel is static if the four that it covers are, lies on a border if one of them does, and has the inverse
         depth of the first.
         """
         camera = self.camera
+        if min(camera.size) < 2:
+            return self
         height, width = camera.height // 2, camera.width // 2
         blocks = [self.image, self.static_mask[..., None], self.inverse_depth[..., None]]
         if self.mask_border is not None:
@@ -219,11 +221,11 @@ class Views:
             (scale, offset), factor = self._depth_factors[frame.name]
             depth = ((scale * depth + offset) * factor - offset) / scale
         time = torch.tensor([camera.time])
-        static_mask = frame.static_mask
+        moving = torch.zeros(size, dtype=torch.bool)
         if frame.name in self._moving:
-            static_mask = static_mask & ~from_blocks(self._moving[frame.name], *size)
+            moving = from_blocks(self._moving[frame.name], *size)
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
-        border = mask_border(static_mask, 0 if is_exact else margin) if margin else None
-        tensors = (camera.viewmat, camera.K, time, frame.image, static_mask, depth.half())
+        border = mask_border(frame.static_mask, 0 if is_exact else margin) & ~moving if margin else None
+        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask & ~moving, depth.half())
         return _Stored(*tensors, border, self._gains.get(frame.name))
