@@ -63,7 +63,9 @@ def _compare(
     _check_inputs(image, target, mask, mean)
     mask_bytes = None if mask is None else mask.view(torch.uint8)
     H, W, C = image.shape
-    strip = kernels.SMALL_IMAGE_STRIP if image.is_cuda and is_small((W, H)) else kernels.STRIP
+    strip = kernels.CPU_STRIP
+    if image.is_cuda:
+        strip = kernels.SMALL_IMAGE_STRIP if is_small((W, H)) else kernels.STRIP
     threads = -(-H // strip) * W * C
     _, l1, similarity = weights
     with_mask = mask is not None
