@@ -137,6 +137,15 @@ def test_nothing_is_printed_where_there_is_no_cuda_driver():
     assert (done.stdout, done.stderr) == (b"", b"")
 
 
+@pytest.mark.parametrize(
+    "command", ["python -c 'import warpgs.runtime.launch' 2>&-", 'TMPDIR=/proc python -c "$START"']
+)
+def test_warp_starts_without_standard_error_or_a_folder_for_temporary_files(command):
+    start = "import tempfile; tempfile.tempdir = '/proc'; import warpgs.runtime.launch"
+    environment = {**os.environ, "START": start, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    subprocess.run(["sh", "-c", command], check=True, env=environment)
+
+
 FAILING_START = """
 import sys
 import warp

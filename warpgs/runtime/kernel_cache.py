@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import warp as wp
 
@@ -25,6 +26,8 @@ SEAL = "warpgs.sha256"
 MAX_SEAL, MAX_BYTES = 1 << 16, 1 << 28
 """Maximum size of this file and of a compiled module [bytes]; modules have less than a MiB."""
 
+GPU_DEVICES = ("/dev/nvidiactl", "/dev/dxg")
+"""Files of which one is there where Linux or WSL has an NVIDIA GPU."""
 
 STDERR = 2
 """File descriptor of standard error, to which native libraries print."""
@@ -50,15 +53,20 @@ def init_warp() -> None:
 def _without_driver_warning() -> Iterator[None]:
     """Drops what Warp's library says about a missing CUDA driver: a machine without a GPU needs none.
 
-    Whoever asks for CUDA there is told so by ``choose_device``. Everything else on standard error is passed on.
+    Whoever asks for CUDA there is told so by ``choose_device``. Everything else on standard error is passed on. Where
+    there is a GPU, or no way to filter, nothing is dropped.
     """
-    sys.stderr.flush()
-    try:
-        stderr = os.dup(STDERR)
-    except OSError:  # closed: nothing is printed
+    printed: IO[bytes] | None = None
+    if sys.stderr is not None and not any(Path(device).exists() for device in GPU_DEVICES):
+        with contextlib.suppress(OSError):  # standard error is closed, or no folder for temporary files can be written
+            os.fstat(STDERR)
+            printed = tempfile.TemporaryFile()  # noqa: SIM115
+    if printed is None:
         yield
         return
-    with tempfile.TemporaryFile() as printed:
+    sys.stderr.flush()
+    stderr = os.dup(STDERR)
+    with printed:
         os.dup2(printed.fileno(), STDERR)
         try:
             yield
