@@ -45,7 +45,8 @@ def static_depth(
     def local(frame: int) -> LocalGeometry:
         found = triangulate(frames.observations(frame, flows), frames.focal)
         flows.release(frame)
-        moves = cv2.resize(dynamic[frame].astype(np.uint8), size, interpolation=cv2.INTER_AREA) > 0
+        covered = np.where(dynamic[frame], 255, 0).astype(np.uint8)
+        moves = cv2.resize(covered, size, interpolation=cv2.INTER_AREA) > 0  # a part of a pixel is enough
         with np.errstate(invalid="ignore"):
             bad = moves | ~(found.residual < MAX_RESIDUAL)
             bad |= ~(found.sigma < MAX_RELATIVE_SIGMA * found.inverse_depth)
