@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from .peers import read_peers
 from .ray_pool import RayPool
 from .results import write_report, write_tables
 from .scheduler import Event, run_jobs
+from .shared_gpu import shared_gpus
 from .spec import MAX_SEEDS, SweepSpec, read_spec
 from .table import Peers
 
@@ -96,7 +98,8 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
     code, stopped = 0, False
     try:
         if not options.tables_only:
-            _train(options, spec, board, peers)
+            with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
+                _train(options, spec, board, peers)
     except ConnectionError as error:
         log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
         code = FAILED
@@ -110,6 +113,15 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
     if stopped:
         raise KeyboardInterrupt("stopped; the same command continues")
     return code or (INCOMPLETE if "failed" in board.states.values() else 0)
+
+
+def _shares_local_gpus(options: Sweep) -> bool:
+    """Whether trainings share GPUs of this machine; the nodes of a cluster start MPS themselves, or not at all."""
+    if options.per_gpu == 1 or options.address is not None or options.device == "cpu":
+        return False
+    import torch
+
+    return torch.cuda.device_count() > 0
 
 
 def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers) -> None:

@@ -1,0 +1,91 @@
+"""MPS is started for trainings that share a GPU, and ended; the driver's program is played by a script."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from warpgs.sweep.command import Sweep
+from warpgs.sweep.run_sweep import _shares_local_gpus
+from warpgs.sweep.shared_gpu import CONTROL, PIPES, shared_gpus
+
+SCRIPT = """#!/bin/sh
+echo "$* $(cat) $CUDA_MPS_PIPE_DIRECTORY" >> {calls}
+exit {code}
+"""
+
+
+@pytest.fixture
+def control(tmp_path, monkeypatch):
+    """Puts a program with this exit code in the place of the driver's; ``control.calls`` says how it was called."""
+    monkeypatch.delenv(PIPES, raising=False)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    def install(code):
+        calls = tmp_path / "calls"
+        (tmp_path / CONTROL).write_text(SCRIPT.format(calls=calls, code=code))
+        (tmp_path / CONTROL).chmod(0o755)
+        return lambda: [line.split() for line in calls.read_text().splitlines()] if calls.exists() else []
+
+    return install
+
+
+def test_processes_find_mps_until_it_is_ended(control):
+    calls = control(0)
+    with shared_gpus(pytest.fail):
+        folder = os.environ[PIPES]
+        assert Path(folder).is_dir()
+        assert calls() == [["-d", folder]]
+    assert calls() == [["-d", folder], ["quit", folder]]
+    assert PIPES not in os.environ
+    assert not Path(folder).exists()
+
+
+def test_mps_is_ended_after_an_error_too(control):
+    calls = control(0)
+    with pytest.raises(KeyboardInterrupt), shared_gpus(pytest.fail):
+        raise KeyboardInterrupt
+    assert calls()[-1][0] == "quit"
+    assert PIPES not in os.environ
+
+
+def test_the_users_own_mps_is_used(control, monkeypatch):
+    calls = control(0)
+    monkeypatch.setenv(PIPES, "/somewhere")
+    with shared_gpus(pytest.fail):
+        assert os.environ[PIPES] == "/somewhere"
+    assert os.environ[PIPES] == "/somewhere"
+    assert calls() == []
+
+
+def test_mps_that_does_not_start_is_said(control):
+    control(3)
+    lines = []
+    with shared_gpus(lines.append):
+        assert PIPES not in os.environ
+    assert lines == [f"trainings take turns on a GPU, because {CONTROL} ended with exit code 3"]
+
+
+def test_mps_that_is_not_installed_is_said(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv(PIPES, raising=False)
+    lines = []
+    with shared_gpus(lines.append):
+        assert PIPES not in os.environ
+    assert lines == [f"trainings take turns on a GPU, because {CONTROL} is not installed"]
+
+
+@pytest.mark.parametrize(
+    ("options", "gpus", "shares"),
+    [
+        ({"per_gpu": 2}, 1, True),
+        ({"per_gpu": 2}, 0, False),
+        ({"per_gpu": 1}, 1, False),
+        ({"per_gpu": 2, "device": "cpu"}, 1, False),
+        ({"per_gpu": 2, "address": "head:6379"}, 1, False),
+    ],
+)
+def test_only_trainings_that_share_a_gpu_of_this_machine_need_mps(options, gpus, shares, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    assert _shares_local_gpus(Sweep("ablation", **options)) is shares

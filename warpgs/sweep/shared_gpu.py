@@ -1,0 +1,56 @@
+"""Trainings that share a GPU run on it at the same time: NVIDIA's Multi-Process Service (MPS)."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+CONTROL = "nvidia-cuda-mps-control"
+"""Program of the driver that starts and ends MPS, which needs no privileges."""
+
+PIPES = "CUDA_MPS_PIPE_DIRECTORY"
+"""Variable by which CUDA finds MPS: the folder of its sockets."""
+
+TIMEOUT = 30.0
+"""Time for MPS to start or to end [s]."""
+
+
+@contextmanager
+def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
+    """Processes that start in this context share GPUs through MPS.
+
+    Without it, CUDA runs the kernels of one process at a time, however few of the multiprocessors they use. An MPS that
+    the user has started is left as it is.
+
+    Args:
+        log: Receives a line if MPS cannot be started; processes then take turns.
+    """
+    if PIPES in os.environ:
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="warpgs-mps-", ignore_cleanup_errors=True) as folder:
+        problem = _start({**os.environ, PIPES: folder, "CUDA_MPS_LOG_DIRECTORY": folder})
+        if problem:
+            log(f"trainings take turns on a GPU, because {problem}")
+            yield
+            return
+        os.environ[PIPES] = folder
+        try:
+            yield
+        finally:
+            with suppress(OSError, subprocess.SubprocessError):
+                subprocess.run([CONTROL], input=b"quit\n", capture_output=True, timeout=TIMEOUT)
+            del os.environ[PIPES]
+
+
+def _start(environment: dict[str, str]) -> str:
+    """Starts MPS; returns what went wrong, or nothing."""
+    if shutil.which(CONTROL) is None:
+        return f"{CONTROL} is not installed"
+    try:
+        done = subprocess.run([CONTROL, "-d"], env=environment, stdin=subprocess.DEVNULL, timeout=TIMEOUT)
+    except (OSError, subprocess.SubprocessError) as error:
+        return f"{CONTROL} did not start: {error}"
+    return f"{CONTROL} ended with exit code {done.returncode}" if done.returncode else ""
