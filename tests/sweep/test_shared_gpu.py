@@ -11,7 +11,7 @@ from warpgs.sweep.run_sweep import _shares_local_gpus
 from warpgs.sweep.shared_gpu import CONTROL, PIPES, shared_gpus
 
 SCRIPT = """#!/bin/sh
-echo "$* $(cat) $CUDA_MPS_PIPE_DIRECTORY" >> {calls}
+echo "$* $(cat) $CUDA_MPS_PIPE_DIRECTORY ${{CUDA_VISIBLE_DEVICES-}}" >> {calls}
 exit {code}
 """
 
@@ -31,13 +31,15 @@ def control(tmp_path, monkeypatch):
     return install
 
 
-def test_processes_find_mps_until_it_is_ended(control):
+def test_processes_find_mps_which_has_all_gpus_until_it_is_ended(control, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
     calls = control(0)
     with shared_gpus(pytest.fail):
         folder = os.environ[PIPES]
         assert Path(folder).is_dir()
         assert calls() == [["-d", folder]]
-    assert calls() == [["-d", folder], ["quit", folder]]
+    assert calls() == [["-d", folder], ["quit", folder, "1"]]
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
     assert PIPES not in os.environ
     assert not Path(folder).exists()
 

@@ -31,7 +31,9 @@ def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
         yield
         return
     with tempfile.TemporaryDirectory(prefix="warpgs-mps-", ignore_cleanup_errors=True) as folder:
-        problem = _start({**os.environ, PIPES: folder, "CUDA_MPS_LOG_DIRECTORY": folder})
+        # A GPU hidden from MPS would change the numbers by which its clients name the others.
+        environment = {name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"}
+        problem = _start({**environment, PIPES: folder, "CUDA_MPS_LOG_DIRECTORY": folder})
         if problem:
             log(f"trainings take turns on a GPU, because {problem}")
             yield
