@@ -136,6 +136,23 @@ def test_view_dependent_colours_match_the_renderer(browser, tmp_path, degree):
     assert psnr(shown(browser, tmp_path / "sh.html", ""), expected(baked.at(0.0))) > 40
 
 
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [("log_scales", -46.0), ("log_scales", 30.0), ("means", 1e3), ("means", 1e30), ("sh", 1e3), ("sh", -1e30)],
+)
+def test_the_page_shows_the_others_beside_an_extreme_gaussian(browser, tmp_path, clouds, part, value):
+    def at(time):
+        cloud = clouds.at(time)
+        getattr(cloud, part)[[0, -1], 0] = value
+        if part != "means":
+            cloud.logit_opacities[[0, -1]] = -12.0  # itself it is not seen
+        return cloud
+
+    write_page(tmp_path / "extreme.html", bake(at, [0.0]), start())
+    others = np.arange(1, len(clouds.at(0.0)) - 1)
+    assert psnr(shown(browser, tmp_path / "extreme.html", ""), expected(clouds.at(0.0).select(others))) > 35
+
+
 def test_a_damaged_page_shows_a_message(browser, page, tmp_path):
     text = page.read_text().replace('id="dynamic-colors">', 'id="dynamic-colors">AAAA')
     (tmp_path / "damaged.html").write_text(text)

@@ -27,8 +27,9 @@ against the scene (docs/viewing.md)."""
 MEAN_STEP = 1 / 8
 """Step of a mean, as a fraction of the size of small Gaussians (10th percentile of the longest standard deviation)."""
 
-SCALE_SPAN = 16.0
-"""Range of log-scales below the largest one; a Gaussian that is e¹⁶ times thinner is flat."""
+SCALES = (-7.0, 9.0)
+"""Bounds of log-scales, from that of the median Gaussian's longest axis: an axis that is e⁷ times shorter is flat, and
+one Gaussian of absurd size must not take the precision of all others."""
 
 COLORS = (-1.0, 2.0)
 REST = (-2.0, 2.0)
@@ -164,7 +165,8 @@ def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray, pr
         rotations, log_scales = turned[None, :, 1:], np.take_along_axis(log_scales, axes[None], 2)
     else:
         rotations = _signs_aligned(quats)
-    log_scales = np.maximum(log_scales, log_scales.max(initial=-np.inf) - SCALE_SPAN)
+    middle = np.median(log_scales[0].max(1)) if len(order) else 0.0
+    log_scales = np.clip(log_scales, middle + SCALES[0], middle + SCALES[1])
     values = {
         "means": means,
         "rotations": rotations,

@@ -64,8 +64,11 @@ function packedRotation(q) {
   return word;
 }
 
-function geometryOf({means, rotations, log_scales: scales}, [keys, num]) {
+const NEARLY_LINEAR = 1024; // quantisation steps of the file
+function geometryOf({means: linear, rotations, log_scales: scales}, [keys, num], unit) {
   // Four words per Gaussian: 21 bits per axis of the mean over its bounds, the rotation, and 10 bits per log-scale.
+  // Means beyond a unit are stored by their logarithms, so that distant Gaussians do not make near ones imprecise.
+  const means = linear.map((x) => Math.sign(x) * Math.log1p(Math.abs(x) / unit));
   const words = new Uint32Array(4 * keys * num), implied = rotations.length < 4 * keys * num, q = [0, 0, 0, 0];
   const ranges = [0, 1, 2].map((axis) => boundsOf(axisOf(means, num, axis))), sizes = boundsOf(scales);
   for (let key = 0, out = 0; key < keys; key++) for (let i = 0; i < num; i++, out += 4) {
@@ -152,17 +155,19 @@ function texture(unit, name, values, count, layers, isInteger) {
 async function upload() {
   const means = [];
   for (const [branch, name] of NAMES.entries()) {
-    const {means: {shape}, colors: {shape: [colorKeys]}, rest: {shape: [, , channels]}} = BRANCHES[branch], num = shape[1];
+    const {means: {shape, steps}, colors: {shape: [colorKeys]}, rest: {shape: [, , channels]}} = BRANCHES[branch], num = shape[1];
     const parts = {};
     for (const part of Object.keys(BRANCHES[branch])) parts[part] = await unpacked(name, part);
     for (const part of ['colors', 'rest']) toColors(parts[part], num);
-    const {words, ranges, sizes} = geometryOf(parts, shape), colors = boundsOf(parts.colors), rests = boundsOf(parts.rest);
+    const unit = NEARLY_LINEAR * steps[0], {words, ranges, sizes} = geometryOf(parts, shape, unit);
+    const colors = boundsOf(parts.colors), rests = boundsOf(parts.rest);
     means.push(meansOf(parts.means, shape));
     texture(branch, `${name}Geometry`, words, num, shape[0], true);
     texture(2 + branch, `${name}Colors`, texelsOf(parts.colors, num, colors, parts.opacities), num, colorKeys, false);
     texture(4 + branch, `${name}Rest`, texelsOf(parts.rest, num, rests), num, channels / 3, false);
     gl.uniform3fv(uniform(`lowest[${branch}]`), ranges.map((range) => range[0]));
     gl.uniform3fv(uniform(`span[${branch}]`), ranges.map((range) => range[1] - range[0]));
+    gl.uniform1f(uniform(`unit[${branch}]`), unit);
     gl.uniform2fv(uniform(`sizes[${branch}]`), sizes);
     gl.uniform2fv(uniform(`colors[${branch}]`), colors);
     gl.uniform2fv(uniform(`rests[${branch}]`), rests);

@@ -8,7 +8,8 @@ precision highp sampler2DArray;
 uniform usampler2DArray staticGeometry, dynamicGeometry; // one layer per key time
 uniform sampler2DArray staticColors, dynamicColors;      // one layer per key time
 uniform sampler2DArray staticRest, dynamicRest;          // one layer per coefficient
-uniform vec3 lowest[2], span[2];                         // bounds of the means; [0] static, [1] dynamic
+uniform vec3 lowest[2], span[2];                         // bounds of the stored means; [0] static, [1] dynamic
+uniform float unit[2];                                   // beyond it, means are stored by their logarithms
 uniform vec2 sizes[2], colors[2], rests[2];              // minimum and maximum
 uniform int restBases[2];
 uniform float position;    // time in keys
@@ -46,7 +47,8 @@ mat3 matrixOf(vec4 q) { // q = (w, x, y, z)
 
 vec3 mean(uvec4 words, int branch) {
   uint y = ((words.x & 2047u) << 10) | (words.y >> 21);
-  return lowest[branch] + vec3(words.x >> 11, y, words.y & 2097151u) / 2097151.0 * span[branch];
+  vec3 stored = lowest[branch] + vec3(words.x >> 11, y, words.y & 2097151u) / 2097151.0 * span[branch];
+  return sign(stored) * (exp(abs(stored)) - 1.0) * unit[branch];
 }
 
 vec3 logScales(uint word, int branch) {
