@@ -174,4 +174,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
         assert f'id="{public}"' in api
     assert not re.search(r"<code>\w+,</code>", api)  # two names in one line of a docstring are not parsed
     pages = "".join(path.read_text() for path in (tmp_path / "site").rglob("*.html"))
+    for paragraph in re.findall(r"<p>(.*?)</p>", pages, re.DOTALL):
+        assert not re.search(r"\n(?:[-*]|\d+\.) ", paragraph), paragraph  # a list that Python's Markdown does not see
+    assert not re.search(r"<h\d[^>]*>[^<]*\\", pages)  # an escape that only GitHub understands
     assert not re.search(r'(?:src|href)="https?://[^"]*\.(?:js|css|woff2?)"', pages)  # loads nothing from elsewhere
