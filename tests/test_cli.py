@@ -65,8 +65,9 @@ def test_what_the_output_cannot_represent_is_escaped(arguments, shown, monkeypat
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_rewrapped_and_names_what_is_expected(command, capsys):
-    text = shown(capsys, command, "--help")
+    text = shown(capsys, command, "--help-all" if command == "train" else "--help")
     assert "{None}" not in text
+    assert "``" not in text
     assert "(default: None)" not in text
     # a line ends early only at the end of a text
     broken = re.findall(r"^[│ ] {10,}\S[^│\n]{1,25}[a-z,] {20,}│?\n[│ ] {10,}[a-z]", text, re.MULTILINE)

@@ -150,13 +150,15 @@ def described(options: type, shown: Collection[str] | None = None) -> Iterator[N
     """While it lasts, tyro shows rewrapped help of a dataclass of options and of those inside it.
 
     Args:
-        options: The dataclass; its annotations are replaced, and restored afterwards.
+        options: The dataclass; its annotations and its docstring are replaced, and restored afterwards.
         shown: Names of the fields to show; all if None. The others are accepted, but not shown.
     """
     hints = typing.get_type_hints(options, include_extras=True)
-    before, texts = dict(options.__annotations__), docstrings(options)
+    before, texts, docstring = dict(options.__annotations__), docstrings(options), options.__doc__ or ""
     with contextlib.ExitStack() as stack:
         stack.callback(lambda: setattr(options, "__annotations__", before))
+        stack.callback(lambda: setattr(options, "__doc__", docstring))
+        options.__doc__ = docstring.replace("``", "")
         for name in before:
             hint, plain = hints[name], _plain(hints[name])
             if shown is not None and name not in shown:
