@@ -30,6 +30,15 @@ def state_types(num_channels: int, num_pixels: int) -> tuple[type, type, type, t
     )
 
 
+def is_vectorized(pixels: tuple[int, int]) -> bool:
+    """Whether a lane that owns these columns and rows of pixels composites a row of them at once, without branches.
+
+    LLVM makes vector instructions of such a loop. So it does on CPU, where a lane owns a whole tile; on CUDA the lanes
+    themselves are the vector.
+    """
+    return pixels[0] == TILE_SIZE
+
+
 def module_options(pixels_per_lane: int) -> dict[str, object]:
     """Compile options of a compositing kernel.
 

@@ -19,6 +19,7 @@ from .blocks import (
     block_corner,
     blocks_of_tile,
     equals_joint,
+    is_vectorized,
     module_options,
     stage_survivors,
     state_types,
@@ -90,7 +91,9 @@ def make_composite_bwd(
     P = columns * rows_per_lane
     absolute, of_images = offset_gradient == "absolute", offset_gradient == "images"
     scalars, integers, colors, features_vector = state_types(C, P)
-    sums_vector, lane_add = make_lane_add(C + NUM_MOMENTS + (NUM_OFFSET_SUMS if offset_gradient else 0))
+    vectorized = is_vectorized(pixels)
+    num_sums = C + NUM_MOMENTS + (NUM_OFFSET_SUMS if offset_gradient else 0)
+    sums_vector, lane_add = make_lane_add(num_sums, columns if vectorized else 1)
 
     # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
@@ -182,7 +185,7 @@ def make_composite_bwd(
                                 v = read_gradient(
                                     m, v_image_joint, v_image_static, v_image_dynamic, pixel, wp.static(num_features), c
                                 )
-                                v_color[k * wp.static(C) + c] += v
+                                v_color[c * wp.static(P) + k] += v
                                 if background.shape[0] > 0:
                                     v_transmittance += background[m * background_stride + c] * v
                             if wp.static(of_images):
@@ -190,7 +193,7 @@ def make_composite_bwd(
                             if wp.static(with_depth):
                                 v_depth = read_gradient(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
                                 v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
-                                v_color[k * wp.static(C) + wp.static(num_features)] += v_depth_sum
+                                v_color[wp.static(num_features * P) + k] += v_depth_sum
                                 v_transmittance += v_depth_sum * depth[m * height * width + pixel]
                             R[k] += T[k] * v_transmittance
         n_max = lane_max(n_max)  # from here on, that of the lane group
@@ -227,53 +230,95 @@ def make_composite_bwd(
                     span_end(row0[1] + half_size[1] - y0, wp.static(rows_per_lane)),
                 ):
                     dy = row0[1] - (y0 + float(j * lane_rows()))
-                    span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
-                    for i in range(
-                        span_begin(row0[0] - span[1] - x0, wp.static(columns)),
-                        span_end(row0[0] - span[0] - x0, wp.static(columns)),
-                    ):
-                        dx = row0[0] - (x0 + float(i * lane_columns()))
-                        log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
-                        if log2_alpha >= LOG2_ALPHA_MIN:
+                    if wp.static(vectorized):
+                        row_begin = wp.static(columns) * j & wp.static(P - 1)  # LLVM sees that it is not negative
+                        for i in range(wp.static(columns)):
+                            k = row_begin + i
+                            dx = row0[0] - (x0 + float(i))
+                            log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
+                            hit = log2_alpha >= LOG2_ALPHA_MIN and position <= n[k]
+                            contributes = contributes | wp.where(hit, 1, 0)
                             unclamped = exp2(log2_alpha)
-                            alpha = wp.min(ALPHA_MAX, unclamped)
+                            alpha = wp.where(hit, wp.min(ALPHA_MAX, unclamped), 0.0)
                             scale = 1.0 / (1.0 - alpha)
-                            v_alpha = float(0.0)
-                            v_alpha_images = float(0.0)
-                            k = j * wp.static(columns) + i
-                            if position <= n[k]:
-                                contributes = 1
-                                t = T[k] * scale
-                                w = alpha * t
-                                v_weight = float(0.0)
-                                for c in range(wp.static(C)):
-                                    v = v_color[k * wp.static(C) + c]
-                                    v_weight += features[c] * v
-                                    sums[c] += w * v
-                                if wp.static(of_images):
-                                    v_weight_images = float(0.0)
-                                    for c in range(wp.static(num_features)):
-                                        v_weight_images += features[c] * v_color[k * wp.static(C) + c]
-                                    v_alpha_images = t * v_weight_images - R_images[k] * scale
-                                    R_images[k] = R_images[k] + w * v_weight_images
-                                v_alpha = t * v_weight - R[k] * scale
-                                R[k] = R[k] + w * v_weight
-                                T[k] = t
-                            if unclamped <= ALPHA_MAX:
-                                s = alpha * v_alpha
-                                sums[wp.static(C)] += s
-                                sums[wp.static(C + 1)] += s * dx
-                                sums[wp.static(C + 2)] += s * dy
-                                sums[wp.static(C + 3)] += s * dx * dx
-                                sums[wp.static(C + 4)] += s * dx * dy
-                                sums[wp.static(C + 5)] += s * dy * dy
-                                if wp.static(absolute):
-                                    sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
-                                    sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
-                                if wp.static(of_images):
-                                    s = LN_2 * alpha * v_alpha_images
-                                    sums[wp.static(C + 6)] += s * (2.0 * row0[2] * dx + row0[3] * dy)
-                                    sums[wp.static(C + 7)] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
+                            t = T[k] * scale
+                            w = alpha * t
+                            v_weight = float(0.0)
+                            for c in range(wp.static(C)):
+                                v = v_color[c * wp.static(P) + k]
+                                v_weight += features[c] * v
+                                sums[c * wp.static(columns) + i] += w * v
+                            s = wp.where(unclamped <= ALPHA_MAX, alpha * (t * v_weight - R[k] * scale), 0.0)
+                            R[k] = R[k] + w * v_weight
+                            T[k] = t
+                            sums[wp.static(C * columns) + i] += s
+                            sums[wp.static((C + 1) * columns) + i] += s * dx
+                            sums[wp.static((C + 2) * columns) + i] += s * dy
+                            sums[wp.static((C + 3) * columns) + i] += s * dx * dx
+                            sums[wp.static((C + 4) * columns) + i] += s * dx * dy
+                            sums[wp.static((C + 5) * columns) + i] += s * dy * dy
+                            if wp.static(absolute):
+                                v_x = wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
+                                v_y = wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
+                                sums[wp.static((C + 6) * columns) + i] += LN_2 * v_x
+                                sums[wp.static((C + 7) * columns) + i] += LN_2 * v_y
+                            if wp.static(of_images):
+                                v_weight_images = float(0.0)
+                                for c in range(wp.static(num_features)):
+                                    v_weight_images += features[c] * v_color[c * wp.static(P) + k]
+                                v_alpha_images = t * v_weight_images - R_images[k] * scale
+                                R_images[k] = R_images[k] + w * v_weight_images
+                                s = wp.where(unclamped <= ALPHA_MAX, LN_2 * alpha * v_alpha_images, 0.0)
+                                sums[wp.static((C + 6) * columns) + i] += s * (2.0 * row0[2] * dx + row0[3] * dy)
+                                sums[wp.static((C + 7) * columns) + i] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
+                    else:
+                        span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
+                        for i in range(
+                            span_begin(row0[0] - span[1] - x0, wp.static(columns)),
+                            span_end(row0[0] - span[0] - x0, wp.static(columns)),
+                        ):
+                            dx = row0[0] - (x0 + float(i * lane_columns()))
+                            log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
+                            if log2_alpha >= LOG2_ALPHA_MIN:
+                                unclamped = exp2(log2_alpha)
+                                alpha = wp.min(ALPHA_MAX, unclamped)
+                                scale = 1.0 / (1.0 - alpha)
+                                v_alpha = float(0.0)
+                                v_alpha_images = float(0.0)
+                                k = j * wp.static(columns) + i
+                                if position <= n[k]:
+                                    contributes = 1
+                                    t = T[k] * scale
+                                    w = alpha * t
+                                    v_weight = float(0.0)
+                                    for c in range(wp.static(C)):
+                                        v = v_color[c * wp.static(P) + k]
+                                        v_weight += features[c] * v
+                                        sums[c] += w * v
+                                    if wp.static(of_images):
+                                        v_weight_images = float(0.0)
+                                        for c in range(wp.static(num_features)):
+                                            v_weight_images += features[c] * v_color[c * wp.static(P) + k]
+                                        v_alpha_images = t * v_weight_images - R_images[k] * scale
+                                        R_images[k] = R_images[k] + w * v_weight_images
+                                    v_alpha = t * v_weight - R[k] * scale
+                                    R[k] = R[k] + w * v_weight
+                                    T[k] = t
+                                if unclamped <= ALPHA_MAX:
+                                    s = alpha * v_alpha
+                                    sums[wp.static(C)] += s
+                                    sums[wp.static(C + 1)] += s * dx
+                                    sums[wp.static(C + 2)] += s * dy
+                                    sums[wp.static(C + 3)] += s * dx * dx
+                                    sums[wp.static(C + 4)] += s * dx * dy
+                                    sums[wp.static(C + 5)] += s * dy * dy
+                                    if wp.static(absolute):
+                                        sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
+                                        sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
+                                    if wp.static(of_images):
+                                        s = LN_2 * alpha * v_alpha_images
+                                        sums[wp.static(C + 6)] += s * (2.0 * row0[2] * dx + row0[3] * dy)
+                                        sums[wp.static(C + 7)] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
                 if lane_any(contributes) != 0:
                     lane_add(sums, gradients, g)
             lane_sync()

@@ -16,6 +16,9 @@ come first in the launch, so that most groups of a branch read in ``joint_state`
 that runs before this is known writes the same bits again.
 
 The transmittance of a pixel is negated once the pixel is complete.
+
+On CUDA a lane owns one or two pixels and skips what does not reach them. On CPU it owns a whole tile and composites all
+pixels of a row at once, with selections instead of branches (``is_vectorized``).
 """
 
 import functools
@@ -28,6 +31,7 @@ from .blocks import (
     block_corner,
     blocks_of_tile,
     equals_joint,
+    is_vectorized,
     module_options,
     stage_survivors,
     state_types,
@@ -74,6 +78,7 @@ def make_composite_fwd(
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
+    vectorized = is_vectorized(pixels)
     scalars, integers, colors, features_vector = state_types(C, P)
     # With branches, the lowest two bits of a Gaussian's tag encode its branch, and those of a pixel's tag all branches
     # that it has evaluated; the other bits are the position in the list. (In lists of one branch they are not used.)
@@ -161,35 +166,60 @@ def make_composite_fwd(
                 threshold = row1[1] - LOG2_ALPHA_MIN
                 half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
                 weight = float(0.0)
+                closed = int(0)
                 for j in range(
                     span_begin(row0[1] - half_size[1] - y0, wp.static(rows_per_lane)),
                     span_end(row0[1] + half_size[1] - y0, wp.static(rows_per_lane)),
                 ):
                     dy = row0[1] - (y0 + float(j * lane_rows()))
-                    span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
-                    for i in range(
-                        span_begin(row0[0] - span[1] - x0, wp.static(columns)),
-                        span_end(row0[0] - span[0] - x0, wp.static(columns)),
-                    ):
-                        dx = row0[0] - (x0 + float(i * lane_columns()))
-                        log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
-                        if log2_alpha >= LOG2_ALPHA_MIN:
-                            alpha = wp.min(ALPHA_MAX, exp2(log2_alpha))
-                            k = j * wp.static(columns) + i
+                    if wp.static(vectorized):
+                        row_begin = wp.static(columns) * j & wp.static(P - 1)  # LLVM sees that it is not negative
+                        for i in range(wp.static(columns)):
+                            k = row_begin + i
+                            dx = row0[0] - (x0 + float(i))
+                            log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
                             t = T[k]
-                            if t > 0.0:
-                                t_next = t - alpha * t
-                                if t_next <= TRANSMITTANCE_MIN:
-                                    T[k] = -t
-                                    open_pixels[0] -= 1
-                                    n[k] = n[k] | (tag & wp.static(branch_bits))
-                                else:
-                                    w = alpha * t
-                                    for c in range(wp.static(C)):
-                                        color[k * wp.static(C) + c] += w * features[c]
-                                    T[k] = t_next
-                                    n[k] = tag | (n[k] & wp.static(branch_bits))
-                                    weight += w
+                            tags = n[k]
+                            hit = log2_alpha >= LOG2_ALPHA_MIN and t > 0.0
+                            alpha = wp.where(hit, wp.min(ALPHA_MAX, exp2(log2_alpha)), 0.0)
+                            t_next = t - alpha * t
+                            closes = hit and t_next <= TRANSMITTANCE_MIN
+                            w = wp.where(closes, 0.0, alpha * t)
+                            for c in range(wp.static(C)):
+                                color[c * wp.static(P) + k] += w * features[c]
+                            T[k] = wp.where(closes, -t, t_next)
+                            seen = (tags | tag) & wp.static(branch_bits)
+                            n[k] = wp.where(hit, seen | wp.where(closes, tags, tag), tags)
+                            closed += wp.where(closes, 1, 0)
+                            if wp.static(statistics):
+                                weight += w
+                    else:
+                        span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
+                        for i in range(
+                            span_begin(row0[0] - span[1] - x0, wp.static(columns)),
+                            span_end(row0[0] - span[0] - x0, wp.static(columns)),
+                        ):
+                            dx = row0[0] - (x0 + float(i * lane_columns()))
+                            log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
+                            if log2_alpha >= LOG2_ALPHA_MIN:
+                                alpha = wp.min(ALPHA_MAX, exp2(log2_alpha))
+                                k = j * wp.static(columns) + i
+                                t = T[k]
+                                if t > 0.0:
+                                    t_next = t - alpha * t
+                                    if t_next <= TRANSMITTANCE_MIN:
+                                        T[k] = -t
+                                        open_pixels[0] -= 1
+                                        n[k] = n[k] | (tag & wp.static(branch_bits))
+                                    else:
+                                        w = alpha * t
+                                        for c in range(wp.static(C)):
+                                            color[c * wp.static(P) + k] += w * features[c]
+                                        T[k] = t_next
+                                        n[k] = tag | (n[k] & wp.static(branch_bits))
+                                        weight += w
+                if wp.static(vectorized):
+                    open_pixels[0] -= closed
                 if wp.static(statistics) and own_image == 0:
                     weight = lane_sum(weight)
                     if lane == 0 and weight > 0.0:
@@ -221,12 +251,12 @@ def make_composite_fwd(
                             p = (m * height + y) * width + x
                             alpha_image[p] = 1.0 - t
                             for c in range(wp.static(num_features)):
-                                value = color[k * wp.static(C) + c]
+                                value = color[c * wp.static(P) + k]
                                 if background.shape[0] > 0:
                                     value += t * background[m * background_stride + c]
                                 image[p, c] = value
                             if wp.static(num_features < C):
-                                depth_sum = color[k * wp.static(C) + wp.static(num_features)]
+                                depth_sum = color[wp.static(num_features * P) + k]
                                 depth[p] = depth_sum / wp.max(1.0 - t, MIN_ALPHA)
 
     return composite_fwd

@@ -143,17 +143,36 @@ def span_end(high: float, size: int) -> int:
     ...
 
 
-@wp.func_native("return exp2f(x);")
+# On CPU the Taylor series of 2^f for f in [-½, ½], to single precision: LLVM vectorizes no call of exp2f.
+@wp.func_native(
+    native(
+        "return exp2f(x);",
+        """
+        const float bounded = x > -126.0f ? x : -126.0f;
+        const float whole = rintf(bounded);
+        const float f = bounded - whole;
+        const float p = 1.0f + f * (0.693147180559945f + f * (0.240226506959101f + f * (0.0555041086648216f
+                      + f * (0.00961812910762848f + f * (0.00133335581464284f + f * 0.000154035303933816f)))));
+        const int bits = ((int)whole + 127) << 23;
+        float power;
+        __builtin_memcpy(&power, &bits, 4);
+        return p * power;
+        """,
+    )
+)
 def exp2(x: float) -> float: ...
 
 
 # Sums of K values over 32 lanes with little more than one shuffle per value instead of five: in each of the five steps
 # a lane sends the half of its values that its partner keeps, so that each lane ends with K/32 totals, which are
 # adjacent: the totals [index, index + held).
-def make_lane_add(length: int):
+def make_lane_add(length: int, columns: int = 1):
     """A vector type of ``length`` floats and a function ``lane_add(values, target, row)`` that adds the lane group's
-    sum of each value to ``target[row]``, which is a row of contiguous floats."""
-    values_type = wp.types.vector(length=length, dtype=float)
+    sum of each value to ``target[row]``, which is a row of contiguous floats.
+
+    On CPU, each value may be given as ``columns`` consecutive parts, a power of two.
+    """
+    values_type = wp.types.vector(length=length * columns, dtype=float)
 
     @wp.func_native(
         native(
@@ -186,9 +205,15 @@ def make_lane_add(length: int):
             for (int k = 0; k < (K + 31) / 32; ++k)
                 if (k < held) atomicAdd(total + k, v[k]);
             """,
-            """
+            f"""
             float* total = &wp::index(target, row, 0);
-            for (int k = 0; k < (int)(sizeof(values) / sizeof(float)); ++k) total[k] += values[k];
+            for (int k = 0; k < {length}; ++k) {{
+                float parts[{columns}];
+                for (int i = 0; i < {columns}; ++i) parts[i] = values[k * {columns} + i];
+                for (int n = {columns} / 2; n > 0; n /= 2)
+                    for (int i = 0; i < n; ++i) parts[i] += parts[n + i];
+                total[k] += parts[0];
+            }}
             """,
         )
     )

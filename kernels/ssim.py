@@ -34,9 +34,6 @@ RADIUS = 5
 STRIP = 16
 """Pixels of one column per thread on CUDA; the lines above and below a strip are filtered once more."""
 
-CPU_STRIP = 128
-"""As ``STRIP``, on CPU, where columns and channels are threads enough."""
-
 SMALL_IMAGE_STRIP = 4
 """As ``STRIP``, for small images on CUDA, which would otherwise have too few threads to keep a GPU busy."""
 

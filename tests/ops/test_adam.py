@@ -7,6 +7,14 @@ from tests.reference.adam import adam as reference
 from tests.scenes import generator, relative_error
 from warpgs.ops.adam import Adam
 
+
+@pytest.fixture(autouse=True, params=["torch", "kernel"])
+def implementation(request, monkeypatch):
+    """Each test runs torch's implementation, which is that of the CPU, and the kernel of CUDA."""
+    if request.param == "kernel":
+        monkeypatch.setattr(Adam, "_step_on_cpu", Adam._launch)
+
+
 BETAS, EPSILON = (0.9, 0.999), 1e-15
 RATES = (0.01, 0.3)
 
@@ -51,6 +59,15 @@ def test_steps_equal_those_of_torch():
         assert torch.allclose(a, b, rtol=1e-6, atol=2e-6)
         for name in ("exp_avg", "exp_avg_sq"):
             assert torch.allclose(optimizer.state[a][name], expected.state[b][name], rtol=1e-6, atol=1e-7)
+
+
+def test_gradients_may_have_any_strides():
+    parameter = torch.zeros(3, 4, requires_grad=True)
+    gradient = torch.randn(4, 3, generator=generator()).T
+    optimizer = Adam([{"params": [parameter], "lr": torch.tensor(0.5)}], BETAS, EPSILON)
+    parameter.grad = gradient
+    optimizer.step()
+    assert torch.allclose(parameter.detach(), -0.5 * gradient.sign(), rtol=1e-6)
 
 
 def test_the_length_of_the_first_step_is_the_learning_rate():

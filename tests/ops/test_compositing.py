@@ -6,12 +6,21 @@ import torch
 from tests.ops.alone import composite
 from tests.reference.compositing import composite as reference
 from tests.scenes import error, generator, random_like, relative_error, weighted_sum
+from warpgs.ops import compositing
 from warpgs.ops.compositing import composite_bwd, composite_fwd
 from warpgs.ops.projection import Projection
 from warpgs.ops.rows import pack, unpack
 from warpgs.ops.tiles import bin_splats
 from warpgs.runtime import launch
 from warpgs.runtime.launch import command_for
+
+
+@pytest.fixture(autouse=True, params=["rows", "pixels"])
+def loop(request, monkeypatch):
+    """Each test composites whole rows of a tile at once, as on CPU, and pixel by pixel, as on CUDA."""
+    if request.param == "pixels":
+        monkeypatch.setattr(compositing, "CPU_PIXELS", compositing.CUDA_PIXELS)
+
 
 SIZE = (50, 37)
 INPUTS = ("means2d", "conics", "opacities", "features", "background")

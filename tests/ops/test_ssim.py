@@ -7,10 +7,23 @@ from skimage.metrics import structural_similarity
 from tests.reference.ssim import ssim_map as reference
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.kernels import ssim as kernels
+from warpgs.ops import ssim_cpu
 from warpgs.ops.ssim import l1_and_ssim, ssim, ssim_map
 
-SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2)]
-"""Also higher than one thread's strip, and narrower than the window."""
+SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2), (12, 13, ssim_cpu.MAX_CHANNELS + 1)]
+"""Also higher than one thread's strip, narrower than the window, and with more channels than OpenCV filters."""
+
+
+def run_kernels(monkeypatch):
+    """Lets the CPU run the kernels of CUDA."""
+    monkeypatch.setattr(ssim_cpu, "can_filter", lambda image: False)
+
+
+@pytest.fixture(autouse=True, params=["filters", "kernels"])
+def implementation(request, monkeypatch):
+    """Each test runs OpenCV's filters, the implementation of the CPU, and the kernels of CUDA."""
+    if request.param == "kernels":
+        run_kernels(monkeypatch)
 
 
 def images(size=(37, 50, 3)):
@@ -43,9 +56,10 @@ def test_gradient_equals_the_reference(size, masked):
 
 
 def test_the_strip_size_makes_no_difference(monkeypatch):
+    run_kernels(monkeypatch)
     values = []
-    for strip in (kernels.STRIP, kernels.SMALL_IMAGE_STRIP, kernels.CPU_STRIP):
-        monkeypatch.setattr(kernels, "CPU_STRIP", strip)
+    for strip in (kernels.STRIP, kernels.SMALL_IMAGE_STRIP, 128):
+        monkeypatch.setattr(kernels, "SMALL_IMAGE_STRIP", strip)
         image, target, mask = images((37, 21, 3))
         value = ssim_map(image.requires_grad_(), target, mask)
         value.square().sum().backward()
@@ -131,6 +145,22 @@ def test_equal_images_have_no_loss_and_no_gradient():
     value.backward()
     assert value.item() == pytest.approx(0, abs=1e-7)
     assert leaf.grad.abs().max() < 1e-7
+
+
+@pytest.mark.parametrize("size", [(0, 5, 3), (5, 0, 3), (5, 5, 0)])
+def test_the_map_of_an_image_without_pixels_is_empty(size):
+    assert ssim_map(torch.zeros(size), torch.zeros(size)).shape == size
+
+
+def test_values_outside_the_mask_may_be_nan():
+    image, target, mask = images()
+    expected = ssim(image, target, mask)
+    image[~mask] = torch.nan
+    image.requires_grad_()
+    value = ssim(image, target, mask)
+    value.backward()
+    assert torch.equal(value, expected)
+    assert image.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("compare", [ssim, lambda image, target: l1_and_ssim(image, target, 0.2)])

@@ -1,9 +1,10 @@
-"""Adam on the device (kernels/adam.py)."""
+"""Adam on the device: on CUDA in one kernel (kernels/adam.py), on CPU in torch's."""
 
 import math
 from typing import Any
 
 import torch
+from torch.optim.adam import adam
 
 from warpgs.kernels import adam as kernels
 from warpgs.runtime.launch import launch
@@ -12,7 +13,7 @@ from warpgs.runtime.launch import launch
 class Adam(torch.optim.Optimizer):
     """Adam as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, with one launch for each parameter.
 
-    Torch's kernel gives each CUDA block 65,536 numbers, so that the parameters of the Gaussians occupy only a few
+    Torch's CUDA kernel gives each block 65,536 numbers, so that the parameters of the Gaussians occupy only a few
     blocks. All state that changes between steps is on the device, so that a step can be part of a CUDA graph.
 
     Args:
@@ -36,6 +37,12 @@ class Adam(torch.optim.Optimizer):
                 state["step"] = torch.zeros((), device=parameter.device)
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
+        if trained[0][1].is_cuda:
+            self._launch(trained)
+        else:
+            self._step_on_cpu(trained)
+
+    def _launch(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
         torch._foreach_add_([self.state[parameter]["step"] for _, parameter in trained], 1.0)
         for group, parameter in trained:
             state = self.state[parameter]
@@ -51,4 +58,25 @@ class Adam(torch.optim.Optimizer):
                 parameter.view(-1),
                 state["exp_avg"].view(-1),
                 state["exp_avg_sq"].view(-1),
+            )
+
+    def _step_on_cpu(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
+        """Torch's kernel, which is vectorized, as Warp's on CPU is not."""
+        for group, parameter in trained:
+            state = self.state[parameter]
+            adam(
+                [parameter],
+                [parameter.grad.contiguous()],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                fused=True,
+                amsgrad=False,
+                beta1=group["betas"][0],
+                beta2=group["betas"][1],
+                lr=group["lr"],
+                weight_decay=0.0,
+                eps=group["eps"],
+                maximize=False,
             )

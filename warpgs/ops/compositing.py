@@ -93,11 +93,14 @@ def is_small(size: tuple[int, int]) -> bool:
 def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, int]:
     """Columns and rows of the pixels of a lane, number of blocks of an image, lanes per block."""
     num_tiles = len(tiles.ranges)
-    if not tiles.ranges.is_cuda:
-        return CPU_PIXELS, num_tiles, 1
-    columns, rows = SMALL_IMAGE_CUDA_PIXELS if is_small(size) else CUDA_PIXELS
-    blocks_of_tile = (TILE_SIZE // (WARP_COLUMNS * columns)) * (TILE_SIZE // (WARP_ROWS * rows))
-    return (columns, rows), num_tiles * blocks_of_tile, WARP_SIZE
+    if tiles.ranges.is_cuda:
+        columns, rows = SMALL_IMAGE_CUDA_PIXELS if is_small(size) else CUDA_PIXELS
+        block_size, lanes = (WARP_COLUMNS * columns, WARP_ROWS * rows), WARP_SIZE
+    else:
+        columns, rows = block_size = CPU_PIXELS
+        lanes = 1
+    blocks_of_tile = (TILE_SIZE // block_size[0]) * (TILE_SIZE // block_size[1])
+    return (columns, rows), num_tiles * blocks_of_tile, lanes
 
 
 def _launch(

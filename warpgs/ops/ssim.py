@@ -1,4 +1,9 @@
-"""Fused structural similarity (SSIM), alone or together with the L1 loss (kernels/ssim.py)."""
+"""Structural similarity (SSIM), alone or together with the L1 loss.
+
+On CUDA by two kernels (kernels/ssim.py, where the formulas are), on CPU by OpenCV's filters (ops/ssim_cpu.py).
+"""
+
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,10 +14,20 @@ from warpgs.runtime.checks import check_same_device, check_tensor
 from warpgs.runtime.launch import launch
 from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
+from . import ssim_cpu
 from .compositing import is_small
 
-SIMILARITY = (0.0, 0.0, 1.0)
-"""The weights base, l1 and similarity of the kernels (kernels/ssim.py) for SSIM alone."""
+
+class Weights(NamedTuple):
+    """Weights of ``base + l1 |image − target| + similarity SSIM``."""
+
+    base: float
+    l1: float
+    similarity: float
+
+
+SIMILARITY = Weights(0.0, 0.0, 1.0)
+"""SSIM alone."""
 
 
 def ssim_map(
@@ -52,42 +67,55 @@ def l1_and_ssim(
     Args:
         ssim_weight: λ.
     """
-    return _compare(image, target, mask, (ssim_weight, 1.0, -ssim_weight), mean=True)
+    return _compare(image, target, mask, Weights(ssim_weight, 1.0, -ssim_weight), mean=True)
 
 
-def _compare(
-    image: Tensor, target: Tensor, mask: Tensor | None, weights: tuple[float, float, float], mean: bool
-) -> Tensor:
+def _compare(image: Tensor, target: Tensor, mask: Tensor | None, weights: Weights, mean: bool) -> Tensor:
     """base + l1 |image − target| + similarity SSIM: the mean, or without L1 the [H, W, C] values."""
     assert mean or weights == SIMILARITY
     _check_inputs(image, target, mask, mean)
-    mask_bytes = None if mask is None else mask.view(torch.uint8)
-    H, W, C = image.shape
-    strip = kernels.CPU_STRIP
-    if image.is_cuda:
-        strip = kernels.SMALL_IMAGE_STRIP if is_small((W, H)) else kernels.STRIP
-    threads = -(-H // strip) * W * C
-    _, l1, similarity = weights
-    with_mask = mask is not None
+    filtered = ssim_cpu.can_filter(image)
+    forward, backward = (ssim_cpu.ssim_fwd, ssim_cpu.ssim_bwd) if filtered else (ssim_fwd, ssim_bwd)
 
     def op(image: Tensor, target: Tensor) -> Recorded:
-        values = image.new_empty(H, W, C)
-        partials = image.new_empty(3 if image.requires_grad else 0, H, W, C)
-        outputs = (*weights, values, partials)
-        launch(kernels.make_ssim_fwd(with_mask), threads, image, target, mask_bytes, strip, *outputs, work=strip)
-        return Recorded((values.mean() if mean else values,), backward, (image, target, partials))
+        values, partials = forward(image, target, mask, weights, image.requires_grad)
+        return Recorded((values.mean() if mean else values,), op_backward, (image, target, partials))
 
-    def backward(saved: tuple[Tensor, ...], v_outputs: Gradients) -> Gradients:
+    def op_backward(saved: tuple[Tensor, ...], v_outputs: Gradients) -> Gradients:
         (image, target, partials), (v,) = saved, v_outputs
         assert v is not None
-        v_image = torch.empty_like(image)
-        scale, scaled_partials = (1.0 / image.numel(), partials) if mean else (1.0, v * partials)
-        v_sum = v.view(1) if mean else v.new_ones(1)
-        arguments = (scale * l1, scale * similarity, scaled_partials, v_sum, v_image)
-        launch(kernels.make_ssim_bwd(with_mask), threads, image, target, mask_bytes, strip, *arguments, work=strip)
-        return v_image, None
+        if mean:
+            scaled = Weights(0.0, weights.l1 / image.numel(), weights.similarity / image.numel())
+            return backward(image, target, mask, scaled, partials, v.view(1)), None
+        return backward(image, target, mask, weights, v * partials, v.new_ones(1)), None
 
     return differentiable(op, image, target.detach())[0]
+
+
+def ssim_fwd(
+    image: Tensor, target: Tensor, mask: Tensor | None, weights: Weights, with_partials: bool
+) -> tuple[Tensor, Tensor]:
+    """The weighted values [H, W, C] of the kernel, and the three partial derivatives of SSIM [3 or 0, H, W, C]."""
+    values = torch.empty_like(image)
+    partials = image.new_empty(3 if with_partials else 0, *image.shape)
+    _launch(kernels.make_ssim_fwd(mask is not None), image, target, mask, *weights, values, partials)
+    return values, partials
+
+
+def ssim_bwd(
+    image: Tensor, target: Tensor, mask: Tensor | None, weights: Weights, partials: Tensor, v_sum: Tensor
+) -> Tensor:
+    """The gradient of ``image`` [H, W, C], from that of the sum of all values [1]; ``base`` is not used."""
+    v_image = torch.empty_like(image)
+    _launch(kernels.make_ssim_bwd(mask is not None), image, target, mask, *weights[1:], partials, v_sum, v_image)
+    return v_image
+
+
+def _launch(kernel: Any, image: Tensor, target: Tensor, mask: Tensor | None, *arguments: Any) -> None:
+    H, W, C = image.shape
+    strip = kernels.SMALL_IMAGE_STRIP if is_small((W, H)) else kernels.STRIP
+    mask_bytes = None if mask is None else mask.view(torch.uint8)
+    launch(kernel, -(-H // strip) * W * C, image, target, mask_bytes, strip, *arguments, work=strip)
 
 
 def _check_inputs(image: Tensor, target: Tensor, mask: Tensor | None, mean: bool) -> None:

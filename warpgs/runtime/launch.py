@@ -9,7 +9,7 @@ import contextlib
 import functools
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -77,10 +77,19 @@ def launch_on_cpu(kernel: wp.Kernel, dim: int, arguments: Sequence[Any], work: i
         for first in range(shard * chunk, dim, shards * chunk):
             command(min(chunk, dim - first), first, arguments, None, shard)
 
-    if shards == 1:
-        run_shard(0)
+    on_all_cores(run_shard, shards)
+
+
+def on_all_cores(function: Callable[[int], None], number: int) -> None:
+    """Calls ``function(0)`` to ``function(number - 1)`` at once, on the threads of the CPU shards, and waits for them.
+
+    It helps those functions that release Python's global interpreter lock.
+    """
+    if number == 1 or num_shards(torch.device("cpu")) == 1:
+        for index in range(number):
+            function(index)
     else:
-        list(_workers().map(run_shard, range(shards)))
+        list(_workers().map(function, range(number)))
 
 
 @functools.cache
