@@ -12,12 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.prepare import boards
 from warpgs.data.lens import Lens
-from warpgs.prepare import colmap, sfm
+from warpgs.prepare import colmap, focal_guess, sfm
 from warpgs.prepare.cameras import Cameras, NoCamerasError
 from warpgs.prepare.colmap import Job, _map_globally
+from warpgs.prepare.focal_guess import calibrated
 from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
 
@@ -257,6 +259,52 @@ def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
     model = _map_globally(job, tmp_path / "features.db", lambda *progress: None)
     assert started == starts
     assert model.cameras[1].mean_focal_length() == kept
+    assert not list(tmp_path.glob("*.calibrated.db"))
+
+
+def test_the_focal_length_that_pairs_agree_on_is_the_true_one(tmp_path):
+    """Of cameras at random places with random directions: those of ``wide_database`` look at one point."""
+    wide_database(tmp_path / "features.db")
+    opened, random = pycolmap.Database.open(tmp_path / "features.db"), np.random.default_rng(0)
+    calibration = np.linalg.inv([[240.0, 0.0, 240.0], [0.0, 240.0, 135.0], [0.0, 0.0, 1.0]])
+    poses = [(Rotation.from_rotvec(random.normal(size=3) * 0.3), random.normal(size=3)) for _ in range(7)]
+    for key, pair in zip(*opened.read_two_view_geometries(), strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(key)
+        turn = (poses[b][0] * poses[a][0].inv()).as_matrix()
+        x, y, z = poses[b][1] - turn @ poses[a][1]
+        essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ turn
+        pair.F, pair.config = (
+            calibration.T @ essential @ calibration,
+            pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
+        )
+        opened.update_two_view_geometry(a, b, pair)
+    opened.close()
+    copy = calibrated(tmp_path / "features.db")
+    assert copy != tmp_path / "features.db"
+    assert focal_guess._focal(copy) == pytest.approx(240.0, rel=0.02)
+
+
+@pytest.mark.parametrize(("placed", "tried"), [(6, 1), (5, 2)])
+def test_a_far_focal_length_that_loses_frames_has_a_rival(placed, tried, tmp_path, monkeypatch):
+    names, started = wide_database(tmp_path / "features.db"), []
+
+    def map_from(job: Job, path: Path) -> SimpleNamespace:
+        started.append(path)
+        focal = focal_guess._focal(path)
+        measures = {"num_reg_images": lambda: placed, "compute_mean_reprojection_error": lambda: 0.5}
+        return SimpleNamespace(cameras={1: SimpleNamespace(mean_focal_length=lambda: focal)}, **measures)
+
+    def calibrate(path: Path, options: object) -> bool:
+        opened = pycolmap.Database.open(path)
+        set_focal(opened, 240.0)
+        opened.close()
+        return True
+
+    monkeypatch.setattr(pycolmap, "calibrate_view_graph", calibrate)
+    monkeypatch.setattr(colmap, "_map_from", map_from)
+    job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
+    assert _map_globally(job, tmp_path / "features.db", lambda *progress: None) is not None
+    assert len(started) == tried
 
 
 def test_a_known_focal_length_is_kept(tmp_path):

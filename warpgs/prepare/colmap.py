@@ -269,7 +269,11 @@ def _map_globally(job: Job, database: Path, report: Report) -> Any:
     report("cameras", 0, len(job.names))
     start = calibrated(database) if job.finds_focal and job.lens != FISHEYE else database
     model = _map_from(job, start)
-    if start == database or (model is not None and confirms(model, start)):
+    if start == database:
+        return model
+    is_confirmed = _size(model) >= ENOUGH * len(job.names) and confirms(model, start)
+    start.unlink()  # a copy
+    if is_confirmed:
         return model
     found = [m for m in (model, _map_from(job, database)) if m is not None]
     return min(found, key=lambda m: (-_size(m), m.compute_mean_reprojection_error()), default=None)

@@ -32,7 +32,10 @@ def calibrated(database: Path) -> Path:
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = 0
     is_far = pycolmap.calibrate_view_graph(copy, options) and not _are_near(_focal(copy), _focal(database), FAR)
-    return copy if is_far else database
+    if is_far:
+        return copy
+    copy.unlink()
+    return database
 
 
 def confirms(model: Any, database: Path) -> bool:
