@@ -9,7 +9,7 @@ from warpgs.data.writer import write_depth
 from warpgs.prepare.cameras import Cameras
 from warpgs.prepare.depth import add_depth, as_half
 from warpgs.prepare.flow import Flows
-from warpgs.prepare.flow_depth import static_depth
+from warpgs.prepare.flow_depth import _enlarged, static_depth
 from warpgs.prepare.images import brighten
 from warpgs.prepare.methods import DepthMethod
 from warpgs.prepare.motion_masks import clean, find_dynamic, gather, outline, vote
@@ -262,6 +262,16 @@ def test_depth_is_unknown_in_dynamic_regions(video, frames):
     planes = static_depth(frames, video[1])
     assert all(np.isnan(plane[mask]).all() for plane, mask in zip(planes, video[1], strict=True))
     assert np.mean([np.isfinite(plane).mean() for plane in planes]) > 0.5
+
+
+def test_depth_is_not_interpolated_across_an_edge_or_into_the_unknown():
+    plane = np.full((6, 8), 0.2, np.float32)
+    plane[:, 4:], plane[0, 0] = 0.9, np.nan
+    enlarged = _enlarged(plane, 16, 12)
+    assert np.array_equal(enlarged, cv2.resize(plane, (16, 12), interpolation=cv2.INTER_NEAREST), equal_nan=True)
+    slanted = np.tile(np.linspace(0.5, 0.6, 8, dtype=np.float32), (6, 1))
+    steps = np.diff(_enlarged(slanted, 16, 12)[5, 2:-2])
+    assert np.allclose(steps, steps[0], rtol=1e-3)  # within ``AGREEMENT``
 
 
 def test_depth_without_a_known_pixel_is_written_as_unknown(tmp_path):

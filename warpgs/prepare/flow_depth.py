@@ -62,10 +62,15 @@ def static_depth(
 
 
 def _enlarged(plane: np.ndarray, width: int, height: int) -> Float[np.ndarray, "H W"]:
-    """[H, W] the plane at another size, interpolated where all is known around."""
+    """[H, W] the plane at another size, interpolated where all around is known and agrees: on no surface's edge."""
     smooth = cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR)
     nearest = cv2.resize(plane, (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.where(np.isnan(smooth), nearest, smooth)
+    around, unknown = np.ones((3, 3), np.uint8), np.isnan(plane)
+    least = cv2.erode(np.where(unknown, np.float32(np.inf), plane), around)
+    most = cv2.dilate(np.where(unknown, np.float32(-np.inf), plane), around)
+    is_edge = (most / (1.0 + AGREEMENT) > least).astype(np.uint8)
+    is_edge = cv2.resize(is_edge, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return np.where(np.isnan(smooth) | is_edge, nearest, smooth)
 
 
 def _confirmed(frames: PosedFrames, geometry: Sequence[LocalGeometry], frame: int) -> Float[np.ndarray, "H W"]:
