@@ -333,3 +333,12 @@ def test_votes_follow_the_motion():
         dynamic[k, 0, k + 1] = True
     step = (np.arange(5), np.arange(1, 6))
     assert np.array_equal(vote(list(dynamic), [step, step]), dynamic)
+
+
+def test_a_region_too_small_for_every_fourth_pixel_is_outlined():
+    image = np.full((96, 128, 3), 90, np.uint8)
+    image[40:43, 40:43] = 250
+    probability = cv2.circle(np.zeros((96, 128), np.float32), (41, 41), 4, 1.0, -1)
+    found = outline(image, probability)
+    assert found[39:44, 39:44].any()
+    assert found.mean() < 0.01
