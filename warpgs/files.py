@@ -9,7 +9,6 @@ import re
 import reprlib
 import shutil
 import stat
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -245,20 +244,6 @@ def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
     if len(data) != size:
         raise ValueError(f"{path} changes while it is read: expected {size:,} bytes")
     return data
-
-
-def read_start(path: Path, count: int) -> bytes:
-    """The first ``count`` bytes of a regular file, or all if it has fewer.
-
-    Raises:
-        ValueError: If it is missing or not a regular file; the message names it.
-    """
-    require_file(path, sys.maxsize)
-    try:
-        with path.open("rb") as file:
-            return file.read(count)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str, Any]:

@@ -8,12 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from PIL import Image
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json, write_png
 from warpgs.config import MaskPerturbation
 from warpgs.data.colmap import lens_of
-from warpgs.data.images import has_alpha
+from warpgs.data.images import is_transparent
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.loaders.posed import plain_names, times_of_names
@@ -190,15 +191,25 @@ def test_over_another_colour_nothing_is_known_to_be_empty(written):
     assert capture.over("white").frame("train_r_000").empty.any()
 
 
-def test_alpha_is_found_in_the_header_alone(written, tmp_path):
-    path = written["blender"] / "train/r_000.png"
-    cut = tmp_path / "cut.png"
-    cut.write_bytes(path.read_bytes()[:30])
-    assert has_alpha(cut)
-    write_png(cut, layouts.image(0))
-    assert not has_alpha(cut)
+def test_an_image_is_transparent_if_a_pixel_is(written, tmp_path):
+    path = tmp_path / "image.png"
+    assert is_transparent(written["blender"] / "train/r_000.png")
+    image = layouts.image(0)
+    write_png(path, image)
+    assert not is_transparent(path)
+    opaque = np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])
+    cv2.imwrite(str(path), opaque)
+    assert not is_transparent(path)
+    opaque[0, 0, 3] = 254
+    cv2.imwrite(str(path), opaque)
+    assert is_transparent(path)
+    palette = Image.fromarray(image).convert("P")
+    palette.save(path)
+    assert not is_transparent(path)
+    palette.save(path, transparency=palette.getpixel((0, 0)))
+    assert is_transparent(path)
     with pytest.raises(ValueError, match=r"nothing\.png is missing"):
-        has_alpha(tmp_path / "nothing.png")
+        is_transparent(tmp_path / "nothing.png")
 
 
 def test_dnerf_with_masks_is_split_by_them(edited):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from warpgs.files import read_array, read_bounded, read_start
+from warpgs.files import read_array, read_bounded
 
 MAX_SIDE = 16_384
 """Maximum side of an image [px]; larger ones are refused before memory is allocated for them."""
@@ -86,14 +86,20 @@ def image_size(path: Path) -> tuple[int, int]:
     return _read_checked(path, MAX_PIXELS)[1]
 
 
-def has_alpha(path: Path) -> bool:
-    """Whether a file is a PNG image with an alpha channel; only its header is read.
+def is_transparent(path: Path) -> bool:
+    """Whether a file is a PNG image with a pixel that is not opaque; it is decoded only if it may have one.
 
     Raises:
-        ValueError: If it is missing, not a regular file or cannot be read.
+        ValueError: If it is missing, or a PNG image that is damaged.
     """
-    header = read_start(path, _PNG_COLOR_TYPE + 1)
-    return header.startswith(_PNG) and header[_PNG_COLOR_TYPE:] in (b"\x04", b"\x06")
+    data = read_bounded(path, MAX_OVERHEAD + MAX_BYTES_PER_PIXEL * MAX_PIXELS)
+    if not data.startswith(_PNG):
+        return False
+    # Without a channel for it, transparent colours are in a chunk tRNS before the pixels, e.g. of a palette.
+    if data[_PNG_COLOR_TYPE : _PNG_COLOR_TYPE + 1] not in (b"\x04", b"\x06") and b"tRNS" not in data.split(b"IDAT")[0]:
+        return False
+    stored = decode_bytes(path, data)
+    return bool(stored.ndim == 3 and stored.shape[2] == 4 and stored[..., 3].min() < np.iinfo(stored.dtype).max)
 
 
 def _read_checked(

@@ -8,7 +8,7 @@ import numpy as np
 
 from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
-from warpgs.data.images import has_alpha
+from warpgs.data.images import is_transparent
 from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resized_over_white
 from warpgs.data.units import SceneUnits
 from warpgs.files import read_numbers
@@ -42,13 +42,13 @@ class BlenderLoader:
         val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
-        is_transparent = any(has_alpha(path) for path in paths)
+        has_white = any(is_transparent(path) for path in paths)
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
             assumption="masks" if masked else "dynamic",
             own_times=True,
-            background="white" if is_transparent else "black",
+            background="white" if has_white else "black",
         )
         options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
