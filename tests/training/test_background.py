@@ -22,6 +22,7 @@ from warpgs.files import write_png
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
 from warpgs.training.train import fitted, make_trainer, train
+from warpgs.training.trainer import Trainer
 from warpgs.training.views import Views
 from warpgs.video import frames
 from warpgs.video.command import Render
@@ -165,3 +166,10 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
         trainer.scene.dynamic.logit_opacities.fill_(-20.0)
     backgrounds(trainer)
     assert trainer.step.take_means().psnr == pytest.approx(58.9, abs=0.05)
+
+
+def test_a_trainer_refuses_a_background_that_was_not_looked_up(run, tmp_path):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    assert capture.background == "white"
+    with pytest.raises(ValueError, match='background is "capture" over white: call fitted'):
+        Trainer(TrainConfig(device="cpu"), capture, tmp_path)

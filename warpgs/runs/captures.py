@@ -4,7 +4,7 @@ import torch
 
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import builtin_folder, is_builtin
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Background, Capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
 
@@ -23,3 +23,15 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     factor, vrig_factor = config.factor, config.vrig_factor
     capture = load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
     return capture if config.background == "capture" else capture.over(config.background)
+
+
+def known_background(config: TrainConfig, capture: Capture) -> Background:
+    """The background of a config.
+
+    Raises:
+        ValueError: If it is that of the capture, which is white, and was not looked up: runs of earlier versions, whose
+            config does not know it, are over black.
+    """
+    if config.background == "capture" and capture.background == "white":
+        raise ValueError('background is "capture" over white: call fitted(config, capture, log) first')
+    return "white" if config.background == "white" else "black"

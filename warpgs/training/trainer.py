@@ -13,6 +13,7 @@ from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
+from warpgs.runs.captures import known_background
 from warpgs.runs.trained import TrainedScene
 
 from . import initialize, ranks
@@ -72,7 +73,7 @@ class Trainer:
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
         self.config, self.run = config, run
         capture = capture if config.depth else capture.without_depth()
-        self.capture = capture.assuming(config.assume).over("white" if config.background == "white" else "black")
+        self.capture = capture.assuming(config.assume).over(known_background(config, capture))
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
@@ -80,8 +81,7 @@ class Trainer:
         if config.optim.poses:
             poses = PoseCorrections(len(self.capture.train), self.capture.extent).to(self.device)
         self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses)
-        self.iteration = 0
-        self.rollbacks = 0
+        self.iteration, self.rollbacks = 0, 0
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
