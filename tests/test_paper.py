@@ -52,7 +52,6 @@ PAPER = {
         "loss.branches_in_stage2": "yes",
     },
     "Experimental Setup": {
-        "schedule.half_size_until": 0,
         "schedule.stage1": 30_000,
         "schedule.stage2": 40_000,
         "optim.networks": 8e-4,

@@ -247,8 +247,6 @@ class Schedule:
     warmup: int = 1_000
     """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. Adam's
     first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
-    half_size_until: int = 0
-    """Up to this iteration, also of stage II, views are compared at half their size, for speed; 0 in the paper."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000

@@ -119,7 +119,6 @@ QUICK = dataclasses.replace(
         joint_from=0,
         noise_until=400,
         sh_degree_every=400,
-        half_size_until=1_700,
     ),
 )
 

@@ -142,11 +142,6 @@ def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
     assert before == {"static", "dynamic", "depth", "depth_dynamic"}
 
 
-def test_views_have_half_their_size_up_to_an_iteration_of_stage_1():
-    assert iterations_in_phases_where("half_size", schedule={"half_size_until": 15}) == list(range(STAGE1 + 15))
-    assert iterations_in_phases_where("half_size") == []
-
-
 def test_without_the_appearance_network_stage_2_has_its_joint_term():
     assert iterations_in_phases_where("use_appearance", app=False) == []
     assert iterations_with_joint_term(app=False) == list(range(STAGE2, END))
@@ -378,7 +373,7 @@ def test_zeros_of_a_schedule_stay_zero_when_it_is_rescaled(off, iterations):
     schedule = dataclasses.replace(SHORT, **dict.fromkeys(off, 0))
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
     assert total(after) == iterations
-    assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == {*off, "half_size_until"}
+    assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == set(off)
 
 
 @pytest.mark.parametrize("lengths", [(2_000, 70_000, 1_000), (1, 1, 100_000), (40_000, 1, 40_000), (5, 5, 5)])

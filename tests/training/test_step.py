@@ -10,9 +10,8 @@ import torch
 from tests import tiny
 from tests.scenes import relative_error
 from tests.tiny import quickly  # noqa: F401  # a fixture
-from warpgs.rendering import render
 from warpgs.training.optimizer import GROUPS
-from warpgs.training.schedule import Phase, Protocol
+from warpgs.training.schedule import Phase
 from warpgs.training.step import Step
 from warpgs.training.step_inputs import StepInputs
 
@@ -142,7 +141,6 @@ def test_phases_that_differ_in_one_field_are_different_keys(field):
         sh_degree=1,
         with_depth=True,
         with_joint=True,
-        half_size=True,
     )
     other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
     assert len({phase, other}) == 2
@@ -168,18 +166,3 @@ def test_densification_looks_at_the_terms_of_depth_only_if_asked_to(data, tmp_pa
 def test_every_parameter_group_has_a_learning_rate(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
     assert [group["name"] for group in trainer.step.optimizer.param_groups] == list(GROUPS)
-
-
-def test_steps_at_half_the_size_render_and_compare_half_the_size(data, tmp_path, monkeypatch):
-    trainer, sizes = tiny.trainer(data, tmp_path), []
-
-    def recorded(splats, camera, *arguments):
-        sizes.append(camera.size)
-        return render(splats, camera, *arguments)
-
-    monkeypatch.setattr("warpgs.training.step.render", recorded)
-    for half_size_until in (0, 1):
-        schedule = dataclasses.replace(trainer.config.schedule, half_size_until=half_size_until)
-        plan = Protocol(dataclasses.replace(trainer.config, schedule=schedule), has_depth=True).at(0)
-        trainer.step(plan, trainer._sample(plan))
-    assert sizes == [(32, 24), (16, 12)]

@@ -7,11 +7,10 @@ import torch
 
 from tests import tiny
 from tests.data.captures import ids_of, write_capture
-from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
 from warpgs.model.poses import PoseCorrections
-from warpgs.training.views import View, Views, mask_border
+from warpgs.training.views import Views, mask_border
 
 CPU = torch.device("cpu")
 PLENTY = 1 << 30
@@ -192,37 +191,3 @@ def test_a_factor_changes_aligned_inverse_depth(capture, resident_bytes):
     expected = (2.0 * before + 0.5) * factor
     torch.testing.assert_close(2.0 * views[1].inverse_depth + 0.5, expected, rtol=3e-3, atol=0.0, equal_nan=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), other.nan_to_num(-1.0))
-
-
-def full_view(height, width, margin=True):
-    """A view with random content, whose parts are at known pixels."""
-    generator = torch.Generator().manual_seed(0)
-    image = torch.rand(height, width, 3, generator=generator)
-    static = torch.ones(height, width, dtype=torch.bool)
-    static[3, 4] = False
-    border = torch.zeros(height, width, dtype=torch.bool)
-    border[1, 2] = True
-    K = torch.tensor([[90.0, 0.0, 7.25], [0.0, 80.0, 5.5], [0.0, 0.0, 1.0]])
-    camera = Camera(torch.eye(4), K, width, height)
-    depth = torch.arange(height * width).reshape(height, width).float()
-    return View(camera, torch.zeros(1), image, static, border if margin else None, depth)
-
-
-@pytest.mark.parametrize(("height", "width"), [(8, 12), (9, 13)])
-def test_a_halved_view_has_means_of_four_pixels(height, width):
-    view, half = full_view(height, width), full_view(height, width).halved()
-    assert half.camera.size == (width // 2, height // 2)
-    for row, column in [(0, 0), (3, 5), (1, 2)]:
-        square = view.image[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-        torch.testing.assert_close(half.image[row, column], square.mean((0, 1)))
-        assert half.inverse_depth[row, column] == view.inverse_depth[2 * row, 2 * column]
-    assert (~half.static_mask).nonzero().tolist() == [[1, 2]]
-    assert half.mask_border.nonzero().tolist() == [[0, 1]]
-    assert full_view(height, width, margin=False).halved().mask_border is None
-
-
-def test_points_of_a_halved_view_project_to_half_the_pixels():
-    view = full_view(9, 13)
-    point = torch.tensor([0.3, -0.2, 2.0])
-    full, half = (camera.K @ point for camera in (view.camera, view.halved().camera))
-    torch.testing.assert_close(half[:2] / half[2], full[:2] / full[2] / 2)

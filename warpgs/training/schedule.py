@@ -40,7 +40,6 @@ class Phase:
         sh_degree: Maximum degree of spherical harmonics in use.
         with_depth: Whether depth is rendered and compared.
         with_joint: Whether the joint image is compared.
-        half_size: Whether views have half their size.
     """
 
     stage: StageName
@@ -49,7 +48,6 @@ class Phase:
     sh_degree: int
     with_depth: bool
     with_joint: bool
-    half_size: bool = False
 
 
 def compares_branches(stage: StageName, config: LossConfig) -> bool:
@@ -165,7 +163,6 @@ class Protocol:
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
-            half_size=config.schedule.half_size_until > 0 and in_stage1 < config.schedule.half_size_until,
         )
 
     def at(self, iteration: int) -> IterationPlan:

@@ -148,8 +148,6 @@ class Step:
 
     def _run(self, phase: Phase, view: View) -> None:
         self._choose_trained(phase)
-        if phase.half_size:
-            view = view.halved()
         flags = (phase.use_deformation, phase.use_appearance)
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets

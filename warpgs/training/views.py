@@ -35,32 +35,6 @@ class View(NamedTuple):
     mask_border: Bool[Tensor, "H W"] | None
     inverse_depth: Float[Tensor, "H W"]
 
-    def halved(self) -> "View":
-        """The view at half the size; the last row and column of odd sizes are left out. One pixel is not halved.
-
-        A pixel is static if the four that it covers are, lies on a border if one of them does, and has the inverse
-        depth of the first.
-        """
-        camera = self.camera
-        if min(camera.size) < 2:
-            return self
-        height, width = camera.height // 2, camera.width // 2
-        blocks = [self.image, self.static_mask[..., None], self.inverse_depth[..., None]]
-        if self.mask_border is not None:
-            blocks.append(self.mask_border[..., None])
-        image, mask, depth, *border = (
-            block[: 2 * height, : 2 * width].unflatten(1, (width, 2)).unflatten(0, (height, 2)) for block in blocks
-        )
-        K = torch.cat([camera.K[:2] / 2, camera.K[2:]])
-        return View(
-            Camera(camera.viewmat, K, width, height),
-            self.time,
-            image.mean((1, 3)),
-            mask[..., 0].all(3).all(1),
-            border[0][..., 0].any(3).any(1) if border else None,
-            depth[:, 0, :, 0, 0].contiguous(),
-        )
-
 
 def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
     """True in pixels that have both static and dynamic pixels within ``margin`` columns and rows."""
