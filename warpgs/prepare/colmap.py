@@ -25,7 +25,6 @@ from warpgs.data.lens import Lens
 from warpgs.data.turning import find_turning
 
 from .cameras import MISLED, Cameras, NoCamerasError
-from .features import PEAK, WEAK_PEAK, add_features
 from .focal_guess import calibrated, confirms
 from .matches import all_pairs, keep_static, revisit_pairs, sequence_pairs, verified_matches
 from .model import cameras_of_model
@@ -33,6 +32,12 @@ from .rotations import find_directions
 
 FALLBACK_FRAMES = 250
 """Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
+
+MAX_FEATURES = 4096
+"""Maximum number of features per frame; the time for matching grows with its square."""
+
+WEAK_PEAK = 0.002
+"""Minimum contrast of weak features; COLMAP's default is 0.0067."""
 
 MIN_FEATURES = 60
 """Minimum number of features per frame; with fewer, the frames lack texture."""
@@ -148,17 +153,20 @@ def _extract_and_match(job: Job, report: Report) -> None:
     if finished.exists():
         return
     job.database.unlink(missing_ok=True)
-    reading = pycolmap.ImageReaderOptions()
+    reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reading.camera_model = job.lens
     if (params := _starting_parameters(job)) is not None:
         reading.camera_params = ",".join(map(str, params))
-    files = job.files
-    pycolmap.Database.open(job.database).close()  # import_images does not make it
-    pycolmap.import_images(job.database, job.folder, pycolmap.CameraMode.SINGLE, files, reading)
+    extraction.sift.max_num_features = MAX_FEATURES
+    extraction.sift.max_num_orientations = 1
+    if job.weak_features:
+        extraction.sift.peak_threshold = WEAK_PEAK
+    files, single = job.files, pycolmap.CameraMode.SINGLE
     for start in range(0, len(files), CHUNK):
         report("features", start, len(files))
-        peak = WEAK_PEAK if job.weak_features else PEAK
-        add_features(job.database, Path(job.folder), files[start : start + CHUNK], peak)
+        chunk = files[start : start + CHUNK]
+        pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
+        reading.existing_camera_id = 1
     _match(job, sequence_pairs(len(files)), report)
     finished.touch()
 
