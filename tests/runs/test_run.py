@@ -138,6 +138,12 @@ def test_whether_stage_2_compares_branches_was_a_yes_or_no(run, before, now):
     assert read_config(run).loss.branches_in_stage2 == now
 
 
+def test_runs_that_knew_views_of_half_the_size_open(run):
+    before = read_config(run)
+    edit(run, lambda values: values["schedule"].update(half_size_until=1_700))
+    assert read_config(run) == before
+
+
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))

@@ -52,11 +52,13 @@ def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
 
     Before there was ``background``, it was always black. Before there was ``loss.depth_gate``, runs without depth-aware
     pretraining had no depth loss at all. A preset that is gone is none: the file has all of its values.
-    ``loss.branches_in_stage2`` was a yes or no.
+    ``loss.branches_in_stage2`` was a yes or no. ``schedule.half_size_until``, for faster views, is gone.
     """
     values = {"background": "black", **values}
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
+    if isinstance(schedule := values.get("schedule"), dict):
+        values = {**values, "schedule": {k: v for k, v in schedule.items() if k != "half_size_until"}}
     loss = values.get("loss")
     if isinstance(loss, dict) and isinstance(loss.get("branches_in_stage2"), bool):
         loss = {**loss, "branches_in_stage2": "yes" if loss["branches_in_stage2"] else "no"}
