@@ -38,7 +38,7 @@ def test_processes_find_mps_which_has_all_gpus_until_it_is_ended(control, monkey
         folder = os.environ[PIPES]
         assert Path(folder).is_dir()
         assert calls() == [["-d", folder]]
-    assert calls() == [["-d", folder], ["quit", folder, "1"]]
+    assert calls() == [["-d", folder], ["quit", "-t", "5", folder, "1"]]
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "1"
     assert PIPES not in os.environ
     assert not Path(folder).exists()
@@ -50,6 +50,15 @@ def test_mps_is_ended_after_an_error_too(control):
         raise KeyboardInterrupt
     assert calls()[-1][0] == "quit"
     assert PIPES not in os.environ
+
+
+def test_mps_that_does_not_end_is_said(control):
+    control(0)
+    lines = []
+    with shared_gpus(lines.append):
+        control(1)
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{CONTROL} did not end: ")
 
 
 def test_the_users_own_mps_is_used(control, monkeypatch):

@@ -98,8 +98,7 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
     code, stopped = 0, False
     try:
         if not options.tables_only:
-            with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
-                _train(options, spec, board, peers)
+            _train(options, spec, board, peers, log)
     except ConnectionError as error:
         log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
         code = FAILED
@@ -124,7 +123,7 @@ def _shares_local_gpus(options: Sweep) -> bool:
     return torch.cuda.device_count() > 0
 
 
-def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers) -> None:
+def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> None:
     if not board.jobs(""):
         return
 
@@ -132,11 +131,12 @@ def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers) -> None:
         board.tell(event)
         write_tables(board.out, spec, board, peers)  # Ray may end this program
 
-    pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
-    try:
-        for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
-            builtin_folder(data)  # once, not in every cell
-        with board:
-            run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
-    finally:
-        pool.close()
+    with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
+        pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
+        try:
+            for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
+                builtin_folder(data)  # once, not in every cell
+            with board:
+                run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
+        finally:
+            pool.close()

@@ -5,13 +5,16 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 CONTROL = "nvidia-cuda-mps-control"
 """Program of the driver that starts and ends MPS, which needs no privileges."""
 
 PIPES = "CUDA_MPS_PIPE_DIRECTORY"
 """Variable by which CUDA finds MPS: the folder of its sockets."""
+
+QUIT = b"quit -t 5\n"
+"""Ends MPS, at the latest after 5 s, even if a process still uses it."""
 
 TIMEOUT = 30.0
 """Time for MPS to start or to end [s]."""
@@ -22,10 +25,10 @@ def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
     """Processes that start in this context share GPUs through MPS.
 
     Without it, CUDA runs the kernels of one process at a time, however few of the multiprocessors they use. An MPS that
-    the user has started is left as it is.
+    the environment names (CUDA_MPS_PIPE_DIRECTORY) is used as it is.
 
     Args:
-        log: Receives a line if MPS cannot be started; processes then take turns.
+        log: Receives a line if MPS cannot be started, so that processes take turns, or cannot be ended.
     """
     if PIPES in os.environ:
         yield
@@ -42,8 +45,10 @@ def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
         try:
             yield
         finally:
-            with suppress(OSError, subprocess.SubprocessError):
-                subprocess.run([CONTROL], input=b"quit\n", capture_output=True, timeout=TIMEOUT)
+            try:
+                subprocess.run([CONTROL], input=QUIT, capture_output=True, timeout=TIMEOUT, check=True)
+            except (OSError, subprocess.SubprocessError) as error:
+                log(f"{CONTROL} did not end: {error}")
             del os.environ[PIPES]
 
 
