@@ -124,7 +124,7 @@ class Revisits:
         inside = (column >= 0) & (column < lens.width - 1) & (row >= 0) & (row < lens.height - 1) & ~behind
         warped = _sample(flows.planes[other], column, row)
         warped = np.where(inside, warped, flows.planes[frame])
-        # What remains is smooth and short: at full size the masks are as good (intersection over union).
+        # What remains is smooth and short: at half the size the masks are as good (intersection over union).
         remaining = flows.compute(flows.planes[frame], warped, coarse=True)
         to_column, to_row = flows.x + remaining[..., 0], flows.y + remaining[..., 1]
         position = np.stack([_sample(x, to_column, to_row), _sample(y, to_column, to_row)])

@@ -25,8 +25,8 @@ HALF_SIZE = 1.3
 class BlenderLoader:
     """Loads the training frames, and for evaluation the test frames, or those of validation if there are none.
 
-    Transparent pixels are white, and so is the background if training images have alpha. Everything is dynamic, except
-    where nothing but the background is seen, unless frames have a mask_path.
+    Transparent pixels are white, and so is the background if a pixel of a training image is transparent. Everything is
+    dynamic, except where nothing but the background is seen, unless frames have a mask_path.
     """
 
     def recognizes(self, root: Path) -> bool:
@@ -42,13 +42,13 @@ class BlenderLoader:
         val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
-        has_white = any(is_transparent(path) for path in paths)
+        is_white = any(is_transparent(path) for path in paths)
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
             assumption="masks" if masked else "dynamic",
             own_times=True,
-            background="white" if has_white else "black",
+            background="white" if is_white else "black",
         )
         options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
