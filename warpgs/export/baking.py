@@ -95,13 +95,6 @@ class Branch:
             is_dynamic=np.full(len(self), is_dynamic),
         )
 
-    @property
-    def texture_bytes(self) -> int:
-        """Memory of the player's textures [bytes]."""
-        geometry, colors = self.means.levels.shape[0], self.colors.levels.shape[0]
-        rest = self.rest.levels.shape[2] // 3
-        return len(self) * (geometry * TEXEL["geometry"] + colors * TEXEL["colors"] + rest * TEXEL["rest"])
-
 
 @dataclass(frozen=True)
 class Baked:
