@@ -53,7 +53,7 @@ def init_warp() -> None:
 def _without_driver_warning() -> Iterator[None]:
     """Drops what Warp's library says about a missing CUDA driver: a machine without a GPU needs none.
 
-    Whoever asks for CUDA there is told so by ``choose_device``. Everything else on standard error is passed on. Where
+    ``choose_device`` raises an error where CUDA is asked for. Everything else on standard error is passed on. Where
     there is a GPU, or no way to filter, nothing is dropped.
     """
     printed: IO[bytes] | None = None

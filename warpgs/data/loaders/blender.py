@@ -37,12 +37,11 @@ class BlenderLoader:
         """Opens a capture; arguments and errors as for ``load_capture``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
         transforms = Transforms(root / TRAIN)
-        paths = [transforms.image(entry) for entry in transforms.frames]
         train = _frames(transforms, "train")
         val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
-        is_white = any(is_transparent(path) for path in paths)
+        is_white = any(is_transparent(transforms.image(entry)) for entry in transforms.frames)
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
