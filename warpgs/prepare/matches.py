@@ -44,12 +44,13 @@ def revisit_pairs(model: Any, names: list[str]) -> list[Pair]:
     images = {image.name: image for image in model.images.values() if image.has_pose}
     points = {key: point.xyz for key, point in model.points3D.items()}
     frames = [(k, images[name]) for k, name in enumerate(names) if name in images]
-    seen = [[points[p.point3D_id] for p in image.points2D if p.has_point3D()] for _, image in frames]
+    poses = np.array([image.cam_from_world().matrix() for _, image in frames]).reshape(-1, 3, 4)
+    limits = np.array([_half_size(image.camera) for _, image in frames]).reshape(-1, 2)
     shared = np.zeros((len(frames), len(frames)))
-    for row, positions in enumerate(seen):
-        for column, (_, image) in enumerate(frames):
-            if positions:
-                shared[row, column] = _visible(np.array(positions), image).mean()
+    for row, (_, image) in enumerate(frames):
+        seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
+        if seen:
+            shared[row] = _visible(np.array(seen), poses, limits).mean(1)
     shared = np.minimum(shared, shared.T)
     pairs = set()
     for row, (index, _) in enumerate(frames):
@@ -64,13 +65,18 @@ def revisit_pairs(model: Any, names: list[str]) -> list[Pair]:
     return sorted(pairs)
 
 
-def _visible(points: Float[np.ndarray, "P 3"], image: Any) -> Bool[np.ndarray, " P"]:
-    """[P] whether points project into an image, its distortion neglected."""
-    pose, camera = image.cam_from_world().matrix(), image.camera
-    in_camera = points @ pose[:, :3].T + pose[:, 3]
-    depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.inf)
-    half = np.array([camera.width, camera.height]) / (2.0 * camera.mean_focal_length())
-    return (in_camera[:, 2] > 0) & (np.abs(in_camera[:, :2] / depth[:, None]) < half).all(1)
+def _half_size(camera: Any) -> Float[np.ndarray, "2"]:
+    """Tangents of half the angles of view."""
+    return np.array([camera.width, camera.height]) / (2.0 * camera.mean_focal_length())
+
+
+def _visible(
+    points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "F 3 4"], limits: Float[np.ndarray, "F 2"]
+) -> Bool[np.ndarray, "F P"]:
+    """Whether points project into each of the images, whose distortion is neglected."""
+    in_camera = points @ poses[:, :, :3].transpose(0, 2, 1) + poses[:, None, :, 3]
+    depth = np.where(in_camera[..., 2] > 0, in_camera[..., 2], np.inf)
+    return (in_camera[..., 2] > 0) & (np.abs(in_camera[..., :2] / depth[..., None]) < limits[:, None]).all(2)
 
 
 def keep_static(database: Path, masks: Path | None, names: list[str]) -> float:
