@@ -15,7 +15,7 @@ from warpgs.data.capture import Capture
 from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
-from warpgs.training.train import fitted, fitted_bands
+from warpgs.training.fitting import fitted, fitted_bands
 
 
 def changed(name, value, config=PRESETS["paper"]):
@@ -134,19 +134,6 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
     distrusted = asked == "given-masks" and estimated and assume == "masks"
     assert found == ("no" if distrusted else "yes" if asked == "given-masks" else asked)
     assert lines == (["the masks are estimates: stage II compares the joint image alone"] if distrusted else [])
-
-
-@pytest.mark.parametrize("assume", ["masks", "static"])
-@pytest.mark.parametrize("estimated", [False, True])
-def test_only_masks_that_are_estimates_are_completed(assume, estimated):
-    cameras = {"a": make_camera()}
-    capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
-    config = TrainConfig(assume=assume, loss=LossConfig(mask_tolerance=0.04))
-    lines: list[str] = []
-    tolerance = fitted(config, capture, lines.append).loss.mask_tolerance
-    is_used = estimated and assume == "masks"
-    assert tolerance == (0.04 if is_used else 0.0)
-    assert is_used == (lines == [])
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():

@@ -149,9 +149,6 @@ class LossConfig:
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""
-    mask_tolerance: Annotated[float, Bounds(max=1)] = 0.0
-    """Where `prepare` made the masks, the colour error of a block of pixels of the static image above which the block
-    becomes dynamic; 0 trusts the masks (paper)."""
 
 
 @dataclass(frozen=True)
@@ -249,6 +246,9 @@ class Schedule:
     first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
+    mask_trial: int = 0
+    """Length of two short trainings, with masks that `prepare` estimated and without; if held-out frames are better
+    without, everything is taken as dynamic. 0 trusts the masks (paper)."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
     """Iterations between increments of the degree of spherical harmonics, from 0 to ``model.sh_degree``."""
 

@@ -21,7 +21,8 @@ from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
-from warpgs.training.train import fitted, make_trainer, train
+from warpgs.training.fitting import fitted
+from warpgs.training.train import make_trainer, train
 from warpgs.training.trainer import Trainer
 from warpgs.training.views import Views
 from warpgs.video import frames

@@ -8,7 +8,7 @@ from tests import tiny
 from tests.data import layouts
 from tests.tiny import quickly  # noqa: F401
 from warpgs.data.loaders import load_capture
-from warpgs.training.train import fitted
+from warpgs.training.fitting import fitted
 
 pytestmark = pytest.mark.usefixtures("quickly")
 

@@ -297,11 +297,6 @@ def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_netwo
     reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
     assert iterations_where("reseed", densify=reseed, schedule=often) == after(50)
     assert iterations_where("reseed", schedule=often) == []
-    tolerant = LossConfig(mask_tolerance=0.04)
-    assert iterations_where("complete_masks", loss=tolerant, schedule=often) == after(50)
-    assert iterations_where("complete_masks", densify=reseed, schedule=often) == []
-    assert iterations_where("complete_masks", loss=tolerant, schedule=often | {"reset_every": 48}) == []
-    assert iterations_where("complete_masks", loss=tolerant, schedule=often | {"reset_every": 38}) == after(50)
 
 
 def test_without_visibility_driven_pruning_nothing_is_pruned():

@@ -67,9 +67,9 @@ class IterationPlan:
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, prune_weakest, complete_masks, reseed, realign: What to do after the iteration: densify,
-            reset opacities, prune by visibility, prune the Gaussians that contribute least, take for dynamic what
-            static Gaussians cannot show, start new dynamic Gaussians where none shows what moves, align depth again.
+        densify, reset, prune, prune_weakest, reseed, realign: What to do after the iteration: densify, reset opacities,
+            prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where none shows
+            what moves, align depth again.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
@@ -84,7 +84,6 @@ class IterationPlan:
     reset: bool
     prune: bool
     prune_weakest: bool
-    complete_masks: bool
     reseed: bool
     realign: bool
     remove_large: bool
@@ -97,7 +96,7 @@ class IterationPlan:
     @property
     def adapts(self) -> bool:
         """Whether anything is done after the iteration."""
-        return self.replaces_gaussians or self.reset or self.realign or self.complete_masks
+        return self.replaces_gaussians or self.reset or self.realign
 
 
 def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
@@ -175,7 +174,6 @@ class Protocol:
         progress = iteration / self.num_iterations
         decay = max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until))
         prunes = self._prunes(iteration)
-        recovers = prunes and self._reseed_from < done < schedule.densify_until
         return IterationPlan(
             phase=phase,
             progress=progress,
@@ -190,16 +188,10 @@ class Protocol:
             prune_weakest=self.config.densify.weakest > 0.0
             and prunes
             and schedule.densify_until <= done <= 2 * schedule.densify_until,
-            complete_masks=self.config.loss.mask_tolerance > 0.0 and recovers and not self._was_just_reset(done),
-            reseed=self.config.densify.reseed > 0.0 and recovers,
+            reseed=self.config.densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
             remove_large=done > schedule.reset_every,
         )
-
-    def _was_just_reset(self, done: int) -> bool:
-        """Whether the images are still too dark because opacities were reset within the last quarter of an interval."""
-        every = self.config.schedule.reset_every
-        return done >= every and done % every < every // 4
 
     def _means_progress(self, iteration: int) -> dict[str, float]:
         """By branch, fraction done of the iterations over which the rate of its positions decays."""

@@ -3,11 +3,10 @@
 import contextlib
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from warpgs.config import ModelConfig, TrainConfig, scaled
+from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.data.loaders import recognize
@@ -20,8 +19,10 @@ from warpgs.runs.run import Device, Run, choose_device, new_folder, open_capture
 
 from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
+from .fitting import fitted
 from .interrupt import Interrupt
 from .logger import TrainingLogger
+from .mask_trial import with_trusted_masks
 from .schedule import extended
 from .trainer import Trainer
 
@@ -191,8 +192,8 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
-    config = fitted(config, capture, log)
     _compare_ranks(config, capture)
+    config = fitted(with_trusted_masks(config, capture, log, quiet), capture, log)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
     if ranks.is_first():
@@ -216,37 +217,6 @@ def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
     values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
     numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
     ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
-
-
-def fitted(config: TrainConfig, capture: Capture, log: Log) -> TrainConfig:
-    """The config with those values replaced that depend on the capture."""
-    bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
-    if bands < config.model.time_bands:
-        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    uses_estimates = capture.estimated_masks and config.assume == "masks"
-    if loss.mask_tolerance and not uses_estimates:
-        log("the masks are not estimates of warpgs prepare: loss.mask_tolerance is not used")
-        loss = dataclasses.replace(loss, mask_tolerance=0.0)
-    if loss.branches_in_stage2 == "given-masks":
-        if uses_estimates:
-            log("the masks are estimates: stage II compares the joint image alone")
-        loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
-    background = capture.background if config.background == "capture" else config.background
-    return dataclasses.replace(config, loss=loss, background=background)
-
-
-def fitted_bands(model: ModelConfig, num_frames: int) -> int:
-    """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
-
-    See ``ModelConfig.min_period``.
-
-    Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
-    """
-    if model.min_period == 0 or model.time_bands == 0:
-        return model.time_bands
-    periods = 2.0 * (num_frames - 1) / model.min_period
-    return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))
 
 
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:

@@ -23,7 +23,6 @@ from .densify import DensifyLimits, densify, reset_opacities
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
-from .mask_errors import complete_masks, send_from_first
 from .prune import blend_weights, prune_invisible, prune_weakest
 from .reseed import gaussians_that_show, lost_fraction, lost_pixels
 from .sampling import Sampler, random_numbers
@@ -159,17 +158,12 @@ class Trainer:
             self._adapt(plan, logger)
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
         ranks.copy_first_(self.alignments)
-        if plan.complete_masks:
-            send_from_first(self.views)
         if plan.replaces_gaussians:
             self.step.reset_statistics()
 
     def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Changes the alignment of depth and the sets of Gaussians as planned."""
         scene, sh_degree = self.scene, plan.phase.sh_degree
-        # First, because new Gaussians change the images until they are trained.
-        if plan.complete_masks and (completed := complete_masks(scene, self.views, plan.phase, self.config)):
-            logger.log(f"iteration {self.iteration + 1}: {completed}")
         if plan.realign and not self.capture.metric_depth:
             # In place, because CUDA graphs read them.
             aligned = initialize.align_to_rendering(
@@ -272,8 +266,7 @@ class Trainer:
         if not self.callbacks:
             return False
         start = time.monotonic()
-        scene = TrainedScene(self.scene, self.config, self._metadata())
-        progress = Progress(status, self.protocol.num_iterations, scene, self.capture)
+        progress = Progress(status, self.protocol.num_iterations, self.trained_scene(), self.capture)
         stop = [bool(callback(progress)) for callback in self.callbacks]
         seconds = time.monotonic() - start
         self._started += seconds
@@ -309,10 +302,12 @@ class Trainer:
                 tensors[f"adam.{part}.{name}"] = value
         tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
         tensors["alignments"] = self.alignments
-        if self.config.loss.mask_tolerance:
-            tensors["masks.moving"] = self.views.moving_blocks()
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
+
+    def trained_scene(self) -> TrainedScene:
+        """The scene as it is now, to render; it changes as soon as training goes on."""
+        return TrainedScene(self.scene, self.config, self._metadata())
 
     def _metadata(self) -> checkpoint.Metadata:
         """The plain values of a checkpoint of the current iteration."""
@@ -345,8 +340,6 @@ class Trainer:
         if loaded.metadata.views != self.capture.train:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
-        if self.config.loss.mask_tolerance:
-            self.views.set_moving_blocks(loaded.tensor("masks.moving", self.views.moving_blocks().shape))
         if self.views.poses is not None:
             self.views.poses.load_state_dict(checkpoint.load_poses(loaded, self.capture.extent).state_dict())
         self._set_scene(checkpoint.load_scene(loaded, self.config.model))

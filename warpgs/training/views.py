@@ -13,8 +13,6 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.poses import PoseCorrections
 
-from .blocks import GRID, from_blocks, num_blocks
-
 
 class View(NamedTuple):
     """One training view on the device.
@@ -104,7 +102,6 @@ class Views:
         self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
         self._capture, self.background = capture, capture.background
         self._depth_factors: dict[str, tuple[Tensor, Tensor]] = {}
-        self._moving: dict[str, Tensor] = {}
         first = self._store(capture.frame(capture.train[0]))
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -136,30 +133,6 @@ class Views:
         if self.resident:
             self._all.inverse_depth[index] = self._store(self._capture.frame(name)).inverse_depth
             del self._depth_factors[name]
-
-    def moving_blocks(self) -> Float[Tensor, "T h w"]:
-        """1 for the blocks that are dynamic whatever the mask says, 0 for all others and beyond an image."""
-        blocks = torch.zeros(len(self), GRID, GRID)
-        for index, name in enumerate(self._capture.train):
-            if name in self._moving:
-                rows, columns = self._moving[name].shape
-                blocks[index, :rows, :columns] = self._moving[name].float()
-        return blocks
-
-    def set_moving_blocks(self, blocks: Float[Tensor, "T h w"]) -> None:
-        """Takes blocks for dynamic, as ``moving_blocks`` returns them, and follows the masks everywhere else."""
-        for index, (name, own) in enumerate(zip(self._capture.train, blocks.cpu() > 0, strict=True)):
-            width, height = self._capture.cameras[name].size
-            rows, columns = num_blocks(height, width)
-            before, own = self._moving.get(name), own[:rows, :columns]
-            if torch.equal(own, torch.zeros_like(own) if before is None else before):
-                continue
-            self._moving[name] = own
-            if self.resident:
-                stored = self._store(self._capture.frame(name))
-                self._all.static_mask[index] = stored.static_mask
-                if self._all.mask_border is not None and stored.mask_border is not None:
-                    self._all.mask_border[index] = stored.mask_border
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
@@ -195,11 +168,8 @@ class Views:
             (scale, offset), factor = self._depth_factors[frame.name]
             depth = ((scale * depth + offset) * factor - offset) / scale
         time = torch.tensor([camera.time])
-        moving = torch.zeros(size, dtype=torch.bool)
-        if frame.name in self._moving:
-            moving = from_blocks(self._moving[frame.name], *size)
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
-        border = mask_border(frame.static_mask, 0 if is_exact else margin) & ~moving if margin else None
-        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask & ~moving, depth.half())
+        border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
+        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())
         return _Stored(*tensors, border, self._gains.get(frame.name))

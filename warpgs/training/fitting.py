@@ -1,0 +1,36 @@
+"""Values of a config that depend on the capture."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+from warpgs.config import ModelConfig, TrainConfig
+from warpgs.data.capture import Capture
+
+
+def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) -> TrainConfig:
+    """The config with those values replaced that depend on the capture."""
+    bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
+    if bands < config.model.time_bands:
+        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
+        config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
+    uses_estimates = capture.estimated_masks and config.assume == "masks"
+    if loss.branches_in_stage2 == "given-masks":
+        if uses_estimates:
+            log("the masks are estimates: stage II compares the joint image alone")
+        loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
+    background = capture.background if config.background == "capture" else config.background
+    return dataclasses.replace(config, loss=loss, background=background)
+
+
+def fitted_bands(model: ModelConfig, num_frames: int) -> int:
+    """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
+
+    See ``ModelConfig.min_period``.
+
+    Frequency k = 0 … L − 1 of paper Eq. 6 has a period of 2 / 2ᵏ of the time from the first to the last frame.
+    """
+    if model.min_period == 0 or model.time_bands == 0:
+        return model.time_bands
+    periods = 2.0 * (num_frames - 1) / model.min_period
+    return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))
