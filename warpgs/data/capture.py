@@ -29,6 +29,11 @@ Background = Literal["black", "white"]
 """Colour behind all Gaussians."""
 
 
+def background_color(background: Background | Literal["capture"]) -> tuple[float, float, float]:
+    """RGB in [0, 1]; black for "capture", which only runs of earlier versions keep in their config (``fitted``)."""
+    return (1.0, 1.0, 1.0) if background == "white" else (0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Frame:
     """One image and everything that is known about it, on the CPU.

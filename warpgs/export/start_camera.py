@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
 
@@ -87,7 +87,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         track=[c.viewmat.tolist() for c in track],
         seconds=seconds,
         antialias=config.antialias,
-        background=(1.0, 1.0, 1.0) if config.background == "white" else (0.0, 0.0, 0.0),
+        background=background_color(config.background),
     )
 
 

@@ -34,4 +34,4 @@ def known_background(config: TrainConfig, capture: Capture) -> Background:
     """
     if config.background == "capture" and capture.background == "white":
         raise ValueError('background is "capture" over white: call fitted(config, capture, log) first')
-    return "white" if config.background == "white" else "black"
+    return "black" if config.background == "capture" else config.background

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings, TrainConfig
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, background_color
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import Rendering, render
@@ -47,7 +47,8 @@ class TrainedScene:
         self.scene, self.config, self.metadata = scene, config, metadata
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
-        self.background = torch.ones(3, device=self.device) if config.background == "white" else None
+        color = background_color(config.background)
+        self.background = torch.tensor(color, device=self.device) if any(color) else None
 
     @property
     def device(self) -> torch.device:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.data.capture import background_color
 from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import Rendering, render
@@ -25,8 +26,6 @@ from .views import View, Views
 
 DECIBELS = -10.0
 """PSNR is this times the base-10 logarithm of the mean squared error."""
-
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
 class Sample(NamedTuple):
@@ -116,11 +115,11 @@ class Step:
         progress = (plan.progress, plan.means_progress, plan.network_progress)
         rates = optim.learning_rates(self.config.optim, self.extent, *progress, plan.warmup_factors)
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
-        background = WHITE if self.views.background == "white" else None
+        background = background_color(self.views.background)
         self._inputs.send(
             time_noise=sample.time_noise,
-            background=background or BLACK,
-            dynamic_background=background or sample.background.tolist(),
+            background=background,
+            dynamic_background=background if any(background) else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
         )
