@@ -13,6 +13,7 @@ import torch
 
 from warpgs.data import synthetic
 from warpgs.data.bodies import as_tensors, even_samples
+from warpgs.data.builtin_cache import cache_folder
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 
@@ -37,14 +38,14 @@ def test_without_a_home_the_capture_is_kept_in_a_temporary_folder(tmp_path, monk
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder = synthetic.cache_folder()
+    folder = cache_folder()
     assert folder.parent == tmp_path
     assert list(folder.iterdir()) == []
     error = capsys.readouterr().err
     assert error.startswith("warpgs: no cache for the built-in scene (")
     assert error.count("\n") == 1
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert synthetic.cache_folder() == tmp_path / "cache" / "warpgs"
+    assert cache_folder() == tmp_path / "cache" / "warpgs"
     assert capsys.readouterr().err == ""
 
 

@@ -16,12 +16,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.files import complete_or_absent, write_json, write_png
+from warpgs.files import write_json, write_png
 from warpgs.ops.raytrace import SPHERE, raytrace
 from warpgs.progress import progress
 
 from .bodies import Body, Color, as_tensors, euler
-from .synthetic import content_folder
+from .builtin_cache import cached, content_folder
 
 VERSION = 1
 """Increase it when the content changes, so that cached captures are not used any more."""
@@ -146,7 +146,4 @@ def balls_capture(cache_dir: Path | None = None, size: BallsSize | None = None, 
     """
     size = size or BallsSize()
     folder = content_folder(cache_dir, ["balls", VERSION, asdict(size)]) / "balls"
-    if not folder.is_dir():
-        with complete_or_absent(folder, keep_existing=True) as partial:
-            write_balls(partial, size, quiet)
-    return folder
+    return cached(folder, lambda partial: write_balls(partial, size, quiet))

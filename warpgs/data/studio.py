@@ -22,16 +22,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.files import complete_or_absent
 from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
+from .builtin_cache import cached, content_folder
 from .degraded_depth import DegradedDepth
 from .images import decode
 from .lens import Lens
-from .synthetic import content_folder
 from .units import SceneUnits
 
 Depth = Literal["exact", "network", "none"]
@@ -225,22 +224,17 @@ def studio_capture(
     """
     size = size or StudioSize()
     root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
-    exact = root / "studio"
-    if not exact.is_dir():
-        with complete_or_absent(exact, keep_existing=True) as partial:
-            write_studio(partial, size, quiet)
+    exact = cached(root / "studio", lambda partial: write_studio(partial, size, quiet))
     if depth == "exact":
         return exact
-    folder = root / f"studio-depth-{depth}"
-    if not folder.is_dir():
-        with complete_or_absent(folder, keep_existing=True) as partial:
-            shutil.copytree(exact, partial, ignore=shutil.ignore_patterns("depth"), dirs_exist_ok=True)
-            if depth == "network":
-                _write_degraded(exact, partial)
-    return folder
+    return cached(root / f"studio-depth-{depth}", lambda partial: _copy(exact, partial, depth == "network"))
 
 
-def _write_degraded(exact: Path, folder: Path) -> None:
+def _copy(exact: Path, folder: Path, with_depth: bool) -> None:
+    """Copies a capture without its depth, or with the errors of a network in it."""
+    shutil.copytree(exact, folder, ignore=shutil.ignore_patterns("depth"), dirs_exist_ok=True)
+    if not with_depth:
+        return
     files = sorted((exact / "depth/1x").glob("*.png"))
     errors = DegradedDepth(len(files))
     for k, path in enumerate(files):

@@ -3,17 +3,9 @@
 It is ray-traced and written in the layout of NeRF-DS, so that it is loaded like a real capture.
 """
 
-import atexit
-import hashlib
-import json
 import math
-import os
-import shutil
-import sys
-import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +13,12 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.files import complete_or_absent
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
+from .builtin_cache import cached, content_folder
 from .lens import Lens
 from .units import SceneUnits
 
@@ -209,35 +201,4 @@ def builtin_capture(
     """
     scene = scene or BuiltinScene()
     folder = content_folder(cache_dir, [VERSION, asdict(scene)]) / "builtin"
-    if not folder.is_dir():
-        with complete_or_absent(folder, keep_existing=True) as partial:
-            write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet)
-    return folder
-
-
-def content_folder(cache_dir: Path | None, content: Any) -> Path:
-    """The folder for a built-in capture of some content, given as plain values.
-
-    Args:
-        cache_dir: Folder of all of them; ``cache_folder`` if None.
-        content: What the capture is made from; another content has another folder.
-    """
-    if cache_dir is None:
-        cache_dir = cache_folder()
-    return cache_dir / hashlib.blake2b(json.dumps(content).encode(), digest_size=6).hexdigest()
-
-
-def cache_folder() -> Path:
-    """The user's cache of warpgs; without a writable home a folder that is removed at exit, with a warning."""
-    try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
-        folder.mkdir(parents=True, exist_ok=True)
-        reason = "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
-    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
-        reason = str(error)
-    if not reason:
-        return folder
-    folder = Path(tempfile.mkdtemp(prefix="warpgs-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    sys.stderr.write(f"warpgs: no cache for the built-in scene ({reason}): it is made anew; set XDG_CACHE_HOME\n")
-    return folder
+    return cached(folder, lambda partial: write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet))
