@@ -1,6 +1,7 @@
 """Layouts of other programs: the same cameras, images and points come out of each."""
 
 import json
+import os
 import shutil
 
 import cv2
@@ -16,7 +17,7 @@ from warpgs.config import MaskPerturbation
 from warpgs.data.colmap import lens_of
 from warpgs.data.images import is_transparent
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import load_capture, recognize
+from warpgs.data.loaders import blender, load_capture, recognize
 from warpgs.data.loaders.posed import plain_names, times_of_names
 
 ALL = {**layouts.WRITERS, "colmap as text": layouts.write_text_colmap}
@@ -179,6 +180,20 @@ def test_images_without_alpha_have_a_black_background_and_no_empty_pixels(edited
     assert capture.background == "black"
     assert capture.frame("train_r_000").empty is None
     assert not capture.frame("train_r_000").static_mask.any()
+
+
+def test_opaque_images_with_alpha_are_decoded_once_until_they_change(edited, monkeypatch):
+    root, seen = edited("blender"), []
+    for path in root.rglob("*.png"):
+        cv2.imwrite(str(path), np.dstack([layouts.image(0), np.full(layouts.SIZE[::-1], 255, np.uint8)]))
+    monkeypatch.setattr(blender, "is_transparent", lambda path: seen.append(path) or is_transparent(path))
+    assert [load_capture(root).background for _ in range(2)] == ["black", "black"]
+    assert len(seen) == len(set(seen)) == len(list((root / "train").iterdir()))
+    pixels = cv2.imread(str(seen[0]), cv2.IMREAD_UNCHANGED)
+    pixels[0, 0, 3] = 0
+    cv2.imwrite(str(seen[0]), pixels)
+    os.utime(seen[0], (0, 0))
+    assert load_capture(root).background == "white"
 
 
 def test_over_another_colour_nothing_is_known_to_be_empty(written):

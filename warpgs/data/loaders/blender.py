@@ -1,7 +1,7 @@
 """D-NeRF and other datasets rendered by Blender: transforms_train.json, transforms_val.json, transforms_test.json."""
 
 import math
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,9 @@ TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_
 
 HALF_SIZE = 1.3
 """The scenes lie within this distance of the origin, along each axis [world units], as Deformable-3DGS assumes."""
+
+MAX_REMEMBERED = 65_536
+"""Maximum number of images of which it is remembered whether they are transparent."""
 
 
 class BlenderLoader:
@@ -41,7 +44,7 @@ class BlenderLoader:
         val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
-        is_white = any(is_transparent(transforms.image(entry)) for entry in transforms.frames)
+        is_white = any(_is_transparent(transforms.image(entry)) for entry in transforms.frames)
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
@@ -51,6 +54,17 @@ class BlenderLoader:
         )
         options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
+
+
+def _is_transparent(image: Path) -> bool:
+    status = image.stat()
+    return _was_transparent(image, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(MAX_REMEMBERED)
+def _was_transparent(image: Path, modified: int, num_bytes: int) -> bool:
+    """Whether an image is transparent, remembered until the file changes: opaque ones must be decoded completely."""
+    return is_transparent(image)
 
 
 def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
