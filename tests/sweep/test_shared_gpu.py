@@ -6,14 +6,21 @@ from pathlib import Path
 import pytest
 import torch
 
+from warpgs.sweep import shared_gpu
 from warpgs.sweep.command import Sweep
 from warpgs.sweep.run_sweep import _shares_local_gpus
 from warpgs.sweep.shared_gpu import CONTROL, PIPES, shared_gpus
 
 SCRIPT = """#!/bin/sh
-echo "$* $(cat) $CUDA_MPS_PIPE_DIRECTORY ${{CUDA_VISIBLE_DEVICES-}}" >> {calls}
+input=$(cat)
+if [ "$input" = get_server_list ]; then
+    {query}
+fi
+echo "$* $input $CUDA_MPS_PIPE_DIRECTORY ${{CUDA_VISIBLE_DEVICES-}}" >> {calls}
 exit {code}
 """
+NO_DAEMON = "echo Cannot find MPS control daemon process; exit"
+"""What the driver's program does where MPS does not run, before its exit code."""
 
 
 @pytest.fixture
@@ -22,9 +29,9 @@ def control(tmp_path, monkeypatch):
     monkeypatch.delenv(PIPES, raising=False)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
-    def install(code):
+    def install(code, query=f"{NO_DAEMON} 1"):
         calls = tmp_path / "calls"
-        (tmp_path / CONTROL).write_text(SCRIPT.format(calls=calls, code=code))
+        (tmp_path / CONTROL).write_text(SCRIPT.format(calls=calls, code=code, query=query))
         (tmp_path / CONTROL).chmod(0o755)
         return lambda: [line.split() for line in calls.read_text().splitlines()] if calls.exists() else []
 
@@ -68,6 +75,21 @@ def test_the_users_own_mps_is_used(control, monkeypatch):
         assert os.environ[PIPES] == "/somewhere"
     assert os.environ[PIPES] == "/somewhere"
     assert calls() == []
+
+
+def test_mps_in_its_default_folder_is_used(control):
+    calls = control(0, query="echo 4711; exit 0")
+    with shared_gpus(pytest.fail):
+        assert PIPES not in os.environ
+    assert calls() == []
+
+
+@pytest.mark.parametrize("query", [f"{NO_DAEMON} 1", f"{NO_DAEMON} 0", "exit 1", "exec sleep 9"])
+def test_mps_is_started_if_none_answers_in_its_default_folder(control, monkeypatch, query):
+    monkeypatch.setattr(shared_gpu, "TIMEOUT", 3.0)
+    calls = control(0, query)
+    with shared_gpus(pytest.fail):
+        assert calls() == [["-d", os.environ[PIPES]]]
 
 
 def test_mps_that_does_not_start_is_said(control):

@@ -13,6 +13,12 @@ CONTROL = "nvidia-cuda-mps-control"
 PIPES = "CUDA_MPS_PIPE_DIRECTORY"
 """Variable by which CUDA finds MPS: the folder of its sockets."""
 
+QUERY = b"get_server_list\n"
+"""Asks for the servers of MPS, of which there are none before the first process."""
+
+NOT_RUNNING = b"Cannot find MPS control daemon"
+"""Answer where MPS does not run."""
+
 QUIT = b"quit -t 5\n"
 """Ends MPS, at the latest after 5 s, even if a process still uses it."""
 
@@ -25,12 +31,12 @@ def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
     """Processes that start in this context share GPUs through MPS.
 
     Without it, CUDA runs the kernels of one process at a time, however few of the multiprocessors they use. An MPS that
-    the environment names (CUDA_MPS_PIPE_DIRECTORY) is used as it is.
+    the environment names (CUDA_MPS_PIPE_DIRECTORY), or that runs in its default folder, is used as it is.
 
     Args:
         log: Receives a line if MPS cannot be started, so that processes take turns, or cannot be ended.
     """
-    if PIPES in os.environ:
+    if PIPES in os.environ or _runs():
         yield
         return
     with tempfile.TemporaryDirectory(prefix="warpgs-mps-", ignore_cleanup_errors=True) as folder:
@@ -50,6 +56,15 @@ def shared_gpus(log: Callable[[str], None]) -> Iterator[None]:
             except (OSError, subprocess.SubprocessError) as error:
                 log(f"{CONTROL} did not end: {error}")
             del os.environ[PIPES]
+
+
+def _runs() -> bool:
+    """Whether MPS answers in its default folder, where processes without the variable look for it."""
+    try:
+        done = subprocess.run([CONTROL], input=QUERY, capture_output=True, timeout=TIMEOUT)
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return done.returncode == 0 and NOT_RUNNING not in done.stdout + done.stderr
 
 
 def _start(environment: dict[str, str]) -> str:
