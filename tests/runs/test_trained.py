@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
@@ -40,6 +41,13 @@ def test_one_graph_plays_every_camera_of_a_size(trained, captured):
         camera = translated(scenes.camera(), 0.1 * k, 0.1 * k)
         assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
     assert captured == [(64, 48)]
+
+
+def test_a_time_of_numpy_is_rendered_like_one_of_python(trained):
+    expected = trained.render(scenes.camera(), time=0.25).joint.image
+    (time,) = np.linspace(0.25, 1.0, 1)
+    assert torch.equal(trained.render(scenes.camera(), time=time).joint.image, expected)
+    assert torch.equal(trained.splats(time).means, trained.splats(0.25).means)
 
 
 def test_each_size_is_captured_once(trained, captured):

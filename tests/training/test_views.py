@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
@@ -46,6 +47,14 @@ def assert_same(a, b):
     assert torch.equal(a.camera.viewmat, b.camera.viewmat)
     assert torch.equal(a.camera.K, b.camera.K)
     assert a.camera.size == b.camera.size
+
+
+def test_times_of_numpy_are_single_precision(capture):
+    name, *_ = capture.train
+    camera = dataclasses.replace(capture.cameras[name], time=np.float64(0.25))
+    time = views_of(capture.with_cameras({name: camera}))[0].time
+    assert time.dtype == torch.float32
+    assert time.tolist() == [0.25]
 
 
 def test_views_are_resident_if_they_fit(capture):

@@ -82,7 +82,11 @@ class TrainedScene:
             time: Time in [0, 1].
             residual: Whether the appearance network changes the static Gaussians (paper Eq. 8).
         """
-        return self._splats(torch.tensor([time], device=self.device), residual)
+        return self._splats(self._on_device(time), residual)
+
+    def _on_device(self, time: float) -> Float[Tensor, "1"]:
+        # A double of numpy would become a tensor of doubles.
+        return torch.tensor([time], dtype=torch.float32, device=self.device)
 
     def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
         flags = self.metadata.use_deformation, self.metadata.use_appearance and residual
@@ -97,8 +101,7 @@ class TrainedScene:
             time: Time in [0, 1]; ``camera.time`` if None.
             branches: Whether to render the static and the dynamic image as well.
         """
-        time = camera.time if time is None else time
-        return self._render(camera.to(self.device), torch.tensor([time], device=self.device), branches)
+        return self._render(camera.to(self.device), self._on_device(camera.time if time is None else time), branches)
 
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The joint image at the camera's time, as fast as possible.

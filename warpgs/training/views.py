@@ -167,7 +167,7 @@ class Views:
         if frame.name in self._depth_factors:
             (scale, offset), factor = self._depth_factors[frame.name]
             depth = ((scale * depth + offset) * factor - offset) / scale
-        time = torch.tensor([camera.time])
+        time = torch.tensor([camera.time], dtype=torch.float32)
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
