@@ -17,7 +17,9 @@ CENTER = torch.tensor([1.0, -2.0, 0.5])
 HALF_SIZE = torch.tensor([2.0, 2.0, 2.0])
 TIME = torch.tensor([0.37])
 OUTPUTS = 5
-NETWORKS = (*FIELDS.values(), AppearanceField)
+NETWORKS = (MlpDeformation, AppearanceField)
+MODELS = (*FIELDS.values(), AppearanceField)
+"""Networks, and deformation models without a trunk."""
 SHAPES = [(8, 4), (3, 2), (3, 1), (1, 4), (4, 4)]
 """Numbers of layers, and the layer after which the encoding is concatenated, which need not exist."""
 
@@ -140,9 +142,11 @@ def test_the_box_is_saved_with_the_network():
     assert torch.equal(state["half_size"], HALF_SIZE)
 
 
-@pytest.mark.parametrize("network", NETWORKS)
-def test_untrained_networks_output_zero(network):
-    outputs = network(model(), CENTER, HALF_SIZE)(random_means(), TIME)
+@pytest.mark.parametrize("model_type", MODELS)
+@pytest.mark.parametrize("num", [0, 1, 9])
+def test_untrained_models_output_zero_for_any_number_of_gaussians(model_type, num):
+    outputs = outputs_of(model_type(model(), CENTER, HALF_SIZE), random_means(num))
+    assert {len(output) for output in outputs} == {num}
     assert not any(output.any() for output in outputs)
 
 

