@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests import tiny
 from warpgs.data import camera_files, writer
 from warpgs.data.check import check_capture
 from warpgs.data.lens import Lens
@@ -29,6 +30,11 @@ def test_the_example_is_fit_to_train_on(example):
     report = check_capture(example)
     assert report.is_fit
     assert [f.text for f in report.findings if f.level == "warning"] == []
+
+
+def test_the_example_is_trained_on(example, tmp_path):
+    with tiny.in_haste():
+        assert tiny.train(tiny.trainer(example, tmp_path / "run"))
 
 
 def test_the_example_has_the_conventions_of_the_text(example):
