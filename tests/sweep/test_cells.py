@@ -135,6 +135,12 @@ def test_a_query_is_appended_to_built_in_captures_only(tmp_path):
         plan(made, {"as": "/as"}, tmp_path)
 
 
+def test_an_unknown_built_in_capture_is_refused_before_anything_is_trained(tmp_path):
+    for data in ("builtin:synthetic", "builtin:room?depth=none"):
+        with pytest.raises(ValueError, match="there is no built-in capture builtin:"):
+            plan(spec(), {"s": data}, tmp_path)
+
+
 def test_a_cell_is_finished_once_its_last_iteration_was_evaluated(tmp_path):
     (cell,) = plan(spec(), out=tmp_path, iterations=300)
     assert cell.num_iterations == 300

@@ -14,6 +14,19 @@ def is_builtin(data: Path | str) -> bool:
     return str(data).startswith(PREFIX)
 
 
+def parse_builtin(data: Path | str) -> tuple[str, str]:
+    """Which built-in capture a name means, without its prefix, and its depth, which only the studio has a choice of.
+
+    Raises:
+        ValueError: If there is no such capture.
+    """
+    name, _, query = str(data).removeprefix(PREFIX).partition("?")
+    queries = {"room": ("",), "balls": ("",), "studio": ("", *(f"depth={depth}" for depth in DEPTHS))}
+    if query not in queries.get(name, ()):
+        raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}")
+    return name, query.removeprefix("depth=") or "exact"
+
+
 def builtin_folder(data: Path | str, quiet: bool = False) -> Path:
     """The folder of a built-in capture, which is created on the first call.
 
@@ -25,18 +38,16 @@ def builtin_folder(data: Path | str, quiet: bool = False) -> Path:
         ValueError: If there is no such capture.
         OSError: If it cannot be written.
     """
-    name, _, query = str(data).removeprefix(PREFIX).partition("?")
-    depth: Any = query.removeprefix("depth=") if query else "exact"
-    if name == "room" and not query:
+    depth: Any
+    name, depth = parse_builtin(data)
+    if name == "room":
         from .synthetic import builtin_capture  # imports torch
 
         return builtin_capture(quiet=quiet)
-    if name == "balls" and not query:
+    if name == "balls":
         from .balls import balls_capture
 
         return balls_capture(quiet=quiet)
-    if name == "studio" and depth in DEPTHS and query in ("", f"depth={depth}"):
-        from .studio import studio_capture
+    from .studio import studio_capture
 
-        return studio_capture(depth, quiet=quiet)
-    raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}")
+    return studio_capture(depth, quiet=quiet)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig, scaled
-from warpgs.data.builtin import is_builtin
+from warpgs.data.builtin import is_builtin, parse_builtin
 from warpgs.files import read_json
 from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME as CONFIG_NAME
@@ -137,6 +137,8 @@ def _cell(
         if not is_builtin(data) or "?" in data:
             raise ValueError(f"{where} needs a plain built-in capture such as --data builtin:studio, got {data}")
         data = f"{data}?{variant.query}"
+    if is_builtin(data):
+        parse_builtin(data)
     options = dataclasses.asdict(PRESETS[spec.preset])
     for layer in (spec.options, variant.options, overrides):
         _update(options, layer)
