@@ -4,6 +4,7 @@ import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -50,6 +51,12 @@ def test_an_unknown_name_is_an_attribute_error():
 def test_the_version_is_that_of_the_installed_package():
     assert warpgs.__version__ == importlib.metadata.version("warpgs")
     assert run("-m", "warpgs", "--version").stdout == f"warpgs {warpgs.__version__}\n"
+
+
+def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
+    missing = Mock(side_effect=importlib.metadata.PackageNotFoundError)
+    monkeypatch.setattr(importlib.metadata.Distribution, "from_name", missing)
+    assert warpgs.__version__ == "0+unknown"
 
 
 def test_the_package_is_typed():

@@ -32,7 +32,6 @@ PAPER = {
         "loss.dynamic": 1.0,
         "loss.dynamic_background": "black",
         "loss.mask_margin": 0.0,
-        "schedule.mask_trial": 0,
         "assume": "masks",
     },
     "Visibility-Driven Pruning": {"vdp": True},

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from .errors import FAILED, program, run_command, visible
+from .version import version
 
 
 class Command(NamedTuple):
@@ -61,9 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0
     if name == "--version" or rest == ["--version"]:
-        from importlib.metadata import version  # slow to import
-
-        print(f"warpgs {version('warpgs')}")
+        print(f"warpgs {version()}")
         return 0
     if name.startswith("--tyro"):
         return _print_completion(arguments)

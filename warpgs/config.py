@@ -246,9 +246,6 @@ class Schedule:
     first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
-    mask_trial: int = 0
-    """Length of two short trainings, with masks that `prepare` estimated and without; if held-out frames are better
-    without, everything is taken as dynamic. 0 trusts the masks (paper)."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
     """Iterations between increments of the degree of spherical harmonics, from 0 to ``model.sh_degree``."""
 

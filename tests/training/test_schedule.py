@@ -18,7 +18,6 @@ SHORT = Schedule(
     densify_until=60,
     reset_every=20,
     prune_every=30,
-    mask_trial=10,
     deform_from=25,
     appearance_from=35,
     noise_until=40,

@@ -1,6 +1,5 @@
 """``warpgs report``: writes one HTML file about runs."""
 
-import importlib.metadata
 import statistics
 from collections.abc import Sequence
 from datetime import datetime, timezone
@@ -8,6 +7,7 @@ from pathlib import Path
 
 from warpgs.errors import one_line
 from warpgs.files import write_text
+from warpgs.version import version
 
 from .command import Report
 from .evaluated_run import EvaluatedRun, read_runs
@@ -27,7 +27,7 @@ def write_report(options: Report) -> str:
     runs = read_runs(options.run_folders)
     galleries = [_gallery(options, runs, group) for group in groups(runs)] if options.views else []
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    origin = f"written {now} by warpgs {importlib.metadata.version('warpgs')}"
+    origin = f"written {now} by warpgs {version()}"
     out = options.out or (options.run_folders[0] if len(runs) == 1 else Path()) / "report.html"
     write_text(out, page(runs, [gallery for gallery in galleries if gallery.worst], origin))
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB"

@@ -1,6 +1,5 @@
 """The HTML report of a sweep: its tables, then the report of one run of each variant and capture."""
 
-import importlib.metadata
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,6 +9,7 @@ from warpgs.report.evaluated_run import read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
 from warpgs.report.page import Gallery, page, text
 from warpgs.report.write_report import extremes, groups
+from warpgs.version import version
 
 from .cells import Cell
 from .formats import heads, texts
@@ -44,7 +44,7 @@ def write_page(path: Path, title: str, tables: Sequence[Table], notes: Sequence[
             strips = [saved_strips(run, [*worst, *best], REASON) for run in chosen]
             galleries.append(Gallery(group, worst, best, strips))
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    origin = f"written {now} by warpgs {importlib.metadata.version('warpgs')}"
+    origin = f"written {now} by warpgs {version()}"
     write_text(path, page(runs, galleries, origin, title=title, introduction=_introduction(tables, notes)))
 
 

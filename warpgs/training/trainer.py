@@ -266,7 +266,8 @@ class Trainer:
         if not self.callbacks:
             return False
         start = time.monotonic()
-        progress = Progress(status, self.protocol.num_iterations, self.trained_scene(), self.capture)
+        scene = TrainedScene(self.scene, self.config, self._metadata())
+        progress = Progress(status, self.protocol.num_iterations, scene, self.capture)
         stop = [bool(callback(progress)) for callback in self.callbacks]
         seconds = time.monotonic() - start
         self._started += seconds
@@ -304,10 +305,6 @@ class Trainer:
         tensors["alignments"] = self.alignments
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
-
-    def trained_scene(self) -> TrainedScene:
-        """The scene as it is now, to render; it changes as soon as training goes on."""
-        return TrainedScene(self.scene, self.config, self._metadata())
 
     def _metadata(self) -> checkpoint.Metadata:
         """The plain values of a checkpoint of the current iteration."""
