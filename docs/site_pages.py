@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Iterator
+from html import escape
 from typing import Any
 
 from warpgs.cli import COMMANDS
@@ -15,8 +16,14 @@ MARKER = "<!-- options -->"
 
 ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 
-LONG = re.compile(r"<td>(?=(?:(?!</td>).){60})")
-"""Start of a cell of a table with at least 60 characters."""
+CELLS = {"long": re.compile(r"<td>(?=(?:(?!</td>).){60})"), "phrase": re.compile(r"<td>(?=(?:(?!</td>).){20})")}
+"""Starts of cells of a table with at least 60, then with at least 20 characters, by the class that they get."""
+
+LONG_CODE, IN_CODE, TEXT = re.compile(r"<code>(?=[^<]{44})"), re.compile(r"(?<=<code>)[^<]+"), re.compile(r">[^<]+<")
+
+OPTION = re.compile(r"(?<![\w-])--?[a-z][\w.-]*")
+
+IMAGE = re.compile(r'(?<=<p>)<img [^>]*src="([^"]+)"[^>]*>(?=</p>)')
 
 SHOWN = "best"
 """Preset whose values are the defaults of ``train`` in the tables: that of captures."""
@@ -30,8 +37,13 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """mkdocs calls this for the HTML of every page; long cells get a class, of which ``site.css`` keeps them wide."""
-    return LONG.sub('<td class="long">', html)
+    """mkdocs calls this for the HTML of every page; images become links to their files."""
+    for name, start in CELLS.items():
+        html = start.sub(f'<td class="{name}">', html)
+    html = IN_CODE.sub(lambda text: text[0].replace("/", "/<wbr>"), html)
+    html = LONG_CODE.sub('<code class="long">', html)
+    html = TEXT.sub(lambda text: OPTION.sub(r'<span class="option">\g<0></span>', text[0]), html)
+    return IMAGE.sub(r'<a href="\1">\g<0></a>', html)
 
 
 def sections() -> Iterator[str]:
@@ -46,7 +58,7 @@ def sections() -> Iterator[str]:
             groups.setdefault(group_of(option.name), []).append(option)
         for group, members in groups.items():
             if group:
-                yield f"### train --{group}.…\n\n{summary(type(getattr(PRESETS[SHOWN], group)))}\n"
+                yield f"### train --{group}.*\n\n{summary(type(getattr(PRESETS[SHOWN], group)))}\n"
             yield from table(("option", "default", "meaning"), [row(option) for option in members])
         if name == "train":
             yield "### What the presets change\n\nOptions that are not listed are the same in all presets.\n"
@@ -71,12 +83,13 @@ def group_of(name: str) -> str:
 
 def row(option: Option) -> tuple[str, ...]:
     """Name, default and meaning of an option; switches that are on are listed by how to turn them off."""
+    text = escape(option.text, quote=False)
     if option.default is True:
         start, _, end = option.name.rpartition(".")
         name = f"{start}.no-{end}" if start else option.name.replace("--", "--no-", 1)
-        return code(name), "on", option.text
+        return code(name), "on", text
     metavar = option.metavar.replace(",", "`, `")  # so that lines of many choices break between them
-    return code(f"{option.name} {metavar}".strip()), value_of(option.default), option.text
+    return code(f"{option.name} {metavar}".strip()), value_of(option.default), text
 
 
 def value_of(value: Any) -> str:

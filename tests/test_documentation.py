@@ -152,7 +152,33 @@ def test_choices_of_an_option_and_long_cells_of_a_table_have_space(monkeypatch):
     (layers,) = (option for option in pages.options_of("export") if option.name == "--layers")
     assert pages.row(layers)[0] == "`--layers {all`, `static`, `dynamic`, `apart}`"
     long = "a <b>word</b> " * 9
-    assert pages.on_page_content(f"<td>a</td><td>{long}</td>") == f'<td>a</td><td class="long">{long}</td>'
+    phrase = "a <b>word</b> and more"
+    cells = f'<td>a</td><td class="long">{long}</td><td class="phrase">{phrase}</td>'
+    assert pages.on_page_content(f"<td>a</td><td>{long}</td><td>{phrase}</td>") == cells
+
+
+def test_code_breaks_between_words_and_folders_and_not_inside_of_options(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    text = pages.on_page_content("<p><code>train --model.sh-degree 0</code> of the-rest</p>")
+    assert text == '<p><code>train <span class="option">--model.sh-degree</span> 0</code> of the-rest</p>'
+    assert pages.on_page_content("<code>data/loaders/x.py</code>") == "<code>data/<wbr>loaders/<wbr>x.py</code>"
+    assert pages.on_page_content(f"<code>{'word ' * 9}</code>") == f'<code class="long">{"word " * 9}</code>'
+
+
+def test_placeholders_in_the_help_of_options_are_shown(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    (out,) = (option for option in pages.options_of("train") if option.name == "--out")
+    assert "runs/<capture>-<preset>" in out.text
+    assert "runs/&lt;capture&gt;-&lt;preset&gt;" in pages.row(out)[2]
+
+
+def test_images_link_to_their_files(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    pages = importlib.import_module("site_pages")
+    image = '<img alt="A scene" src="../images/a.jpg" />'
+    assert pages.on_page_content(f"<p>{image}</p>") == f'<p><a href="../images/a.jpg">{image}</a></p>'
 
 
 SITE = ("mkdocs", "material", "mkdocstrings")
@@ -176,5 +202,6 @@ def test_the_site_builds_without_a_warning(tmp_path):
     pages = "".join(path.read_text() for path in (tmp_path / "site").rglob("*.html"))
     for paragraph in re.findall(r"<p>(.*?)</p>", pages, re.DOTALL):
         assert not re.search(r"\n(?:[-*]|\d+\.) ", paragraph), paragraph  # a list that Python's Markdown does not see
+    assert not re.search(r"@@\w+@@", pages)  # a placeholder that nobody has filled in
     assert not re.search(r"<h\d[^>]*>[^<]*\\", pages)  # an escape that only GitHub understands
     assert not re.search(r'(?:src|href)="https?://[^"]*\.(?:js|css|woff2?)"', pages)  # loads nothing from elsewhere

@@ -40,7 +40,7 @@ class TrainedScene:
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
 
     Attributes:
-        background: [3] colour behind all Gaussians, on the scene's device; None is black.
+        background (Tensor | None): [3] colour behind all Gaussians, on the scene's device; None is black.
     """
 
     def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:

@@ -35,7 +35,7 @@ class UnfitCaptureError(ValueError):
     """The capture has errors that would make training useless.
 
     Attributes:
-        findings: The errors.
+        findings (tuple[Finding, ...]): The errors.
     """
 
     def __init__(self, findings: Sequence[Finding]) -> None:
@@ -47,9 +47,9 @@ class TrainingInterrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM stopped the training after an iteration, and a checkpoint of it was saved.
 
     Attributes:
-        folder: Run folder; ``TrainConfig(resume=folder)`` continues it.
-        iteration: Iterations done.
-        num_iterations: Those of the whole run.
+        folder (Path): Run folder; ``TrainConfig(resume=folder)`` continues it.
+        iteration (int): Iterations done.
+        num_iterations (int): Those of the whole run.
     """
 
     def __init__(self, folder: Path, iteration: int, num_iterations: int) -> None:
