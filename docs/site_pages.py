@@ -19,9 +19,12 @@ ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 CELLS = {"long": re.compile(r"<td>(?=(?:(?!</td>).){60})"), "phrase": re.compile(r"<td>(?=(?:(?!</td>).){20})")}
 """Starts of cells of a table with at least 60, then with at least 20 characters, by the class that they get."""
 
-LONG_CODE, IN_CODE, TEXT = re.compile(r"<code>(?=[^<]{44})"), re.compile(r"(?<=<code>)[^<]+"), re.compile(r">[^<]+<")
+LONG_CODE, TEXT = re.compile(r"<code>(?=[^<]{44})"), re.compile(r">[^<]+<")
 
-OPTION = re.compile(r"(?<![\w-])--?[a-z][\w.-]*")
+PATH = re.compile(r"(?<=<code>)(?<!</span><code>)[^<\s]{24,}(?=</code>)")
+"""A long path in a sentence or table, not in a block of code."""
+
+OPTION = re.compile(r"(?<![\w-])--?[A-Za-z][\w.-]*")
 
 IMAGE = re.compile(r'(?<=<p>)<img [^>]*src="([^"]+)"[^>]*>(?=</p>)')
 
@@ -40,7 +43,7 @@ def on_page_content(html: str, **_: Any) -> str:
     """mkdocs calls this for the HTML of every page; images become links to their files."""
     for name, start in CELLS.items():
         html = start.sub(f'<td class="{name}">', html)
-    html = IN_CODE.sub(lambda text: text[0].replace("/", "/<wbr>"), html)
+    html = PATH.sub(lambda path: path[0].replace("/", "/<wbr>"), html)
     html = LONG_CODE.sub('<code class="long">', html)
     html = TEXT.sub(lambda text: OPTION.sub(r'<span class="option">\g<0></span>', text[0]), html)
     return IMAGE.sub(r'<a href="\1">\g<0></a>', html)

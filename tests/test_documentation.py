@@ -162,7 +162,10 @@ def test_code_breaks_between_words_and_folders_and_not_inside_of_options(monkeyp
     pages = importlib.import_module("site_pages")
     text = pages.on_page_content("<p><code>train --model.sh-degree 0</code> of the-rest</p>")
     assert text == '<p><code>train <span class="option">--model.sh-degree</span> 0</code> of the-rest</p>'
-    assert pages.on_page_content("<code>data/loaders/x.py</code>") == "<code>data/<wbr>loaders/<wbr>x.py</code>"
+    path = "warpgs/data/loaders/posed.py"
+    assert pages.on_page_content(f"<code>{path}</code>") == f"<code>{path.replace('/', '/<wbr>')}</code>"
+    for kept in ("<code>viewer/</code>", f"<pre><span></span><code>{path}</code></pre>"):
+        assert pages.on_page_content(kept) == kept
     assert pages.on_page_content(f"<code>{'word ' * 9}</code>") == f'<code class="long">{"word " * 9}</code>'
 
 
