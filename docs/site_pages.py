@@ -16,8 +16,11 @@ MARKER = "<!-- options -->"
 
 ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 
-CELLS = {"long": re.compile(r"<td>(?=(?:(?!</td>).){60})"), "phrase": re.compile(r"<td>(?=(?:(?!</td>).){20})")}
-"""Starts of cells of a table with at least 60, then with at least 20 characters, by the class that they get."""
+CELLS = {
+    "long": re.compile(r"<td>(?=(?:(?!</td>).){60})"),
+    "phrase": re.compile(r"<td>(?=(?:(?:<(?!/td>)[^>]*>)*[^<]){20})"),
+}
+"""Starts of cells of a table with at least 60 characters, then with at least 20 outside of tags, by their class."""
 
 LONG_CODE, TEXT = re.compile(r"<code>(?=[^<]{44})"), re.compile(r">[^<]+<")
 

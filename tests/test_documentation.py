@@ -152,9 +152,10 @@ def test_choices_of_an_option_and_long_cells_of_a_table_have_space(monkeypatch):
     (layers,) = (option for option in pages.options_of("export") if option.name == "--layers")
     assert pages.row(layers)[0] == "`--layers {all`, `static`, `dynamic`, `apart}`"
     long = "a <b>word</b> " * 9
-    phrase = "a <b>word</b> and more"
+    phrase, number = "a <b>word</b> and a few more", "<td><strong>41.34</strong></td>"
     cells = f'<td>a</td><td class="long">{long}</td><td class="phrase">{phrase}</td>'
     assert pages.on_page_content(f"<td>a</td><td>{long}</td><td>{phrase}</td>") == cells
+    assert pages.on_page_content(number) == number
 
 
 def test_code_breaks_between_words_and_folders_and_not_inside_of_options(monkeypatch):
