@@ -118,7 +118,7 @@ def drawn(browser, address, **options):
 def test_spark_draws_the_scene(browser, site, name, degree, antialias):
     (folder, address), (write, y_up) = site, FILES[name]
     cloud = scenes.cloud(300, degree).replaced(antialias=antialias)
-    file = f"degree-{degree}-{name}"  # of this test alone: two versions within a second are one to the browser's cache
+    file = f"degree-{degree}-{name}"  # its own: the browser caches by name and second
     write(folder / file, orientation.rotated(cloud, orientation.upright(UP, y_up)))
     image, count = drawn(browser, address, file=file, yUp=y_up, spark=BLUR[antialias])
     truth = scenes.image(cloud, scenes.camera(*SIZE)).numpy()

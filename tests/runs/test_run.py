@@ -138,9 +138,12 @@ def test_whether_stage_2_compares_branches_was_a_yes_or_no(run, before, now):
     assert read_config(run).loss.branches_in_stage2 == now
 
 
-def test_runs_that_knew_views_of_half_the_size_open(run):
+@pytest.mark.parametrize(
+    ("part", "name"), [("schedule", "half_size_until"), ("schedule", "mask_trial"), ("loss", "mask_tolerance")]
+)
+def test_runs_with_an_option_that_is_gone_open(run, part, name):
     before = read_config(run)
-    edit(run, lambda values: values["schedule"].update(half_size_until=1_700))
+    edit(run, lambda values: values[part].update({name: 0}))
     assert read_config(run) == before
 
 

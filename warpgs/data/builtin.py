@@ -20,9 +20,9 @@ def parse_builtin(data: Path | str) -> tuple[str, str]:
     Raises:
         ValueError: If there is no such capture.
     """
-    name, _, query = str(data).removeprefix(PREFIX).partition("?")
+    name, mark, query = str(data).removeprefix(PREFIX).partition("?")
     queries = {"room": ("",), "balls": ("",), "studio": ("", *(f"depth={depth}" for depth in DEPTHS))}
-    if query not in queries.get(name, ()):
+    if query not in queries.get(name, ()) or (mark and not query):
         raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}")
     return name, query.removeprefix("depth=") or "exact"
 

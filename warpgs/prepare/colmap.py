@@ -298,7 +298,7 @@ def _map_from(job: Job, database: Path) -> Any:
     """The reconstruction by global mapping that starts from the database's focal length."""
     options = pycolmap.GlobalPipelineOptions()
     options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS
-    options.mapper.ba_skip_fixed_rotation_stage = True  # a third of the time, for the same cameras
+    options.mapper.ba_skip_fixed_rotation_stage = True  # saves a stage; camera centres as before
     _set_adjustment(options.mapper.bundle_adjustment, job)
     try:
         models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"), options)

@@ -17,6 +17,7 @@ MAX_BYTES = 1 << 20
 """Size of config.json [bytes]."""
 
 REMOVED_PRESETS = ("fast",)
+REMOVED = {"schedule": ("half_size_until", "mask_trial"), "loss": ("mask_tolerance",)}
 
 RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""
@@ -52,13 +53,14 @@ def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
 
     Before there was ``background``, it was always black. Before there was ``loss.depth_gate``, runs without depth-aware
     pretraining had no depth loss at all. A preset that is gone is none: the file has all of its values.
-    ``loss.branches_in_stage2`` was a yes or no. ``schedule.half_size_until``, for faster views, is gone.
+    ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed nothing that is still to be done.
     """
     values = {"background": "black", **values}
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
-    if isinstance(schedule := values.get("schedule"), dict):
-        values = {**values, "schedule": {k: v for k, v in schedule.items() if k != "half_size_until"}}
+    for part, names in REMOVED.items():
+        if isinstance(known := values.get(part), dict):
+            values = {**values, part: {k: v for k, v in known.items() if k not in names}}
     loss = values.get("loss")
     if isinstance(loss, dict) and isinstance(loss.get("branches_in_stage2"), bool):
         loss = {**loss, "branches_in_stage2": "yes" if loss["branches_in_stage2"] else "no"}
