@@ -127,6 +127,7 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch):
         "builtin:",
         "builtin:studi",
         "builtin:studio?depth=",
+        "builtin:studio?",
         "builtin:room?depth=none",
         "builtin:studio?depth=depth=none",
     ],
