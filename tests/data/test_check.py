@@ -107,7 +107,7 @@ def test_every_damaged_file_is_named(root):
 def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):
     report = check_capture(tmp_path)
     assert not report.is_fit
-    assert "dataset.json is missing" in texts(report, "error")
+    assert "has no dataset.json" in texts(report, "error")
 
 
 def test_cameras_that_do_not_match_the_images_are_a_warning(root):

@@ -97,9 +97,27 @@ def test_a_missing_mask_of_a_training_frame_is_refused_on_opening(root):
         load_capture(root)
 
 
-@pytest.mark.parametrize("folder", ["", "nowhere", "rgb", "scene.json"])
-def test_the_error_for_a_wrong_folder_lists_the_files_of_a_capture(root, folder):
-    refused(root.parent if folder == "" else root / folder, "dataset.json is missing: a capture has .*camera")
+@pytest.mark.parametrize(
+    ("folder", "message"),
+    [
+        ("..", "has no dataset.json and the files of no other layout .*colmap.*; warpgs prepare makes a capture"),
+        ("rgb", "has no dataset.json and the files of no other layout"),
+        ("scene.json", "has no dataset.json and the files of no other layout"),
+        ("nowhere", "nowhere does not exist"),
+    ],
+)
+def test_what_has_no_part_of_a_capture_is_refused(root, folder, message):
+    refused(root / folder, message)
+
+
+def test_a_run_folder_is_not_taken_for_a_capture(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    refused(tmp_path, "is a run folder: give the capture that it was trained on, or --resume")
+
+
+def test_the_error_for_a_part_of_a_capture_lists_its_files(root):
+    (root / "dataset.json").unlink()
+    refused(root, "dataset.json is missing: a capture has .*camera")
 
 
 def test_the_error_for_a_missing_size_lists_the_existing_sizes(root):

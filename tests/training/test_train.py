@@ -141,7 +141,7 @@ def test_a_finished_run_can_be_evaluated_again(finished, capsys, monkeypatch):
 
 def test_a_folder_without_a_capture_is_refused_in_one_line_with_exit_code_2(tmp_path, refused):
     text = refused("--data", tmp_path, *QUICK)
-    assert "dataset.json is missing" in text
+    assert "has no dataset.json" in text
     assert len([line for line in text.splitlines() if line.startswith("train.py:")]) == 1
 
 

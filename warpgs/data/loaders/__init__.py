@@ -84,6 +84,8 @@ def load_capture(
     perturbation = perturbation or MaskPerturbation()
     check_perturbation(perturbation)
     root = builtin_folder(root) if is_builtin(root) else Path(root)
+    if dataset is None:
+        _require_parts(root)
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
         factor = vrig_factor
@@ -93,6 +95,20 @@ def load_capture(
 def is_capture(root: Path) -> bool:
     """Whether a folder looks like a capture: it has a dataset.json, or a loader recognizes its files."""
     return (root / "dataset.json").exists() or any(loader.recognizes(root) for loader in LOADERS.values())
+
+
+def _require_parts(root: Path) -> None:
+    """Refuses what has no part of a capture; if some parts are there, the loader says which are missing."""
+    if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
+        return
+    if not root.exists():
+        raise ValueError(f"{root} does not exist")
+    if (root / "config.json").exists():
+        raise ValueError(f"{root} is a run folder: give the capture that it was trained on, or --resume {root}")
+    raise ValueError(
+        f"{root} has no dataset.json and the files of no other layout ({', '.join(LOADERS)}); warpgs prepare makes a "
+        "capture of a video or a folder of frames"
+    )
 
 
 def recognize(root: Path) -> str:
