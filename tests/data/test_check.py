@@ -102,6 +102,7 @@ def test_every_damaged_file_is_named(root):
     assert not report.is_fit
     assert "shot003.png" in texts(report, "error")
     assert "shot007.png" in texts(report, "error")
+    assert " readable frames have masks" in texts(report, "note")
 
 
 def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):

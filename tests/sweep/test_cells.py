@@ -114,11 +114,18 @@ def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
     }
 
 
-def test_two_captures_with_one_name_are_refused():
-    with pytest.raises(
-        ValueError, match="two captures have the name as: /x/as and /y/as; name one with --data NAME=/y/as"
-    ):
-        find_scenes(["/x/as", "/y/as"])
+def test_two_captures_with_one_name_are_refused(tmp_path):
+    first, second = tmp_path / "x/as", tmp_path / "y/as"
+    first.mkdir(parents=True)
+    second.mkdir(parents=True)
+    message = f"two captures have the name as: {first} and {second}; name one with --data NAME={second}"
+    with pytest.raises(ValueError, match=message):
+        find_scenes([str(first), str(second)])
+
+
+def test_a_capture_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"nowhere does not exist: --data takes captures and folders of captures"):
+        find_scenes([str(tmp_path / "nowhere")])
 
 
 def test_a_sweep_without_captures_is_refused():

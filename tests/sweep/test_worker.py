@@ -33,7 +33,7 @@ def test_a_broken_capture_is_one_line(tmp_path):
     made = job(tmp_path, "--preset", "quick", "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "cell"))
     error = run_job(made)
     assert error is not None
-    assert error.startswith(f"warpgs train: {tmp_path}/nowhere/dataset.json is missing")
+    assert error.startswith(f"warpgs train: {tmp_path}/nowhere does not exist")
     assert "\n" not in error
     assert not (tmp_path / "running/cell").exists()
     assert not (tmp_path / "cell").exists()

@@ -152,18 +152,19 @@ def _counts(capture: Capture) -> Iterator[Finding]:
 
 def _files(capture: Capture) -> Iterator[Finding]:
     """Reads every frame; counts and checks masks and depth."""
-    dynamic, num_depths = [], 0
+    dynamic, num_read, num_depths = [], 0, 0
     for name in (*capture.train, *capture.val):
         try:
             frame = capture.frame(name)
         except ValueError as error:
             yield Finding("error", "files", str(error))
             continue
+        num_read += 1
         num_depths += frame.inverse_depth is not None
         if frame.static_mask is not None and capture.assumption == "masks":
             dynamic.append(1.0 - float(frame.static_mask.float().mean()))
-    count = len(capture.train) + len(capture.val)
-    yield Finding("note", "files", f"{len(dynamic)} of {count} frames have masks, {num_depths} have depth")
+    frames = "frames" if num_read == len(capture.train) + len(capture.val) else "readable frames"
+    yield Finding("note", "files", f"{len(dynamic)} of {num_read} {frames} have masks, {num_depths} have depth")
     if capture.assumption == "dynamic":
         yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
     elif not dynamic:

@@ -88,6 +88,8 @@ def _named(text: str) -> Iterator[tuple[str, str]]:
         root = Path(text).resolve()
         inside = _captures_in(root)
         yield from ((path.name, str(path)) for path in inside)
+        if not root.exists():
+            raise ValueError(f"{root} does not exist: --data takes captures and folders of captures")
         if not inside:
             yield root.name, str(root)
 

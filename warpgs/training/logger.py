@@ -15,6 +15,9 @@ from torch.utils.tensorboard.writer import SummaryWriter
 LINE_EVERY = 10.0
 """Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
 
+WIDE = 120
+"""Minimum width of a terminal that shows the bar and all numbers; others show the most important ones in full."""
+
 
 class Status(NamedTuple):
     """Progress of a run at one of the regular checks.
@@ -60,7 +63,7 @@ class TrainingLogger:
         if sys.stdout.isatty() and not quiet:
             self._bar = Progress(
                 TextColumn("{task.description}"),
-                BarColumn(),
+                *([BarColumn()] if self._is_wide else []),
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[status]}"),
                 TimeRemainingColumn(),
@@ -81,6 +84,11 @@ class TrainingLogger:
         if self._events is not None:
             self._events.close()
 
+    @property
+    def _is_wide(self) -> bool:
+        """Whether a line of the terminal holds a bar and all numbers."""
+        return self._console.width >= WIDE
+
     def log(self, text: str) -> None:
         """Prints a line above the bar."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
@@ -96,7 +104,12 @@ class TrainingLogger:
             f"static {status.num_static:,}  dynamic {status.num_dynamic:,}  {rate:.1f} it/s"
         )
         if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=status.iteration, description=status.stage, status=text)
+            shown = (
+                text
+                if self._is_wide
+                else (f"PSNR {status.psnr:.2f}  {status.num_static + status.num_dynamic:,} Gaussians  {rate:.0f} it/s")
+            )
+            self._bar.update(self._task, completed=status.iteration, description=status.stage, status=shown)
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
             remaining = ""
