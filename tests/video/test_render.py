@@ -64,7 +64,8 @@ def test_every_evaluation_view_is_written_under_its_name(run, capture, scene, tm
     assert list(images) == sorted(capture.val)
     for name, image in images.items():
         assert (image == expected(scene, capture.cameras[name])).all()
-    assert summary == f"{len(capture.val)} images of 32 × 24 in {tmp_path / 'out'}"
+    out = tmp_path / "out"
+    assert summary == f"{len(capture.val)} images of 32 × 24 in {out} and {out / 'video.mp4'}"
 
 
 def test_the_ground_truth_is_beside_the_image(run, capture, scene, tmp_path):
@@ -240,10 +241,19 @@ def test_an_animation_shows_every_frame_and_repeats(run, tmp_path, suffix, trans
             assert ((shown[..., 3] == 255) == (truth[..., 3] > 127))[(truth[..., 3] < 20) | (truth[..., 3] > 250)].all()
 
 
-@pytest.mark.parametrize(("write", "suffixes"), [("png", {".png"}), ("mp4", {".mp4"}), ("both", {".png", ".mp4"})])
-def test_only_the_requested_files_are_written(run, tmp_path, write, suffixes):
-    render(run, tmp_path, path="fixed", write=write)
+@pytest.mark.parametrize(
+    ("write", "suffixes", "places"),
+    [
+        ("png", {".png"}, ["out"]),
+        ("mp4", {".mp4"}, ["out/video.mp4"]),
+        ("gif", {".gif"}, ["out/video.gif"]),
+        ("both", {".png", ".mp4"}, ["out", "out/video.mp4"]),
+    ],
+)
+def test_only_the_requested_files_are_written(run, tmp_path, write, suffixes, places):
+    summary = render(run, tmp_path, path="fixed", write=write)
     assert {path.suffix for path in (tmp_path / "out").iterdir()} == suffixes
+    assert summary.endswith(" in " + " and ".join(str(tmp_path / place) for place in places))
 
 
 @pytest.mark.parametrize("quiet", [True, False])

@@ -146,7 +146,8 @@ def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.
         remove_numbered(folder, lambda k: f"{_number(k)}.png")
     with ExitStack() as stack:
         suffix = _video_suffix(options)
-        video = writer.Video(folder / f"video{suffix}", options.rate or writer.FRAME_RATE) if suffix else None
+        file = folder / f"video{suffix}"
+        video = writer.Video(file, options.rate or writer.FRAME_RATE) if suffix else None
         if video is not None:
             stack.enter_context(video)
         for name, image in zip(names, images, strict=True):
@@ -155,7 +156,8 @@ def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.
             if with_images:
                 write_png(folder / f"{name}.png", image)
     height, width = image.shape[:2]
-    return f"{len(names)} images of {width} × {height} in {folder}"
+    places = [*([folder] if with_images else []), *([file] if video else [])]
+    return f"{len(names)} images of {width} × {height} in {' and '.join(map(str, places))}"
 
 
 def _add(video: writer.Video, image: np.ndarray) -> None:
