@@ -58,3 +58,7 @@ def test_the_command_says_what_to_run_next(tmp_path, monkeypatch, capsys):
     assert f"next run warpgs prepare {path} CAPTURE" in capsys.readouterr().out
     assert main(["sample", str(tmp_path / "sample.txt")]) == 2
     assert "must end with" in capsys.readouterr().err
+    before = path.read_bytes()
+    assert main(["sample", str(path)]) == 2
+    assert f"{path} exists: give another name" in capsys.readouterr().err
+    assert path.read_bytes() == before

@@ -55,12 +55,15 @@ def write_sample(path: Path, size: SampleSize | None = None, quiet: bool = True)
         quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
 
     Raises:
-        ValueError: If the suffix is unknown, or the size too small for ``warpgs prepare``.
+        ValueError: If the suffix is unknown, the file exists (it may be a video of the user's own), or the size is too
+            small for ``warpgs prepare``.
         OSError: If the file cannot be written; the message names it.
     """
     size = size or SampleSize()
     if path.suffix not in ENCODINGS:
         raise ValueError(f"{path} must end with {', '.join(ENCODINGS)}")
+    if path.exists():
+        raise ValueError(f"{path} exists: give another name, or delete it first")
     if min(size.width, size.height) < MIN_SIDE or size.num_frames < MIN_FRAMES or size.num_samples < 1:
         raise ValueError(f"the sample needs {MIN_FRAMES} frames of {MIN_SIDE}×{MIN_SIDE} pixels at least, got {size}")
     clutter = _clutter()
