@@ -25,6 +25,7 @@ from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
+from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.training import initialize
 from warpgs.training import train as script
@@ -243,6 +244,21 @@ def test_ctrl_c_saves_a_checkpoint_and_tells_how_to_continue(data, tmp_path):
 def config(tmp_path, contracts_off, monkeypatch):
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
     return dataclasses.replace(tiny.CONFIG, data=tiny.write(tmp_path / "capture"), out=tmp_path / "run")
+
+
+def test_a_moved_capture_is_given_to_eval_and_to_resume(config, tmp_path, refused, train):
+    warpgs.train(config)
+    moved = config.data.rename(tmp_path / "elsewhere")
+    error = refused("--resume", config.out)
+    assert f"the capture of {config.out}, {config.data}, does not exist; if it was moved, give it by --data" in error
+    (config.out / "metrics.json").unlink()
+    assert cli.main(["eval", str(config.out), "--data", str(moved), "--device", "cpu"]) == 0
+    assert (config.out / "metrics.json").exists()
+    assert read_config(config.out).data == config.data
+    code, _ = train("--resume", config.out, "--data", moved)
+    assert code == 0
+    assert read_config(config.out).data == moved
+    assert cli.main(["eval", str(config.out), "--device", "cpu"]) == 0
 
 
 def test_train_returns_the_finished_run_and_prints_nothing_unless_it_is_given_a_log(config, capsys):

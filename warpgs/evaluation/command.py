@@ -24,6 +24,8 @@ class Eval:
     """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
     as_taken: bool = False
     """Compare frames as they were taken, with the distortion of their lens; by default they are undistorted first."""
+    data: Path | None = None
+    """Current folder of the capture, if it was moved."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; by default CUDA if there is a GPU."""
     quiet: bool = False
@@ -31,7 +33,11 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and prints a summary; raises as ``evaluate_run``."""
+        from warpgs.runs.run import Run
+
         from .evaluate_run import evaluate_run
 
-        weights = (self.lpips, self.lpips_net)
-        print(evaluate_run(self.run_folder, None, weights, self.device, self.quiet, self.as_taken))
+        weights, capture = (self.lpips, self.lpips_net), None
+        if self.data is not None:
+            capture = Run.open(self.run_folder, self.device, self.data).open_capture(self.quiet)
+        print(evaluate_run(self.run_folder, capture, weights, self.device, self.quiet, self.as_taken))

@@ -109,12 +109,12 @@ def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool)
 
 
 def _summary(values: dict[str, Any]) -> str:
-    def show(name: str, digits: int) -> str:
+    def show(name: str, digits: int, unit: str = "") -> str:
         value = values[name]
-        return "not measured" if value is None else f"{value:.{digits}f}"
+        return "not measured" if value is None else f"{value:.{digits}f}{unit}"
 
     last_line = f"{values['num_static']:,} static and {values['num_dynamic']:,} dynamic Gaussians"
-    motion = f"flicker {show('flicker', 5)}, jitter {show('jitter', 3)}, {show('fps', 1)} FPS"
+    motion = f"flicker {show('flicker', 5)}, jitter {show('jitter', 3)}, {show('fps', 1, ' FPS')}"
     if not values["num_views"]:
         quality = "the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"
         return f"{quality}\n{motion}\n{last_line}"
@@ -123,8 +123,8 @@ def _summary(values: dict[str, Any]) -> str:
         lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
     similarity = f"SSIM {show('ssim', 4)}, MS-SSIM {show('ms_ssim', 4)}"
     lines = [
-        f"{values['num_views']} views: PSNR {show('psnr', 2)} dB, {similarity}, {lpips}",
-        f"static region {show('psnr_static', 2)} dB, dynamic region {show('psnr_dynamic', 2)} dB, {motion}",
+        f"{values['num_views']} views: PSNR {show('psnr', 2, ' dB')}, {similarity}, {lpips}",
+        f"static region {show('psnr_static', 2, ' dB')}, dynamic region {show('psnr_dynamic', 2, ' dB')}, {motion}",
         last_line,
     ]
     if values["poses_aligned"]:
@@ -132,7 +132,7 @@ def _summary(values: dict[str, Any]) -> str:
     if values["frames"] == "undistorted":
         lines.append("frames were undistorted, and so resampled; eval --as-taken compares them as they were taken")
     if values["masked_psnr"] is not None:
-        masked = f"mPSNR {show('masked_psnr', 2)} dB, mSSIM {show('masked_ssim', 4)}"
+        masked = f"mPSNR {show('masked_psnr', 2, ' dB')}, mSSIM {show('masked_ssim', 4)}"
         lines.insert(1, f"co-visible: {masked}, mLPIPS {show('masked_lpips', 4)}")
     return "\n".join(lines)
 

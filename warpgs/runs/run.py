@@ -11,6 +11,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
+from warpgs.data.builtin import is_builtin
 from warpgs.data.capture import Capture, extent_of
 from warpgs.files import partial_path
 
@@ -102,6 +103,11 @@ class Run:
 
     def open_capture(self, quiet: bool = False) -> Capture:
         """The capture that the run was trained on; raises as ``open_capture``."""
+        data = self.config.data
+        if data is not None and not is_builtin(data) and not data.exists():
+            raise ValueError(
+                f"the capture of {self.folder}, {data}, does not exist; if it was moved, give it by --data"
+            )
         return open_capture(self.config, quiet)
 
     def open_corrected_capture(self, quiet: bool = False) -> Capture:

@@ -91,8 +91,8 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         log = log if is_first else None
         trainer = make_trainer(config, log)
         _describe(trainer, log or _ignore)
-        is_extended = config.resume is not None and config.iterations is not None
-        _train(trainer, is_extended, callbacks, quiet=log is None)
+        is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
+        _train(trainer, is_changed, callbacks, quiet=log is None)
     if is_first:
         _evaluate(trainer, log)
     return Run(trainer.run, trainer.config)
@@ -108,7 +108,7 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 
 
-def _train(trainer: Trainer, is_extended: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
+def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
     """Trains in the locked run folder; raises TrainingInterrupted after Ctrl-C."""
     num_iterations, is_first = trainer.protocol.num_iterations, ranks.is_first()
     run = Run(trainer.run, trainer.config)
@@ -119,7 +119,7 @@ def _train(trainer: Trainer, is_extended: bool, callbacks: Sequence[Callback], q
         TrainingLogger(events, num_iterations, trainer.iteration, quiet) as logger,
     ):
         if is_first:
-            if is_extended:
+            if is_changed:
                 write_config(run.folder, run.config)
             trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
         try:
@@ -179,6 +179,8 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
         saved = extended(read_config(config.resume), config.iterations)
+        if config.data is not None:
+            saved = dataclasses.replace(saved, data=config.data)
         if config.lpips is not None:
             saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
         run = Run(config.resume, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
