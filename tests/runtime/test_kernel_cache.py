@@ -1,6 +1,7 @@
 """Damaged files in Warp's cache are compiled again, and a home that cannot be written is replaced."""
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -98,6 +99,15 @@ def test_a_damaged_seal_costs_a_compilation_at_most(folder, capsys):
     load_in_a_new_process()
     assert (folder / kernel_cache.SEAL).read_bytes() == whole
     capsys.readouterr()
+
+
+def test_the_first_compilation_of_a_process_is_announced(folder, capsys):
+    kernel_cache._announce_compilation.cache_clear()
+    for _ in range(2):
+        shutil.rmtree(folder)
+        load_in_a_new_process()
+    error = capsys.readouterr().err
+    assert error == f"warpgs: compiling kernels into {folder.parent}, once: this can take a minute\n"
 
 
 def test_an_undamaged_module_is_not_compiled_again(folder, capsys):

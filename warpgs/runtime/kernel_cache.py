@@ -7,6 +7,7 @@ before it is loaded by a later process.
 
 import atexit
 import contextlib
+import functools
 import hashlib
 import os
 import shutil
@@ -104,6 +105,8 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
     if key in _loaded:
         return
     folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(key[2])
+    if not folder.is_dir():
+        _announce_compilation()
     if damaged := _damaged_file(folder):
         _discard(folder, f"{damaged} is not what was written")
     was_cached = folder.is_dir()
@@ -118,6 +121,12 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
         wp.load_module(kernel.module, device, block_dim=key[2])
     _seal(folder)
     _loaded.add(key)
+
+
+@functools.cache
+def _announce_compilation() -> None:
+    """Says once per process why nothing happens for a while."""
+    sys.stderr.write(f"warpgs: compiling kernels into {wp.config.kernel_cache_dir}, once: this can take a minute\n")
 
 
 def _discard(folder: Path, reason: object) -> None:
