@@ -115,6 +115,12 @@ def test_a_run_folder_is_not_taken_for_a_capture(tmp_path):
     refused(tmp_path, "is a run folder: give the capture that it was trained on, or --resume")
 
 
+def test_a_model_without_its_images_is_named(tmp_path):
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    (tmp_path / "sparse/0/cameras.txt").write_text("")
+    refused(tmp_path, "has a COLMAP model, but not the folder images/")
+
+
 def test_the_error_for_a_part_of_a_capture_lists_its_files(root):
     (root / "dataset.json").unlink()
     refused(root, "dataset.json is missing: a capture has .*camera")

@@ -10,6 +10,7 @@ from typing import Protocol
 from warpgs.config import MaskPerturbation
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
+from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
 from warpgs.files import read_json
 
@@ -105,6 +106,8 @@ def _require_parts(root: Path) -> None:
         raise ValueError(f"{root} does not exist")
     if (root / "config.json").exists():
         raise ValueError(f"{root} is a run folder: give the capture that it was trained on, or --resume {root}")
+    if find_model(root) is not None:
+        raise ValueError(f"{root} has a COLMAP model, but not the folder images/ with its images")
     raise ValueError(
         f"{root} has no dataset.json and the files of no other layout ({', '.join(LOADERS)}); warpgs prepare makes a "
         "capture of a video or a folder of frames"
