@@ -33,8 +33,9 @@ from .rotations import find_directions
 FALLBACK_FRAMES = 250
 """Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
 
-MAX_FEATURES = 4096
-"""Maximum number of features per frame; the time for matching grows with its square."""
+MAX_FEATURES = 2048
+"""Maximum number of features per frame, of which COLMAP keeps the coarsest; matching takes the square of its time. Of
+120 frames of 960×540, the first pass took 116 s instead of 174 with 4,096, with 0.50 instead of 0.48 px."""
 
 WEAK_PEAK = 0.002
 """Minimum contrast of weak features; COLMAP's default is 0.0067."""
