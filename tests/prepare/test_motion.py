@@ -6,15 +6,16 @@ import pytest
 
 from tests.prepare import boards
 from warpgs.data.writer import write_depth
+from warpgs.prepare import motion_masks
 from warpgs.prepare.cameras import Cameras
 from warpgs.prepare.depth import add_depth, as_half
 from warpgs.prepare.flow import Flows
 from warpgs.prepare.flow_depth import _enlarged, static_depth
 from warpgs.prepare.images import brighten
 from warpgs.prepare.methods import DepthMethod
-from warpgs.prepare.motion_masks import clean, find_dynamic, gather, outline, vote
+from warpgs.prepare.motion_masks import clean, confirmed, find_dynamic, gather, outline, vote
 from warpgs.prepare.posed_frames import PosedFrames
-from warpgs.prepare.revisits import Evidence
+from warpgs.prepare.revisits import MIN_GAPS, Agreement, Evidence, Revisits
 from warpgs.prepare.segments import Graph, Segments
 from warpgs.prepare.triangulation import Observation, fill_unknown, triangulate
 
@@ -167,22 +168,25 @@ def test_a_dynamic_colour_does_not_outvote_proof_that_a_surface_is_static():
         sizes=size,
         colors=np.array([*[red] * 6, red, grey, red] * 7),
         log_inverse_depth=np.arange(63.0),  # so no neighbour counts
-        static=size * np.array([*[0.0] * 6, 0.1, 0.5, 0.0] * 7),
-        dynamic=size * np.array([*[0.9] * 6, 0.0, 0.0, 0.0] * 7),
+        static=size * np.array([[*[0.0] * 6, 0.1, 0.5, 0.0] * 7, [1.0] * 63]),
+        dynamic=size * np.array([[*[0.9] * 6, 0.0, 0.0, 0.0] * 7, [0.0] * 63]),
     )
-    (probability,) = Graph([segments], []).dynamic_probabilities()
+    graph = Graph([segments], [])
+    (probability,) = graph.dynamic_probabilities(0)
     *moving, confirmed, other, unknown = probability[0].reshape(7, 9).T
     assert np.min(moving) > 0.85
     assert confirmed.max() < 0.4
     assert other.max() < 0.1
     assert unknown.min() > 0.6
+    assert graph.dynamic_probabilities(1)[0].max() < 0.1  # the other kind of evidence
 
 
 def gathered(image: np.ndarray, residual: np.ndarray, witnesses: int = 0) -> Segments:
     """The evidence on an image, with a residual in pixels and nothing that agrees in the far frames."""
     nothing = np.zeros(residual.shape, np.float32)
     seen = np.full(residual.shape, witnesses, np.uint8)
-    return gather(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), Evidence(residual, nothing, seen, nothing + 1.0))
+    evidence = Evidence(residual, (Agreement(nothing, seen),) * 2, nothing + 1.0)
+    return gather(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), evidence)
 
 
 def test_evidence_at_half_the_size_counts_where_it_is():
@@ -200,7 +204,7 @@ def test_evidence_at_half_the_size_counts_where_it_is():
 
 def evidence_on(region: tuple, found: Segments) -> tuple[float, float]:
     """Mean static and dynamic evidence per pixel of a region."""
-    return tuple(float((kind / found.sizes)[found.labels][region].mean()) for kind in (found.static, found.dynamic))
+    return tuple(float((kind[0] / found.sizes)[found.labels][region].mean()) for kind in (found.static, found.dynamic))
 
 
 def test_where_no_far_frame_looks_the_neighbours_decide(video):
@@ -300,6 +304,24 @@ def test_dark_images_are_brightened_to_middle_grey_and_black_ones_stay_black(vid
     assert not brighten([np.zeros((8, 8, 3), np.uint8)])[0].any()
 
 
+@pytest.mark.parametrize("min_gap", MIN_GAPS)
+def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, frames):
+    revisits = Revisits(frames, Flows(frames.images))
+    gaps = [abs(k - 12) for k in revisits.far_frames(12, 0.2, min_gap)]
+    assert gaps
+    assert min(gaps) == min(min_gap, 24 // 5)  # of a short video at most a fifth
+
+
+def test_evidence_is_found_beside_both_sets_of_far_frames():
+    images, _ = boards.record(48)
+    frames = PosedFrames(images, boards.lens(), boards.poses(48), boards.points())
+    flows = Flows(brighten(frames.images), frames.expected_flow)
+    farther, nearer = Revisits(frames, flows).evidence(24).agreements
+    assert farther.witnesses.max() > 2
+    assert nearer.witnesses.max() > 2
+    assert not np.array_equal(farther.agreement, nearer.agreement)
+
+
 def test_small_regions_and_holes_are_removed():
     dynamic = np.zeros((100, 200), bool)
     dynamic[20:60, 50:120] = True
@@ -325,6 +347,59 @@ def test_a_flicker_in_one_frame_is_outvoted_and_a_gap_is_filled():
     voted = vote(list(dynamic), [(everywhere, everywhere)] * 4)
     assert voted[2][:, :2].all()
     assert not voted[2][:, 4].any()
+
+
+def blocks(*columns: int) -> np.ndarray:
+    """[4, 12] regions that begin at these columns and are two columns wide."""
+    mask = np.zeros((4, 12), bool)
+    for column in columns:
+        mask[:, column : column + 2] = True
+    return mask
+
+
+STILL, LOST = (np.arange(48), np.arange(48)), (np.zeros(0, np.int64), np.zeros(0, np.int64))
+"""Flow between two frames in which nothing moves, and in which no pixel is seen again."""
+
+
+def test_an_object_of_which_nothing_is_certain_is_dropped():
+    kept = confirmed([blocks(1, 5)] * 3, [blocks(5)] * 3, [STILL] * 2)
+    assert np.array_equal(kept, [blocks(5)] * 3)
+
+
+def test_an_object_that_is_certain_in_other_frames_stays_in_all():
+    """A hand that hesitates for some frames."""
+    masks, certain = [blocks(1)] * 3, [blocks(1), blocks(), blocks(1)]
+    assert np.array_equal(confirmed(masks, certain, [STILL] * 2), masks)
+    assert not confirmed(masks, certain, [LOST] * 2)[1].any()
+
+
+def test_a_large_object_is_not_confirmed_by_a_small_one_that_flow_carries_into_it():
+    masks = [blocks(1, 3, 5, 7), blocks(3), blocks(1, 3, 5, 7)]
+    kept = confirmed(masks, [blocks(), blocks(3), blocks()], [STILL] * 2)
+    assert not kept[0].any()
+    assert np.array_equal(kept[1], blocks(3))
+
+
+@pytest.mark.parametrize(("width", "added"), [(2, False), (30, True)])
+def test_what_only_the_nearer_far_frames_show_is_added_if_it_is_much(width, added, frames, monkeypatch):
+    still = np.arange(192 * 256)
+    slow, fast = (np.zeros((192, 256), np.float32) for _ in range(2))
+    slow[50:150, 20:120] = fast[50:150, 20:120] = 1.0
+    fast[50:150, 180 : 180 + width] = 1.0
+
+    class Solved:
+        def __init__(self, segments, carried):
+            self.count = len(segments)
+
+        def dynamic_probabilities(self, kind):
+            return [(slow, fast)[kind]] * self.count
+
+    monkeypatch.setattr(motion_masks, "Graph", Solved)
+    monkeypatch.setattr(motion_masks._Finder, "find", lambda self, k: (None, (still, still) if k < 23 else None))
+    monkeypatch.setattr(motion_masks, "outline", lambda image, probability: probability > 0.5)
+    for mask in find_dynamic(frames):
+        assert mask[60:140, 30:110].all()
+        assert mask[60:140, 182:208].any() == added
 
 
 def test_votes_follow_the_motion():

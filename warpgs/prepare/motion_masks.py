@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from .flow import Flows
 from .images import brighten
 from .parallel import map_frames
 from .posed_frames import PosedFrames
-from .revisits import NUM_AGREEING, Evidence, Revisits
+from .revisits import MIN_GAPS, NUM_AGREEING, Evidence, Revisits
 from .segments import Graph, Segments, segment
 from .triangulation import fill_unknown
 
@@ -27,6 +29,12 @@ MIN_HOLE = 0.003
 
 CERTAIN, LIKELY, POSSIBLE = 0.85, 0.5, 0.15
 """Dynamic probabilities above which GrabCut starts from foreground, probable foreground and probable background."""
+
+MIN_CERTAIN = 0.2
+"""Fraction of a region that must seem to move beside the nearer far frames, too."""
+
+MIN_ADDED = 0.05
+"""What they add to the masks, as a fraction of the masks, from which on it is outlined and added."""
 
 GRABCUT_ROUNDS = 1
 """A second round takes a quarter to two thirds more time and changes the intersection over union by at most 0.003."""
@@ -53,10 +61,6 @@ MIN_ISOTROPY, FULL_ISOTROPY = 0.1, 0.5
 
 OWN_VOTE, VOTES = 1.5, (1.0, 0.8, 0.6)
 """Weight of a frame's own mask, and of the masks one, two and three frames away in both directions."""
-
-OUTLINE_WIDTH = 0.002
-"""Width by which dynamic regions are dilated, as a fraction of the image width; 0.006 costs 0.04 to 0.07 of the
-intersection over union. Training has a margin of its own (``loss.mask_margin``)."""
 
 Carried = tuple[np.ndarray, np.ndarray]
 """Flat indices of pixels, and their flat indices in the next frame."""
@@ -98,18 +102,23 @@ def gather(lab: UInt8[np.ndarray, "H W 3"], evidence: Evidence) -> Segments:
         evidence: Evidence on its pixels, at this size or a smaller one.
     """
     dx, dy = _gradients(lab)
-    texture, seen = _texture(dx, dy), evidence.witnesses >= NUM_AGREEING
+    texture = _texture(dx, dy)
     residual = np.nan_to_num(evidence.residual, nan=UNKNOWN_RESIDUAL)
     size = lab.shape[1::-1]
     contradiction = _contradiction(evidence.residual)
-    # A dynamic object also contradicts the neighbours; where they fit well, a mismatch far away is doubtful.
-    doubt = (1.0 - evidence.agreement) * seen * np.clip(residual - 0.5, 0.15, 1.0)
-    # Where no far frame looks, the neighbours alone decide: better than the colours of other places.
-    static = np.where(seen, evidence.agreement, np.exp(-((residual / LOCAL_TOLERANCE) ** 2))) * (1.0 - contradiction)
     # Along an edge or a stripe, flow is a guess: it may contradict the cameras, but not show motion.
-    dynamic = cv2.resize(np.maximum(doubt, contradiction), size) * _isotropy(dx, dy)
+    motion_texture = texture * _isotropy(dx, dy)
+    static, dynamic = [], []
+    for agreement, witnesses in evidence.agreements:
+        seen = witnesses >= NUM_AGREEING
+        # A dynamic object also contradicts the neighbours; where they fit well, a mismatch far away is doubtful.
+        doubt = (1.0 - agreement) * seen * np.clip(residual - 0.5, 0.15, 1.0)
+        # Where no far frame looks, the neighbours alone decide: better than the colours of other places.
+        fits = np.where(seen, agreement, np.exp(-((residual / LOCAL_TOLERANCE) ** 2))) * (1.0 - contradiction)
+        static.append(texture * cv2.resize(fits, size))
+        dynamic.append(motion_texture * cv2.resize(np.maximum(doubt, contradiction), size))
     inverse_depth = cv2.resize(fill_unknown(evidence.inverse_depth), size)
-    return segment(lab, inverse_depth, texture * cv2.resize(static, size), texture * dynamic)
+    return segment(lab, inverse_depth, np.array(static), np.array(dynamic))
 
 
 def _contradiction(residual: np.ndarray) -> Float[np.ndarray, "H W"]:
@@ -154,9 +163,49 @@ def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarra
     labs = [cv2.cvtColor(image, cv2.COLOR_RGB2LAB) for image in images]
     found = map_frames(_Finder(flows, labs, Revisits(small, flows)).find, indices, "motion", quiet)
     segments, carried = [s for s, _ in found], [c for _, c in found if c is not None]
-    probabilities = Graph(segments, carried).dynamic_probabilities()
-    outlines = map_frames(lambda k: outline(images[k], probabilities[k]), indices, "outlines", quiet)
-    return [clean(mask) for mask in vote(outlines, carried)]
+    graph = Graph(segments, carried)
+
+    def outlined(probabilities: Sequence[np.ndarray]) -> list[Bool[np.ndarray, "H W"]]:
+        outlines = map_frames(lambda k: outline(images[k], probabilities[k]), indices, "outlines", quiet)
+        return [clean(mask) for mask in vote(outlines, carried)]
+
+    slow, fast = (graph.dynamic_probabilities(k) for k in range(len(MIN_GAPS)))
+    certain = [smooth(p) > LIKELY for p in fast]
+    masks = outlined(slow)
+    added = sum(int((c & ~m).sum()) for c, m in zip(certain, masks, strict=True))
+    masks = confirmed(masks, certain, carried)
+    if added > MIN_ADDED * sum(int(m.sum()) for m in masks):
+        masks = [a | b for a, b in zip(masks, outlined(fast), strict=True)]
+    return masks
+
+
+def confirmed(
+    masks: Sequence[Bool[np.ndarray, "H W"]], certain: Sequence[Bool[np.ndarray, "H W"]], carried: Sequence[Carried]
+) -> list[Bool[np.ndarray, "H W"]]:
+    """[H, W] the masks without the objects of which too little is certain, over all frames together.
+
+    Args:
+        masks, certain: [H, W] of each frame.
+        carried: As for ``vote``. Two regions are one object if flow carries half of the larger one into the other.
+    """
+    counts, labels = zip(*(cv2.connectedComponents(mask.astype(np.uint8)) for mask in masks), strict=True)
+    starts = np.cumsum([0, *counts])
+    sizes = np.concatenate([np.bincount(a.ravel(), minlength=n) for a, n in zip(labels, counts, strict=True)])
+    share = np.concatenate(
+        [np.bincount(a.ravel(), c.ravel(), n) for a, c, n in zip(labels, certain, counts, strict=True)]
+    )
+    links = []
+    for k, (pixels, targets) in enumerate(carried):
+        i, j = labels[k].ravel()[pixels], labels[k + 1].ravel()[targets]
+        both = (i > 0) & (j > 0)
+        pairs, shared = np.unique(np.stack([i[both] + starts[k], j[both] + starts[k + 1]]), axis=1, return_counts=True)
+        links.append(pairs[:, shared > 0.5 * sizes[pairs].max(0)])
+    i, j = np.concatenate([np.zeros((2, 0), np.int64), *links], 1)
+    graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), (starts[-1], starts[-1]))
+    count, objects = connected_components(graph, directed=False)
+    kept = np.bincount(objects, share, count) > MIN_CERTAIN * np.bincount(objects, sizes, count)
+    kept = kept[objects]
+    return [mask & kept[start + a] for mask, start, a in zip(masks, starts, labels, strict=False)]
 
 
 def vote(masks: Sequence[Bool[np.ndarray, "H W"]], carried: Sequence[Carried]) -> list[Bool[np.ndarray, "H W"]]:
@@ -193,7 +242,7 @@ def outline(image: UInt8[np.ndarray, "H W 3"], probability: Float[np.ndarray, "H
         image: [H, W, 3].
         probability: [H, W] in [0, 1] that a pixel is dynamic.
     """
-    probability = cv2.GaussianBlur(probability.astype(np.float32), (0, 0), 3.0)
+    probability = smooth(probability)
     likely = probability > LIKELY
     if not likely.any() or likely.all():
         return likely
@@ -212,14 +261,15 @@ def outline(image: UInt8[np.ndarray, "H W 3"], probability: Float[np.ndarray, "H
     return likely if dynamic.sum() < 0.5 * likely.sum() else dynamic
 
 
+def smooth(probability: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """[H, W] the probability without the steps between superpixels."""
+    return cv2.GaussianBlur(probability.astype(np.float32), (0, 0), 3.0)
+
+
 def clean(dynamic: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """[H, W] the region without small parts and holes, dilated by the width of soft outlines."""
-    area, width = dynamic.size, dynamic.shape[1]
-    dynamic = _remove_small(dynamic, MIN_REGION * area)
-    dynamic = ~_remove_small(~dynamic, MIN_HOLE * area)
-    radius = round(OUTLINE_WIDTH * width)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return cv2.dilate(dynamic.astype(np.uint8), disc) > 0
+    """[H, W] the region without small parts and holes."""
+    dynamic = _remove_small(dynamic, MIN_REGION * dynamic.size)
+    return ~_remove_small(~dynamic, MIN_HOLE * dynamic.size)
 
 
 def _remove_small(region: np.ndarray, min_area: float) -> np.ndarray:

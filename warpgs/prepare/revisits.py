@@ -4,10 +4,13 @@ Between neighbouring frames a slow object looks static: a wrong depth explains i
 with frames far away in time that were taken from similar viewpoints. The far image is warped into the frame by the
 depth from the neighbours, optical flow measures the remaining displacement, and depth is solved again from all
 positions together: then a static surface whose depth was slightly wrong agrees with most far frames, and one that has
-moved agrees with none.
+moved agrees with none. Two sets of far frames do that: the farther one also shows slow motion; the nearer one is right
+more often, because a camera that passes still sees the same surfaces, and reflections stay where they are.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,15 +21,15 @@ from .flow import Flows
 from .posed_frames import PosedFrames
 from .triangulation import Observation, errors, fill_unknown, triangulate
 
-NUM_FAR = 6
-"""Number of far frames to compare with."""
+NUM_FAR = 5
+"""Number of far frames to compare with, of each set."""
 
 NUM_AGREEING = 3
 """Number of far frames that must agree for a surface to be static; it may be occluded in the others."""
 
-MIN_GAP = 8
-"""Minimum number of frames between a frame and its far frames. With 6, of a hand that moves slowly less is found; with
-10, a camera that passes shares too little with them (docs/prepare.md has the figures)."""
+MIN_GAPS = (8, 4)
+"""Minimum number of frames between a frame and its far frames, of each set. A hand that moves slowly is lost with 4 and
+partly with 6; with 10, a camera that passes shares too little with them (docs/prepare.md has the figures)."""
 
 MIN_SPACING = 3
 """Minimum number of frames between far frames."""
@@ -44,20 +47,30 @@ PIXEL_NOISE = 1.5
 """Standard deviation of a grey level; keeps patches without texture from correlating."""
 
 
+class Agreement(NamedTuple):
+    """How far frames agree with a frame.
+
+    Attributes:
+        agreement: [H, W] in [0, 1], how well the best of them see the pixel where a static surface would be.
+        witnesses: [H, W] number of them whose view contains the pixel's surface.
+    """
+
+    agreement: Float[np.ndarray, "H W"]
+    witnesses: UInt8[np.ndarray, "H W"]
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Evidence of the neighbours and the far frames on a frame's pixels.
 
     Attributes:
         residual: [H, W] residual of the neighbours alone [px], see ``LocalGeometry``; NaN where unknown.
-        agreement: [H, W] in [0, 1], how well the best far frames see the pixel where a static surface would be.
-        witnesses: [H, W] number of far frames whose view contains the pixel's surface.
-        inverse_depth: [H, W] from neighbours and far frames; NaN where unknown.
+        agreements: For each of ``MIN_GAPS``, how far frames at least that far away agree.
+        inverse_depth: [H, W] from neighbours and the farthest frames; NaN where unknown.
     """
 
     residual: Float[np.ndarray, "H W"]
-    agreement: Float[np.ndarray, "H W"]
-    witnesses: UInt8[np.ndarray, "H W"]
+    agreements: tuple[Agreement, ...]
     inverse_depth: Float[np.ndarray, "H W"]
 
 
@@ -76,14 +89,14 @@ class Revisits:
         self._grey = [cv2.GaussianBlur(plane, (0, 0), 0.7).astype(np.float32) for plane in flows.grey]
         self._centers = camera_centers(frames.poses)
 
-    def far_frames(self, frame: int, inverse_depth: float) -> list[int]:
+    def far_frames(self, frame: int, inverse_depth: float, min_gap: int) -> list[int]:
         """Frames far away in time that view a scene of this inverse depth from similar viewpoints, best first."""
         poses = self._frames.poses
         cosines = (np.einsum("fij,ij->f", poses[:, :, :3], poses[frame, :, :3]) - 1.0) / 2.0
         distances = np.linalg.norm(self._centers - self._centers[frame], axis=1) * inverse_depth
         cost = np.arccos(np.clip(cosines, -1.0, 1.0)) + distances
         indices = np.arange(len(poses))
-        cost[np.abs(indices - frame) < min(MIN_GAP, max(2, len(poses) // 5))] = np.inf
+        cost[np.abs(indices - frame) < min(min_gap, max(2, len(poses) // 5))] = np.inf
         chosen: list[int] = []
         while len(chosen) < NUM_FAR and np.isfinite(cost).any():
             chosen.append(int(cost.argmin()))
@@ -94,22 +107,28 @@ class Revisits:
 
     def evidence(self, frame: int) -> Evidence:
         """The evidence of the neighbours and the far frames on a frame."""
-        focal = self._frames.focal
         near = self._frames.observations(frame, self._flows)
-        local = triangulate(near, focal)
+        local = triangulate(near, self._frames.focal)
         rho = fill_unknown(local.inverse_depth)
-        revisits = [self._revisit(frame, other, rho) for other in self.far_frames(frame, float(np.median(rho)))]
+        chosen = [self.far_frames(frame, float(np.median(rho)), gap) for gap in MIN_GAPS]
+        revisits = {other: self._revisit(frame, other, rho) for other in sorted(set().union(*chosen))}
         if not revisits:
-            nothing = np.zeros_like(rho)
-            return Evidence(local.residual, nothing, nothing.astype(np.uint8), local.inverse_depth)
-        solved = triangulate([*near, *(r.observation for r in revisits)], focal).inverse_depth
+            nothing = Agreement(np.zeros_like(rho), np.zeros(rho.shape, np.uint8))
+            return Evidence(local.residual, (nothing,) * len(MIN_GAPS), local.inverse_depth)
+        agreements, solved = zip(*(self._agreement(near, [revisits[k] for k in far]) for far in chosen), strict=True)
+        return Evidence(local.residual, agreements, solved[0])
+
+    def _agreement(self, near: Sequence[Observation], far: Sequence[_Revisit]) -> tuple[Agreement, np.ndarray]:
+        """How far frames agree with the depth from neighbours and them, and its inverse."""
+        focal = self._frames.focal
+        solved = triangulate([*near, *(r.observation for r in far)], focal).inverse_depth
         scores = []
-        for r in revisits:
+        for r in far:
             fit = np.exp(-((errors(r.observation, solved, focal) / TOLERANCE) ** 2))
             scores.append(np.nan_to_num(fit * np.clip((r.correlation - 0.3) / 0.5, 0.0, 1.0) * r.inside))
         best = np.partition(scores, -min(NUM_AGREEING, len(scores)), axis=0)[-NUM_AGREEING:]
-        witnesses = np.sum([r.inside for r in revisits], axis=0).astype(np.uint8)
-        return Evidence(local.residual, best.mean(0).astype(np.float32), witnesses, solved)
+        witnesses = np.sum([r.inside for r in far], axis=0).astype(np.uint8)
+        return Agreement(best.mean(0).astype(np.float32), witnesses), solved
 
     def _revisit(self, frame: int, other: int, rho: np.ndarray) -> _Revisit:
         """Warps another frame into this one by its depth and measures the remaining displacement by optical flow."""

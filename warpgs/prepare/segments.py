@@ -66,22 +66,22 @@ class Segments:
         sizes: [S] number of pixels.
         colors: [S, 3] mean Lab colours.
         log_inverse_depth: [S] means.
-        static, dynamic: [S] evidence, in pixels.
+        static, dynamic: [E, S] evidence of each kind, in pixels.
     """
 
     labels: Int[np.ndarray, "H W"]
     sizes: Float[np.ndarray, " S"]
     colors: Float[np.ndarray, "S 3"]
     log_inverse_depth: Float[np.ndarray, " S"]
-    static: Float[np.ndarray, " S"]
-    dynamic: Float[np.ndarray, " S"]
+    static: Float[np.ndarray, "E S"]
+    dynamic: Float[np.ndarray, "E S"]
 
 
 def segment(
     lab: UInt8[np.ndarray, "H W 3"],
     inverse_depth: Float[np.ndarray, "H W"],
-    static: Float[np.ndarray, "H W"],
-    dynamic: Float[np.ndarray, "H W"],
+    static: Float[np.ndarray, "E H W"],
+    dynamic: Float[np.ndarray, "E H W"],
 ) -> Segments:
     """Superpixels (SLIC) of a frame with the evidence on their inner pixels.
 
@@ -90,7 +90,7 @@ def segment(
     Args:
         lab: [H, W, 3] image in 8-bit Lab.
         inverse_depth: [H, W], positive.
-        static, dynamic: [H, W] evidence.
+        static, dynamic: [E, H, W] evidence of each kind.
     """
     slic = cv2.ximgproc.createSuperpixelSLIC(cv2.GaussianBlur(lab, (0, 0), 0.8), cv2.ximgproc.SLIC, SIDE, 15.0)
     slic.iterate(5)
@@ -108,8 +108,8 @@ def segment(
         sizes,
         np.stack([total(lab[..., c]) / sizes for c in range(3)], 1),
         total(np.log(np.maximum(inverse_depth, 1e-6))) / sizes,
-        total(static * inner),
-        total(dynamic * inner),
+        np.stack([total(plane * inner) for plane in static]),
+        np.stack([total(plane * inner) for plane in dynamic]),
     )
 
 
@@ -140,12 +140,12 @@ class Graph:
         """
         self.frames = frames
         self.starts = np.cumsum([0, *(len(f.sizes) for f in frames)])
-        self._sizes, self._colors, self._depths, self._static, self._dynamic = (
+        self._sizes, self._colors, self._depths = (
             np.concatenate(parts)
-            for parts in zip(
-                *((f.sizes, f.colors, f.log_inverse_depth, f.static, f.dynamic) for f in frames), strict=True
-            )
+            for parts in zip(*((f.sizes, f.colors, f.log_inverse_depth) for f in frames), strict=True)
         )
+        self._static = np.concatenate([f.static for f in frames], 1)
+        self._dynamic = np.concatenate([f.dynamic for f in frames], 1)
         count = int(self.starts[-1])
         edges = [self._edges_within(k) for k in range(len(frames))]
         edges += [self._edges_to_next(k, *pairs) for k, pairs in enumerate(carried)]
@@ -171,21 +171,24 @@ class Graph:
         i, j = i + self.starts[k], j + self.starts[k + 1]
         return i, j, TIME_WEIGHT * shared * _similarity(self._colors, i, j)
 
-    def dynamic_probabilities(self) -> list[Float[np.ndarray, "H W"]]:
-        """[H, W] probability in [0, 1] that each frame's pixels are dynamic."""
-        x = self._solve(np.zeros_like(self._sizes), np.zeros_like(self._sizes))
+    def dynamic_probabilities(self, kind: int) -> list[Float[np.ndarray, "H W"]]:
+        """[H, W] probability in [0, 1] that each frame's pixels are dynamic, by one kind of evidence."""
+        evidence = self._static[kind], self._dynamic[kind]
+        x = self._solve(*evidence, np.zeros_like(self._sizes), np.zeros_like(self._sizes))
         cells = self._cells()
         # Agreement with far frames proves that a surface is static; its absence has other causes than motion, too. So
         # colour may outvote evidence of motion, but not evidence that a superpixel is static.
-        unproven = HALVING_EVIDENCE * self._sizes / (self._static + HALVING_EVIDENCE * self._sizes)
+        unproven = HALVING_EVIDENCE * self._sizes / (evidence[0] + HALVING_EVIDENCE * self._sizes)
         for _ in range(NUM_COLOR_ROUNDS):
             odds = COLOR_TRUST * self._sizes * self._log_odds(cells, x)
-            x = self._solve(np.maximum(-odds, 0.0), np.maximum(odds, 0.0) * unproven)
+            x = self._solve(*evidence, np.maximum(-odds, 0.0), np.maximum(odds, 0.0) * unproven)
         return [x[start + frame.labels] for start, frame in zip(self.starts, self.frames, strict=False)]
 
-    def _solve(self, more_static: np.ndarray, more_dynamic: np.ndarray) -> np.ndarray:
-        static = TRUST * self._static + PRIOR * self._sizes + more_static
-        dynamic = TRUST * self._dynamic + more_dynamic
+    def _solve(
+        self, static: np.ndarray, dynamic: np.ndarray, more_static: np.ndarray, more_dynamic: np.ndarray
+    ) -> np.ndarray:
+        static = TRUST * static + PRIOR * self._sizes + more_static
+        dynamic = TRUST * dynamic + more_dynamic
         diagonal = static + dynamic + self._degrees + 1e-9  # a superpixel without evidence and edges is static
         matrix = (sparse.diags(diagonal) - self._weights).tocsr()
         x, _ = cg(matrix, dynamic, rtol=1e-3, maxiter=300, M=sparse.diags(1.0 / diagonal))
