@@ -29,6 +29,8 @@ PAPER = {
     },
     "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {
         "model.deformation": "mlp",
+        "model.paths": 1,  # of the deformation model "splines" alone, like the next
+        "model.path_points": 4,
         "loss.dynamic": 1.0,
         "loss.dynamic_background": "black",
         "loss.mask_margin": 0.0,

@@ -9,9 +9,11 @@ from torch import Tensor, nn
 from warpgs.config import ModelConfig
 
 from .mlp_deformation import MlpDeformation
+from .spline_deformation import SplineDeformation
 
 FIELDS: dict[str, type[nn.Module]] = {
     "mlp": MlpDeformation,
+    "splines": SplineDeformation,
 }
 """Deformation models by name.
 

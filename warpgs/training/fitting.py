@@ -6,10 +6,27 @@ from collections.abc import Callable
 
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.data.capture import Capture
+from warpgs.runs.captures import known_background
+
+from .tracked_start import for_tracks
+from .tracks import find_tracks
 
 
 def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) -> TrainConfig:
-    """The config with those values replaced that depend on the capture."""
+    """The config with those values replaced that depend on the capture.
+
+    Raises:
+        ValueError: If it names a deformation model that the capture does not suit.
+    """
+    background = capture.background if config.background == "capture" else config.background
+    config = dataclasses.replace(config, background=background)
+    seen = capture.assuming(config.assume).over(known_background(config, capture))
+    if config.model.dynamic_start == "points" and config.model.deformation in ("mlp", "splines"):
+        if tracks := find_tracks(seen):
+            log(f"{len(tracks)} things move far from frame to frame: dynamic Gaussians start on their tracks")
+            config = for_tracks(config, tracks)
+        elif config.model.deformation == "splines":
+            raise ValueError('model.deformation "splines": no small things are tracked in this capture; use "mlp"')
     bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
@@ -19,8 +36,7 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
         if uses_estimates:
             log("the masks are estimates: stage II compares the joint image alone")
         loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
-    background = capture.background if config.background == "capture" else config.background
-    return dataclasses.replace(config, loss=loss, background=background)
+    return dataclasses.replace(config, loss=loss)
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:

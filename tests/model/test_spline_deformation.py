@@ -1,0 +1,52 @@
+"""Deformation along splines."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from tests.scenes import error, generator
+from warpgs.config import ModelConfig
+from warpgs.model.spline_deformation import SplineDeformation
+
+NUM_PATHS, NUM_POINTS = 3, 9
+
+
+@pytest.fixture
+def model():
+    config = ModelConfig(position_bands=2, time_bands=2, depth=2, width=8, paths=NUM_PATHS, path_points=NUM_POINTS)
+    found = SplineDeformation(config, torch.zeros(3), torch.ones(3))
+    found.paths.data.copy_(torch.randn(found.paths.shape, generator=generator()))
+    found.homes.copy_(torch.eye(3))
+    return found
+
+
+@pytest.mark.parametrize("time", [0.0, 0.1, 0.5, 0.83, 1.0])
+def test_paths_are_uniform_cubic_splines(model, time):
+    pieces = NUM_POINTS - 3
+    knots = np.arange(-3, pieces + 4) / pieces
+    expected = BSpline(knots, model.paths.detach().double().numpy().swapaxes(0, 1), 3)(time)
+    assert error(model.positions(torch.tensor([time])), torch.from_numpy(expected).float()) < 1e-5
+
+
+def test_a_path_goes_on_beyond_the_first_and_the_last_time(model):
+    """Time has noise in training."""
+    inside, outside = (model.positions(torch.tensor([t])) for t in (1.0, 1.001))
+    assert 0 < error(outside, inside) < 0.1
+
+
+def test_each_gaussian_moves_with_the_nearest_home(model):
+    means = torch.eye(3)[[2, 0, 1, 0]] + 0.1 * torch.randn(4, 3, generator=generator())
+    time = torch.tensor([0.4])
+    moved = (model.positions(time) - model.homes)[[2, 0, 1, 0]]
+    offsets = model(means, time)
+    assert error(offsets[:, :3], moved) < 1e-6  # a network adds nothing before training
+    assert not offsets[:, 3:].any()
+    assert model(means[:0], time).shape == (0, 10)
+
+
+def test_only_control_points_around_a_time_have_gradients(model):
+    model(torch.eye(3), torch.tensor([0.0])).square().sum().backward()
+    gradients = model.paths.grad.abs().sum((0, 2))
+    assert (gradients[:3] > 0).all()
+    assert not gradients[4:].any()

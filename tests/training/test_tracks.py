@@ -1,0 +1,121 @@
+"""Tracks of small things that move far between frames, and trainings that start on them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from tests import tiny
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
+from warpgs.data.balls import RADIUS, BallsSize, _balls, balls_capture
+from warpgs.data.loaders import load_capture
+from warpgs.presets import PRESETS
+from warpgs.rendering import render
+from warpgs.training.fitting import fitted
+from warpgs.training.tracked_start import MAX_RATE
+from warpgs.training.tracks import find_tracks
+
+SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
+UNITS = 1.3
+"""World units of D-NeRF per scene unit."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return balls_capture(tmp_path_factory.mktemp("cache"), SIZE, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def capture(data):
+    return load_capture(data)
+
+
+@pytest.fixture(scope="module")
+def tracks(capture):
+    return find_tracks(capture)
+
+
+def ball_centers(times: np.ndarray) -> np.ndarray:
+    """[T, 5, 3] scene units."""
+    return np.array([[body.center for body in _balls(time, SIZE)] for time in times]) / UNITS
+
+
+@pytest.mark.parametrize("halfway", [False, True])
+def test_every_ball_has_a_track(tracks, halfway):
+    times = (np.arange(1, 48) + 0.5 * halfway) / 49
+    centers = ball_centers(times)
+    errors = np.array([np.linalg.norm(t.path(times)[:, None] - centers, axis=2) for t in tracks])
+    medians = np.median(errors, axis=1)
+    assert sorted(medians.argmin(1)) == [0, 1, 2, 3, 4]
+    assert medians.min(1).max() < 0.2 * RADIUS / UNITS
+    assert [t.radius for t in tracks] == pytest.approx([RADIUS / UNITS] * 5, rel=0.25)  # with the rim that is mixed
+
+
+def test_what_moves_little_from_frame_to_frame_is_not_tracked(tmp_path):
+    slow = balls_capture(tmp_path, BallsSize(side=48, num_frames=80, num_val=2, turns=0.5), quiet=True)
+    assert find_tracks(load_capture(slow)) == []
+
+
+def test_nothing_is_tracked_without_transparent_surroundings_or_with_masks(capture, tmp_path):
+    assert find_tracks(capture.over("black")) == []
+    assert find_tracks(capture.assuming("static")) == []
+    assert find_tracks(load_capture(tiny.write(tmp_path))) == []
+
+
+def test_too_few_frames_are_not_tracked(tmp_path):
+    short = balls_capture(tmp_path, BallsSize(side=64, num_frames=6, num_val=2, turns=0.5), quiet=True)
+    assert find_tracks(load_capture(short)) == []
+
+
+@pytest.mark.parametrize("preset", ["best", "quick"])
+def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
+    lines: list[str] = []
+    found = fitted(PRESETS[preset], capture, lines.append)
+    assert (found.model.deformation, found.model.paths) == ("splines", 5)
+    assert found.model.path_points == len(tracks[0].path.c)
+    assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
+    assert found.optim.networks == min(MAX_RATE, PRESETS[preset].optim.networks)
+    assert "5 things move far from frame to frame: dynamic Gaussians start on their tracks" in lines
+
+
+def test_the_paper_starts_without_tracks(capture):
+    assert fitted(PRESETS["paper"], capture, print).model.deformation == "mlp"
+
+
+def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
+    config = TrainConfig(model=dataclasses.replace(TrainConfig().model, deformation="splines"))
+    with pytest.raises(ValueError, match="no small things are tracked"):
+        fitted(config, load_capture(tiny.write(tmp_path)), print)
+
+
+@pytest.fixture
+def trainer(data, capture, tmp_path):
+    model = dataclasses.replace(tiny.MODEL, dynamic_points=500)
+    schedule = Schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
+    optim = OptimConfig(opacities=0.3)
+    config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule, optim=optim)
+    return tiny.trainer(data, tmp_path / "run", fitted(config, capture, print))
+
+
+def test_dynamic_gaussians_start_on_the_balls_at_all_times(trainer):
+    trainer._add_dynamic_gaussians()
+    means = trainer.scene.dynamic.means.detach()
+    distances = []
+    for time in np.arange(1, 48) / 49:
+        moved = means + trainer.scene.deformation(means, torch.tensor([time]).float())[:, :3].detach()
+        centers = torch.from_numpy(ball_centers(np.array([time]))[0]).float()
+        distances.append(torch.cdist(moved, centers).amin(1))
+    assert torch.cat(distances).quantile(0.8) < 1.5 * RADIUS / UNITS
+
+
+def test_the_balls_are_still_there_after_training(trainer, capture, quickly):  # noqa: F811
+    assert tiny.train(trainer)
+    alphas = []
+    for name in capture.val:
+        frame = capture.frame(name)
+        splats = trainer.scene.splats(torch.tensor([frame.camera.time]))
+        image = render(splats, frame.camera, settings=RenderSettings(branches=True)).dynamic
+        alphas.append(image.alpha[~frame.static_mask].mean().item())
+    assert np.median(alphas) > 0.5

@@ -1,0 +1,46 @@
+"""Deformation along paths: each thing moves along a spline of its own, and a network adds what is left."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from warpgs.config import ModelConfig
+
+from .mlp_deformation import MlpDeformation
+
+
+class SplineDeformation(nn.Module):
+    """The movement of the nearest home, a uniform cubic B-spline over time, plus the offsets of ``MlpDeformation``.
+
+    For small things that move far between frames, which a network alone finds neither nor follows exactly.
+
+    Args:
+        config: ``paths`` and ``path_points`` are the sizes of the splines; the others are those of the network.
+        center, half_size: [3] box of the scene.
+
+    Attributes:
+        homes: [K, 3] canonical positions of the things [scene units].
+        paths: [K, C, 3] control points of their positions over time, from 0 to 1 [scene units].
+    """
+
+    homes: Tensor
+
+    def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
+        super().__init__()
+        self.network = MlpDeformation(config, center, half_size)
+        self.register_buffer("homes", center.new_zeros(config.paths, 3))
+        self.paths = nn.Parameter(center.new_zeros(config.paths, config.path_points, 3))
+
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
+        """Offsets; see ``fields.FIELDS``. No gradient flows to ``means``."""
+        moved = (self.positions(time) - self.homes)[torch.cdist(means.detach(), self.homes).argmin(1)]
+        return self.network(means, time) + nn.functional.pad(moved, (0, 7))
+
+    def positions(self, time: Float[Tensor, "1"]) -> Float[Tensor, "K 3"]:
+        """Positions of the things at a time; outside [0, 1], the first or last piece of the splines goes on."""
+        pieces = self.paths.shape[1] - 3
+        first = (time * pieces).floor().clamp(0, pieces - 1)
+        f = time * pieces - first
+        weights = torch.cat([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
+        points = self.paths.index_select(1, first.long() + torch.arange(4, device=time.device))
+        return (points * weights[:, None]).sum(1)

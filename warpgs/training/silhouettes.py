@@ -1,0 +1,63 @@
+"""The regions of what moves in images with transparent surroundings."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from warpgs.data.capture import Capture, Frame
+
+MIN_PIXELS = 12
+"""Minimum size of a region."""
+
+
+class Region(NamedTuple):
+    """A connected region of what moves, as one frame sees it.
+
+    Attributes:
+        time: Of the frame, in [0, 1].
+        origin: [3] camera centre.
+        center: [3] unit vector from there through the centre of the region.
+        radius: Angle of a disc of the region's area [rad].
+        lab: [3] mean colour in 8-bit Lab.
+        rays: [P, 3] unit vectors through its pixels.
+        colors: [P, 3] of its pixels in [0, 1].
+    """
+
+    time: float
+    origin: Float[np.ndarray, "3"]
+    center: Float[np.ndarray, "3"]
+    radius: float
+    lab: Float[np.ndarray, "3"]
+    rays: Float[np.ndarray, "P 3"]
+    colors: Float[np.ndarray, "P 3"]
+
+
+def find_regions(capture: Capture) -> list[list[Region]]:
+    """The regions of each training frame."""
+    return [_regions(capture.frame(name)) for name in capture.train]
+
+
+def _regions(frame: Frame) -> list[Region]:
+    if frame.static_mask is None:
+        return []
+    camera, image = frame.camera, frame.image.numpy()
+    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    rotation = viewmat[:3, :3]
+    origin, to_rays = -rotation.T @ viewmat[:3, 3], rotation.T @ np.linalg.inv(K)
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(float)
+    count, labels = cv2.connectedComponents((~frame.static_mask.numpy()).astype(np.uint8), connectivity=4)
+    regions = []
+    for label in range(1, count):
+        y, x = np.nonzero(labels == label)
+        if len(x) >= MIN_PIXELS:
+            rays = _unit(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ to_rays.T)
+            radius = float(np.sqrt(len(x) / (np.pi * K[0, 0] * K[1, 1])))
+            sight = camera.time, origin, _unit(rays.mean(0)), radius
+            regions.append(Region(*sight, lab[y, x].mean(0), rays, image[y, x] / 255.0))
+    return regions
+
+
+def _unit(vectors: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
