@@ -14,8 +14,9 @@ from warpgs.data.loaders import load_capture
 from warpgs.presets import PRESETS
 from warpgs.rendering import render
 from warpgs.training.fitting import fitted
-from warpgs.training.tracked_start import MAX_RATE
-from warpgs.training.tracks import find_tracks
+from warpgs.training.silhouettes import Region
+from warpgs.training.tracked_start import MAX_FINAL_RATE, MAX_POSITION_RATE, MAX_RATE
+from warpgs.training.tracks import _divided, find_tracks
 
 SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
 UNITS = 1.3
@@ -42,6 +43,29 @@ def ball_centers(times: np.ndarray) -> np.ndarray:
     return np.array([[body.center for body in _balls(time, SIZE)] for time in times]) / UNITS
 
 
+def test_a_region_of_two_things_is_divided_by_their_colours():
+    random = np.random.default_rng(0)
+    rays = np.stack([np.linspace(-0.1, 0.1, 200), np.zeros(200), np.ones(200)], 1)
+    red, blue = (
+        np.array(color) + 0.05 * random.standard_normal((200, 3)) for color in ([0.9, 0.1, 0.1], [0.1, 0.1, 0.9])
+    )
+
+    def region(colors: np.ndarray, chosen: slice) -> Region:
+        lab = 255.0 * colors[chosen].mean(0)
+        whole = Region(0.5, np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.05, lab, rays, colors)
+        return whole.part(np.isin(np.arange(200), np.arange(200)[chosen]))
+
+    alone = [region(colors, slice(None)) for colors in (red, blue) for _ in range(6)]
+    both = region(np.where(np.arange(200)[:, None] < 150, red, blue), slice(None))
+    labels = np.array([0] * 6 + [1] * 6 + [0])
+    found, of_found = _divided([*alone, both], labels, 2)
+    assert of_found.tolist() == [*labels[:12], 0, 1]
+    assert all(a is b for a, b in zip(found, alone, strict=False))
+    assert found[12].center[0] == pytest.approx(-0.025, abs=2e-3)
+    assert found[13].center[0] == pytest.approx(0.075, abs=2e-3)
+    assert [part.radius for part in found[12:]] == pytest.approx([0.05 * 0.75**0.5, 0.05 * 0.25**0.5], rel=0.02)
+
+
 @pytest.mark.parametrize("halfway", [False, True])
 def test_every_ball_has_a_track(tracks, halfway):
     times = (np.arange(1, 48) + 0.5 * halfway) / 49
@@ -50,6 +74,7 @@ def test_every_ball_has_a_track(tracks, halfway):
     medians = np.median(errors, axis=1)
     assert sorted(medians.argmin(1)) == [0, 1, 2, 3, 4]
     assert medians.min(1).max() < 0.2 * RADIUS / UNITS
+    assert np.quantile(errors.min(2), 0.98) < RADIUS / UNITS  # also where one hides another
     assert [t.radius for t in tracks] == pytest.approx([RADIUS / UNITS] * 5, rel=0.25)  # with the rim that is mixed
 
 
@@ -76,7 +101,8 @@ def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
     assert (found.model.deformation, found.model.paths) == ("splines", 5)
     assert found.model.path_points == len(tracks[0].path.c)
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
-    assert found.optim.networks == min(MAX_RATE, PRESETS[preset].optim.networks)
+    assert (found.optim.networks, found.optim.means) == (MAX_RATE, MAX_POSITION_RATE)
+    assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
     assert "5 things move far from frame to frame: dynamic Gaussians start on their tracks" in lines
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from warpgs.data.capture import Capture, Frame
 
@@ -32,6 +32,16 @@ class Region(NamedTuple):
     lab: Float[np.ndarray, "3"]
     rays: Float[np.ndarray, "P 3"]
     colors: Float[np.ndarray, "P 3"]
+
+    def part(self, chosen: Bool[np.ndarray, " P"]) -> "Region":
+        """The region of some of the pixels."""
+        rays = self.rays[chosen]
+        return self._replace(
+            center=_unit(rays.mean(0)),
+            radius=self.radius * float(np.sqrt(chosen.mean())),
+            rays=rays,
+            colors=self.colors[chosen],
+        )
 
 
 def find_regions(capture: Capture) -> list[list[Region]]:

@@ -15,18 +15,23 @@ from .dynamic_points import max_scale
 from .point_cloud import gaussians_at, subsample
 from .tracks import Track
 
-MAX_RATE = 4e-4
-"""Maximum learning rate of paths and networks. On builtin:balls, with ``quick``, 1e-3 costs 0.8 dB in the moving region
-and 3e-3, the rate of the preset, 2.9 dB."""
+MAX_RATE, MAX_FINAL_RATE, MAX_POSITION_RATE = 3e-4, 1e-5, 8e-4
+"""Maximum initial and final learning rates of paths and networks, and initial one of Gaussians' positions; what higher
+ones cost is in docs/design/tracks.md."""
 
 
 def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
     """The config of a training that starts from tracks: it follows them from its first iteration, at exact times."""
-    model, rate = config.model, min(MAX_RATE, config.optim.networks)
+    model, optim = config.model, config.optim
     return dataclasses.replace(
         config,
         model=dataclasses.replace(model, deformation="splines", paths=len(tracks), path_points=len(tracks[0].path.c)),
-        optim=dataclasses.replace(config.optim, networks=rate, networks_end=min(rate, config.optim.networks_end)),
+        optim=dataclasses.replace(
+            optim,
+            networks=min(MAX_RATE, optim.networks),
+            networks_end=min(MAX_FINAL_RATE, optim.networks_end),
+            means=min(MAX_POSITION_RATE, optim.means),
+        ),
         schedule=dataclasses.replace(config.schedule, deform_from=0, noise_until=0),
     )
 

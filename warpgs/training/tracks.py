@@ -16,10 +16,13 @@ from scipy.linalg import solveh_banded
 
 from warpgs.data.capture import Capture
 
-from .silhouettes import Region, find_regions
+from .silhouettes import MIN_PIXELS, Region, find_regions
 
 MIN_REGIONS = 12
 """Minimum number of regions that a track is found from."""
+
+MIN_PART = 0.15
+"""Fraction of a region's pixels from which on their colours make a part of it."""
 
 SHOWING_ALL = 0.75
 """Quantile of the frames' numbers of regions that is the number of things: in many frames, one hides another."""
@@ -74,6 +77,7 @@ def find_tracks(capture: Capture) -> list[Track]:
     if count == 0 or len(regions) < MIN_REGIONS * count:
         return []
     labels = _by_color(np.array([region.lab for region in regions]), count)
+    regions, labels = _divided(regions, labels, count)
     tracks = []
     for label in range(count):
         track = _track([regions[k] for k in np.flatnonzero(labels == label)], len(by_frame))
@@ -89,6 +93,35 @@ def _by_color(colors: Float[np.ndarray, "R 3"], count: int) -> np.ndarray:
     cv2.setRNGSeed(0)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.1)
     return cv2.kmeans(colors.astype(np.float32), count, None, stop, 10, cv2.KMEANS_PP_CENTERS)[1].ravel()
+
+
+def _divided(regions: list[Region], labels: np.ndarray, count: int) -> tuple[list[Region], np.ndarray]:
+    """The regions and their labels, with those of several things divided by the colours of their pixels.
+
+    Pixels go to the most likely of normal distributions, one per label, of the regions whose colours are most typical.
+    """
+    lab = np.array([region.lab for region in regions])
+    models = []
+    for label in range(count):
+        chosen = np.flatnonzero(labels == label)
+        distance = np.linalg.norm(lab[chosen] - np.median(lab[chosen], 0), axis=1)
+        colors = np.concatenate([regions[k].colors for k in chosen[distance <= np.median(distance)]])
+        models.append((colors.mean(0), np.linalg.inv(np.cov(colors.T) + 1e-4 * np.eye(3))))
+    parts: list[Region] = []
+    found: list[int] = []
+    for region in regions:
+        costs = [
+            np.einsum("pi,ij,pj->p", region.colors - mean, precision, region.colors - mean)
+            - np.log(np.linalg.det(precision))
+            for mean, precision in models
+        ]
+        likeliest = np.argmin(costs, axis=0)
+        counts = np.bincount(likeliest, minlength=count)
+        shown = np.flatnonzero(counts >= max(MIN_PIXELS, MIN_PART * counts.sum()))
+        for label in shown:
+            parts.append(region.part(likeliest == label) if len(shown) > 1 else region)
+            found.append(int(label))
+    return parts, np.array(found)
 
 
 def _track(regions: list[Region], num_frames: int) -> Track | None:
