@@ -84,7 +84,7 @@ def find_tracks(capture: Capture) -> list[Track]:
         if track is None:
             return []
         tracks.append(track)
-    times = np.sort([capture.cameras[name].time for name in capture.train])
+    times = np.unique([capture.cameras[name].time for name in capture.train])
     steps = [np.linalg.norm(np.diff(t.path(times), axis=0), axis=1) / (2.0 * t.radius) for t in tracks]
     return tracks if np.median(steps) >= MIN_STEP else []
 
@@ -118,9 +118,8 @@ def _divided(regions: list[Region], labels: np.ndarray, count: int) -> tuple[lis
         likeliest = np.argmin(costs, axis=0)
         counts = np.bincount(likeliest, minlength=count)
         shown = np.flatnonzero(counts >= max(MIN_PIXELS, MIN_PART * counts.sum()))
-        for label in shown:
-            parts.append(region.part(likeliest == label) if len(shown) > 1 else region)
-            found.append(int(label))
+        found += shown.tolist()
+        parts += [region.part(likeliest == label) for label in shown] if len(shown) > 1 else [region] * len(shown)
     return parts, np.array(found)
 
 
@@ -142,7 +141,7 @@ class _Fit:
 
     def __init__(self, regions: list[Region], num_frames: int) -> None:
         self.knots = np.arange(-DEGREE, num_frames + DEGREE) / (num_frames - 1)
-        self.times = np.array([region.time for region in regions])
+        self.times = np.array([region.time for region in regions]).clip(0.0, 1.0)
         self.origins, self.rays = (np.array([getattr(r, name) for r in regions]) for name in ("origin", "center"))
         self.angles = np.array([region.radius for region in regions])
         self.everything = np.ones(len(regions), bool)
