@@ -44,6 +44,7 @@ PAPER = {
         "loss.depth_gate": False,
         "loss.depth_tolerance": 0.0,
         "loss.depth_smooth": False,
+        "loss.object_depth": False,
     },
     "Training Protocol: Eq. 15": {
         "stage2": True,

@@ -151,6 +151,9 @@ class LossConfig:
     by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
+    object_depth: bool = False
+    """Whether moving objects whose depth is unknown get one by their size, which they keep, and by the static points
+    that they hide (docs/design/object-depth.md)."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

@@ -38,6 +38,7 @@ BEST = TrainConfig(
         depth_dynamic=4.0,
         depth_tolerance=0.03,
         depth_smooth=True,
+        object_depth=True,
         mask_margin=0.008,
         branches_in_stage2="given-masks",
     ),

@@ -56,10 +56,10 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     size = round(width * factor), round(height * factor)
     if min(size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
-    a, b = (_grey(frame, size) for frame in (first, second))
+    a, b = (grey_at(frame, size) for frame in (first, second))
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = method.calc(a, b, None)
-    agrees = _leads_back(flow, method.calc(b, a, None))
+    agrees = leads_back(flow, method.calc(b, a, None))
     distance = _epipolar_distance(first, second, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
     textured = gradient > max(np.quantile(gradient, 0.6), 8.0)
@@ -83,7 +83,7 @@ def are_comparable(first: Camera, second: Camera) -> bool:
     return float(relative.trace()) >= 1.0 + 2.0 * math.cos(math.radians(MAX_ANGLE))
 
 
-def _leads_back(forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray, "H W 2"]) -> Bool[np.ndarray, "H W"]:
+def leads_back(forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray, "H W 2"]) -> Bool[np.ndarray, "H W"]:
     """Whether the backward flow at the end of the forward flow is its opposite, up to a pixel and 5 % of its length."""
     height, width = forward.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -93,7 +93,8 @@ def _leads_back(forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray,
     return np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
 
 
-def _grey(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+def grey_at(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """A frame in grey levels with even contrast, as optical flow wants it, resized to (width, height)."""
     plane = cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY)
     return cv2.createCLAHE(2.0, (8, 8)).apply(cv2.resize(plane, size, interpolation=cv2.INTER_AREA))
 

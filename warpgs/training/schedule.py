@@ -127,14 +127,15 @@ class Protocol:
 
     Args:
         config: Config whose schedule is rescaled already (``config.scaled``).
-        has_depth: Whether any view has aligned depth; without it there is no pretraining.
+        has_depth: Whether any view has depth to compare.
+        pretrains: Whether that includes depth of the static region, which pretraining needs.
     """
 
-    def __init__(self, config: TrainConfig, has_depth: bool) -> None:
+    def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True) -> None:
         self.config = config
         self.has_depth = has_depth
         schedule = config.schedule
-        pretrain = schedule.pretrain if config.dap and has_depth else 0
+        pretrain = schedule.pretrain if config.dap and has_depth and pretrains else 0
         # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.
         stage2 = schedule.stage2 if config.stage2 else 0
         stage1 = schedule.num_iterations - pretrain - stage2

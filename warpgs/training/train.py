@@ -151,8 +151,10 @@ def _describe(trainer: Trainer, log: Log) -> None:
     if refused:
         log(f"depth of {refused} of {num_views} views is hardly better than a constant and is not used")
     if num_aligned < num_views - refused:
-        reason = "" if num_aligned else NO_DEPTH
+        reason = "" if num_aligned or trainer.num_with_objects else NO_DEPTH
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+    if trainer.num_with_objects:
+        log(f"depth of moving objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:

@@ -24,6 +24,7 @@ from .densify import DensifyLimits, densify, reset_opacities
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
+from .object_depth import fill_object_depth
 from .prune import blend_weights, prune_invisible, prune_weakest
 from .reseed import gaussians_that_show, lost_fraction, lost_pixels
 from .sampling import Sampler, random_numbers
@@ -63,6 +64,7 @@ class Trainer:
         iteration: Iterations done.
         gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
+        num_with_objects: Number of views in which the size of moving objects gives their depth.
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
         depth_trust: [T] factor of each view's depth errors, in [0, 1]; 0 = the depth is not used.
         seconds: Training time of earlier sessions of this run [s].
@@ -93,7 +95,9 @@ class Trainer:
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
         self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
-        self.protocol = Protocol(config, has_depth=self.num_aligned > 0)
+        self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments)
+        has_depth = self.num_aligned + self.num_with_objects > 0
+        self.protocol = Protocol(config, has_depth, pretrains=self.num_aligned > 0)
         self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
         self._start_from(initialize.initial_scene(config, self.capture, self._generator("points")))
 

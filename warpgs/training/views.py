@@ -1,5 +1,6 @@
 """Training views on the device."""
 
+from collections import defaultdict
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -101,7 +102,7 @@ class Views:
         self.poses = poses
         self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
         self._capture, self.background = capture, capture.background
-        self._depth_factors: dict[str, tuple[Tensor, Tensor]] = {}
+        self._depth_changes: dict[str, list[Callable[[Tensor, Tensor], Tensor]]] = defaultdict(list)
         first = self._store(capture.frame(capture.train[0]))
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -128,11 +129,33 @@ class Views:
 
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
         """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
-        name = self._capture.train[index]
-        self._depth_factors[name] = (alignment.cpu(), factor.half().cpu())
+        (scale, offset), factor = alignment.cpu(), factor.half().cpu()
+        self._change_depth(index, lambda depth, static_mask: ((scale * depth + offset) * factor - offset) / scale)
+
+    def set_object_depth(self, index: int, alignment: Float[Tensor, "2"], depths: Float[Tensor, "h w"]) -> None:
+        """Sets the aligned depth of a view's dynamic pixels whose depth is unknown.
+
+        Args:
+            index: Of the view.
+            alignment: [2] of its inverse depth; it stays the same.
+            depths: [h, w] depth [scene units] of any size, NaN where unknown.
+        """
+        scale, offset = alignment.cpu()
+        inverse = ((1.0 / depths - offset) / scale).numpy()
+
+        def change(depth: Tensor, static_mask: Tensor) -> Tensor:
+            found = cv2.resize(inverse, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+            return torch.where(depth.isnan() & ~static_mask, torch.from_numpy(found), depth)
+
+        self._change_depth(index, change)
+
+    def _change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Replaces the inverse depth of a view by a function of it and of the mask, now or whenever it is read."""
         if self.resident:
-            self._all.inverse_depth[index] = self._store(self._capture.frame(name)).inverse_depth
-            del self._depth_factors[name]
+            depth, static_mask = (values[index].cpu() for values in (self._all.inverse_depth, self._all.static_mask))
+            self._all.inverse_depth[index] = change(depth.float(), static_mask).half()
+        else:
+            self._depth_changes[self._capture.train[index]].append(change)
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
@@ -164,12 +187,12 @@ class Views:
                 "give the capture masks, or train with --assume static or --assume dynamic"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
-        if frame.name in self._depth_factors:
-            (scale, offset), factor = self._depth_factors[frame.name]
-            depth = ((scale * depth + offset) * factor - offset) / scale
+        depth = depth.half()
+        for change in self._depth_changes.get(frame.name, ()):
+            depth = change(depth.float(), frame.static_mask).half()
         time = torch.tensor([camera.time], dtype=torch.float32)
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
-        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth.half())
+        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth)
         return _Stored(*tensors, border, self._gains.get(frame.name))

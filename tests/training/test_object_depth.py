@@ -1,0 +1,290 @@
+"""Moving objects are followed from frame to frame, and their size gives their depth."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from tests import tiny
+from warpgs.cameras import Camera
+from warpgs.config import LossConfig
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.loaders import load_capture
+from warpgs.training.object_depth import fill_object_depth, object_depth
+from warpgs.training.objects import MIN_VISIBLE, find_objects
+from warpgs.training.train import _describe
+from warpgs.training.trainer import Trainer
+from warpgs.training.views import Views
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
+NUM = 30
+WALL = 2.0
+"""Depth of a wall of static points behind everything."""
+
+CONFIG = dataclasses.replace(tiny.CONFIG, loss=LossConfig(object_depth=True))
+
+
+def ellipse(column: float, row: float, axes: tuple[float, float], angle: float = 0.0) -> np.ndarray:
+    """[H, W] true inside an ellipse with these semi-axes [px]."""
+    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    shift = 3
+    center, half = (tuple(round(v * 2**shift) for v in values) for values in ((column, row), axes))
+    cv2.ellipse(image, center, half, angle, 0, 360, 1, -1, cv2.LINE_8, shift)
+    return image > 0
+
+
+def ball(depth: float, x: float = 0.0, radius: float = 0.2) -> np.ndarray:
+    """[H, W] true where a ball at a depth is seen, before the middle of the image."""
+    size = FOCAL * radius / depth
+    return ellipse(WIDTH / 2 + FOCAL * x / depth, HEIGHT / 2, (size, size))
+
+
+def wall(depth: float = WALL) -> torch.Tensor:
+    """[P, 3] points on a plane across the whole image."""
+    x, y = torch.meshgrid(torch.linspace(-0.53, 0.53, 80), torch.linspace(-0.4, 0.4, 60), indexing="xy")
+    return torch.stack([x, y, torch.ones_like(x)], -1).view(-1, 3) * depth
+
+
+def capture_of(masks, points=None, images=None, **frames) -> Capture:
+    """A capture of a camera that moves sideways, with dynamic masks [T, H, W]."""
+    K = torch.tensor([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    cameras = {}
+    for k in range(len(masks)):
+        viewmat = torch.eye(4)
+        viewmat[0, 3] = 1e-3 * k
+        cameras[f"{k:03d}"] = Camera(viewmat, K, WIDTH, HEIGHT, k / max(1, len(masks) - 1))
+
+    def read(name: str) -> Frame:
+        k = int(name)
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8) if images is None else images[k]
+        static = torch.from_numpy(~masks[k])
+        return Frame(name, cameras[name], torch.from_numpy(image), static, **{n: f(static) for n, f in frames.items()})
+
+    points = wall() if points is None else points
+    return Capture("objects", cameras, list(cameras), [], points, None, read)
+
+
+def depths_at(capture: Capture, masks) -> np.ndarray:
+    """[T] depth of what the masks show; NaN where there is none."""
+    found = object_depth(capture)
+    means = []
+    for k, mask in enumerate(masks):
+        values = found[k].numpy()[mask] if k in found else np.array([np.nan])
+        assert np.ptp(values) == 0 or np.isnan(values).all()
+        means.append(values[0])
+    return np.array(means)
+
+
+def test_an_object_that_keeps_its_size_is_as_far_away_as_it_looks_small():
+    true = np.linspace(1.0, 1.5, NUM)
+    masks = [ball(depth) for depth in true]
+    found = depths_at(capture_of(masks), masks)
+    assert found / found[0] == pytest.approx(true / true[0], rel=0.03)
+
+
+def test_an_object_is_as_far_away_as_the_static_points_around_it_allow():
+    """It comes back to the wall, and never goes through it."""
+    true = WALL - 0.8 * np.sin(np.linspace(0.0, math.pi, NUM))
+    masks = [ball(depth, radius=0.3) for depth in true]
+    assert depths_at(capture_of(masks), masks) == pytest.approx(true, rel=0.04)
+
+
+def test_points_on_the_object_itself_do_not_bound_its_depth():
+    masks = [ball(1.0) for _ in range(NUM)]
+    on_it = torch.tensor([[0.0, 0.0, 0.5]]).repeat(50, 1)
+    found = depths_at(capture_of(masks, torch.cat([wall(), on_it])), masks)
+    assert found == pytest.approx(np.full(NUM, WALL), rel=0.01)
+
+
+def test_the_diameter_measures_a_ring_that_tumbles():
+    angles = np.linspace(0.0, 3.0 * math.pi, NUM)
+    masks = [ellipse(80, 60, (30.0, 6.0 + 24.0 * abs(math.cos(a))), 10.0) for a in angles]
+    found = depths_at(capture_of(masks), masks)
+    assert np.ptp(found) < 0.05 * found.mean()
+
+
+def test_the_area_measures_a_body_that_deforms():
+    stretch = 1.3 ** np.sin(np.linspace(0.0, 3.0 * math.pi, NUM))
+    masks = [ellipse(80, 60, (20.0 * s, 20.0 / s)) for s in stretch]
+    found = depths_at(capture_of(masks), masks)
+    assert np.ptp(found) < 0.05 * found.mean()
+
+
+@pytest.mark.parametrize(
+    ("masks", "points"),
+    [
+        ([ball(1.0)] * 11, None),
+        ([ball(1.0)] * NUM, torch.zeros(0, 3)),
+        ([ellipse(80, 0, (20.0, 20.0))] * NUM, None),
+        ([ellipse(80, 60, (2.0, 2.0))] * NUM, None),
+        ([np.zeros((HEIGHT, WIDTH), bool)] * NUM, None),
+        ([np.ones((HEIGHT, WIDTH), bool)] * NUM, None),
+        ([ball(1.0)], None),
+    ],
+    ids=["few frames", "no points", "cut off", "tiny", "nothing moves", "everything moves", "one frame"],
+)
+def test_there_is_no_depth_where_nothing_tells_it(masks, points):
+    assert object_depth(capture_of(masks, points)) == {}
+
+
+def test_frames_without_masks_show_no_objects():
+    capture = capture_of([ball(1.0)] * NUM)
+    read = capture.read
+    capture._cached = lambda name: dataclasses.replace(read(name), static_mask=None)
+    assert find_objects(capture, range(NUM)) == []
+
+
+# Several objects ------------------------------------------------------------------------------------------------------
+
+
+def textured(seed: int) -> np.ndarray:
+    """[H, W, 3] smooth noise, which optical flow can follow."""
+    noise = np.random.default_rng(seed).random((HEIGHT // 4, WIDTH // 4, 3)).astype(np.float32)
+    return (255 * cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC).clip(0, 1)).astype(np.uint8)
+
+
+def two_balls(offsets: np.ndarray, radius: float = 18.0):
+    """Masks and images of a ball in the middle and one that passes behind it at these columns [px]."""
+    still, ground = textured(1), textured(2)
+    masks, images = [], []
+    front = ellipse(80, 60, (radius, radius))
+    for offset in offsets:
+        behind = ellipse(80 + offset, 60, (radius, radius))
+        moved = cv2.warpAffine(textured(3), np.float32([[1, 0, offset], [0, 1, 0]]), (WIDTH, HEIGHT))
+        images.append(np.where(front[..., None], still, np.where(behind[..., None], moved, ground)))
+        masks.append(front | behind)
+    return masks, images
+
+
+def test_objects_that_touch_are_told_apart_by_optical_flow():
+    offsets = np.concatenate([np.linspace(-50, -30, 15), np.linspace(-30, -50, 15)])
+    masks, images = two_balls(offsets)
+    objects = find_objects(capture_of(masks, images=images), range(NUM))
+    assert len(objects) == 2
+    joined = [k for k in range(NUM) if k not in objects[0].whole]
+    assert joined
+    for item in objects:
+        assert sorted(item.pixels) == list(range(NUM))
+        assert not item.is_mixture
+    for k in joined:
+        front = ellipse(80, 60, (18.0, 18.0))
+        column = np.unravel_index(objects[0].pixels[k], front.shape)[1].mean()
+        item = objects[1] if abs(column - 80) > 8 else objects[0]
+        shown = np.zeros(front.shape, bool)
+        shown.flat[item.pixels[k]] = True
+        assert (shown & front).sum() > 0.9 * (shown | front).sum()
+
+
+def test_what_is_hidden_by_half_is_not_followed():
+    masks, images = two_balls(np.linspace(-50, 0, NUM))
+    objects = find_objects(capture_of(masks, images=images), range(NUM))
+    both = objects[2]
+    assert [item.is_mixture for item in objects] == [False, False, True]
+    assert max(objects[0].pixels) == max(objects[1].pixels) == min(both.pixels) - 1
+    assert all(len(item.pixels[max(item.pixels)]) >= MIN_VISIBLE * len(item.pixels[0]) for item in objects[:2])
+
+
+def test_objects_that_part_are_told_apart_backward_in_time():
+    masks, images = two_balls(np.concatenate([np.full(5, -33.0), np.linspace(-33, -60, NUM - 5)]))
+    capture = capture_of(masks, images=images)
+    assert len(find_objects(capture, range(NUM))) == 3
+    objects = find_objects(capture, range(NUM)[::-1])
+    assert len(objects) == 2
+    assert all(sorted(item.pixels) == list(range(NUM)) for item in objects)
+
+
+# In training ----------------------------------------------------------------------------------------------------------
+
+
+def views_of(capture: Capture, resident_bytes: int = 1 << 30) -> Views:
+    return Views(capture, torch.device("cpu"), resident_bytes)
+
+
+def no_alignments() -> torch.Tensor:
+    return torch.full((NUM, 2), torch.nan)
+
+
+MASKS = [ball(depth) for depth in np.linspace(1.0, 1.5, NUM)]
+
+
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_views_without_depth_get_that_of_objects(resident_bytes):
+    capture, alignments = capture_of(MASKS), no_alignments()
+    views = views_of(capture, resident_bytes)
+    assert fill_object_depth(CONFIG, capture, views, alignments) == NUM
+    assert alignments.tolist() == [[1.0, 0.0]] * NUM
+    expected = object_depth(capture)
+    for k in range(NUM):
+        assert torch.equal(views[k].inverse_depth.isfinite(), ~views[k].static_mask)
+        found = views[k].inverse_depth[~views[k].static_mask].mean().item()
+        assert found == pytest.approx(1.0 / expected[k].nanmean().item(), rel=1e-3)
+
+
+def test_static_depth_stays_and_objects_follow_its_alignment():
+    capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
+    views, alignments = views_of(capture), torch.tensor([[0.5, -1.0]]).repeat(NUM, 1)
+    assert fill_object_depth(CONFIG, capture, views, alignments) == NUM
+    assert alignments.tolist() == [[0.5, -1.0]] * NUM
+    expected = object_depth(capture)
+    for k in range(NUM):
+        view = views[k]
+        assert (view.inverse_depth[view.static_mask] == 3.0).all()
+        aligned = 0.5 * view.inverse_depth[~view.static_mask] - 1.0
+        assert 1.0 / aligned.mean().item() == pytest.approx(expected[k].nanmean().item(), rel=2e-3)
+
+
+def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
+    capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
+    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments()) == 0
+
+
+@pytest.mark.parametrize(
+    ("config", "change"),
+    [
+        (tiny.CONFIG, lambda capture: capture),
+        (dataclasses.replace(CONFIG, depth=False), lambda capture: capture),
+        (CONFIG, lambda capture: capture.assuming("dynamic")),
+        (CONFIG, lambda capture: capture.assuming("static")),
+    ],
+    ids=["off", "no depth", "all dynamic", "all static"],
+)
+def test_objects_get_no_depth_where_it_is_not_asked_for(config, change):
+    capture = change(capture_of(MASKS))
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments()) == 0
+
+
+def test_known_depth_of_what_moves_is_kept():
+    capture = capture_of(MASKS, inverse_depth=lambda static: torch.ones(static.shape))
+    views = views_of(capture)
+    assert fill_object_depth(CONFIG, capture, views, torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)) == 0
+    assert (views[0].inverse_depth == 1.0).all()
+
+
+def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
+    capture = capture_of(MASKS)
+    trainer = Trainer(CONFIG, capture, tmp_path)
+    assert (trainer.num_aligned, trainer.num_with_objects) == (0, NUM)
+    assert trainer.protocol.pretrain.end == 0
+    assert trainer.protocol.at(0).depth_weight > 0
+    trainer._add_dynamic_gaussians()
+    z = trainer.scene.dynamic.means[:, 2]
+    true = torch.cat([image[image.isfinite()] for image in object_depth(capture).values()])
+    assert true.min() - 1e-3 <= z.min()
+    assert z.max() <= true.max() + 1e-3
+
+
+def test_a_capture_with_depth_pretrains(tmp_path):
+    data = tiny.write(tmp_path / "data")
+    trainer = Trainer(CONFIG, load_capture(data), tmp_path / "run")
+    assert trainer.num_with_objects == 0
+    assert trainer.protocol.pretrain.end == tiny.SCHEDULE.pretrain
+
+
+def test_training_says_that_size_gives_depth(tmp_path):
+    lines: list[str] = []
+    _describe(Trainer(CONFIG, capture_of(MASKS), tmp_path), lines.append)
+    assert f"depth of moving objects is taken from their size in {NUM} of {NUM} views" in lines
+    assert not any("training without depth" in line for line in lines)

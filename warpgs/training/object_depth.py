@@ -1,0 +1,175 @@
+"""Depth of moving objects from their size.
+
+One camera does not determine how far away something is that moves: twice as large, twice as far away and twice as fast
+looks the same. But the distance of an object that keeps its size is inversely proportional to the size at which it is
+seen, and the factor is bounded, because the object hides the static surfaces around it. Most objects stand on something
+or come close to it at some time, so the largest factor that the bound allows is a good one.
+"""
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced_indices
+
+from .dynamic_points import MIN_KNOWN_FRACTION
+from .objects import MovingObject, find_objects, scaled_size
+from .views import Views
+
+MIN_FRAMES = 12
+"""Minimum number of frames that show an object whole."""
+
+AROUND = 0.015
+"""Width of the rim around an object where static points bound its depth, as a fraction of the image's longer side."""
+
+MIN_POINTS = 3
+"""Minimum number of points in that rim."""
+
+NEAREST, TIGHTEST = 0.02, 0.05
+"""Quantile of these points' depths that is the bound in a frame; quantile of the frames' bounds that is the bound of
+the factor. Both leave room for outliers."""
+
+NUM_CHECKED = 8
+"""Number of frames that are looked at for known depth of what moves."""
+
+
+def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> int:
+    """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
+
+    Captures with the depth of what moves keep it, and those without masks get none.
+
+    Args:
+        config: The config.
+        capture: The capture, with masks and static points.
+        views: Its training views; dynamic pixels of unknown depth are changed.
+        alignments: [T, 2] scale and offset of each view's inverse depth; set to 1 and 0 for views that had none.
+
+    Returns:
+        The number of views that have such depth now.
+    """
+    if not (config.loss.object_depth and config.depth) or capture.assumption != "masks" or _is_known(capture):
+        return 0
+    count = 0
+    for index, depth in object_depth(capture).items():
+        if capture.frame(capture.train[index]).inverse_depth is None:
+            alignments[index] = alignments.new_tensor([1.0, 0.0])
+        if bool(alignments[index].isfinite().all()):
+            views.set_object_depth(index, alignments[index], depth)
+            count += 1
+    return count
+
+
+def _is_known(capture: Capture) -> bool:
+    """Whether frames have the depth of what moves."""
+    known = total = 0
+    for index in evenly_spaced_indices(len(capture.train), NUM_CHECKED):
+        frame = capture.frame(capture.train[index])
+        if frame.static_mask is not None and frame.inverse_depth is not None:
+            known += int((frame.inverse_depth.isfinite() & ~frame.static_mask).sum())
+            total += int((~frame.static_mask).sum())
+    return known > MIN_KNOWN_FRACTION * total
+
+
+def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
+    """Depth of the objects in a capture's training frames that keep their size.
+
+    Args:
+        capture: The capture, with masks and static points.
+
+    Returns:
+        By index of the frame, [h, w] depth in its scaled mask [scene units], the same for all pixels of an object, NaN
+        elsewhere.
+    """
+    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
+    depths: dict[int, Tensor] = {}
+    for frames in (order, order[::-1]):  # by time first; backward, what parts later can be told apart before
+        for item in find_objects(capture, frames):
+            for index, depth in _depths(item, capture).items():
+                size = scaled_size(capture.cameras[capture.train[index]])
+                values = depths.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
+                pixels = torch.from_numpy(item.pixels[index]).long()
+                values[pixels] = values[pixels].nan_to_num(nan=depth)
+    return depths
+
+
+def _depths(item: MovingObject, capture: Capture) -> dict[int, float]:
+    """Depth of an object in each frame that shows it whole or beside another one; none if that cannot be told.
+
+    The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
+    it tumbles, the area of a body while it deforms.
+    """
+    if item.is_mixture or len(item.whole) < MIN_FRAMES:
+        return {}
+    views = {index: _ObjectView(pixels, capture.cameras[capture.train[index]]) for index, pixels in item.pixels.items()}
+    bounds = np.array([views[index].bound(capture, index) for index in item.whole])
+    if not np.isfinite(bounds).any():
+        return {}
+    choices = []
+    for measure in (_ObjectView.diameter, _ObjectView.area):
+        sizes = {index: measure(view) for index, view in views.items() if index in item.whole or not view.is_cut}
+        factor = float(np.nanquantile(bounds * [sizes[index] for index in item.whole], TIGHTEST))
+        found = {index: factor / size for index, size in sizes.items()}
+        path = np.stack([views[index].position(found[index]) for index in item.whole])
+        choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
+    return min(choices, key=lambda choice: choice[0])[1]
+
+
+class _ObjectView:
+    """An object as one frame sees it.
+
+    Args:
+        pixels: Flat indices of its pixels in the scaled mask.
+        camera: The camera of the frame.
+    """
+
+    def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
+        width, height = self.size = scaled_size(camera)
+        self.rows, self.columns = np.divmod(pixels, width)
+        self.camera = camera
+        border = (self.rows == 0) | (self.rows == height - 1) | (self.columns == 0) | (self.columns == width - 1)
+        self.is_cut = bool(border.any())
+
+    def _rays(self, columns: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "P 3"]:
+        """Rays of depth 1 through pixels of the scaled mask, in camera space."""
+        scale = self.camera.width / self.size[0], self.camera.height / self.size[1]
+        pixels = np.stack([(columns + 0.5) * scale[0], (rows + 0.5) * scale[1], np.ones(len(rows))], 1)
+        return pixels @ np.linalg.inv(self.camera.K.double().numpy()).T
+
+    def diameter(self) -> float:
+        """Largest distance of two of its pixels at depth 1."""
+        hull = cv2.convexHull(np.stack([self.columns, self.rows], 1))[:, 0]
+        rays = self._rays(*hull.T)
+        return float(np.linalg.norm(rays[:, None] - rays, axis=-1).max())
+
+    def area(self) -> float:
+        """Square root of its area at depth 1."""
+        K = self.camera.K
+        pixel = self.camera.width / self.size[0] * self.camera.height / self.size[1]
+        return math.sqrt(len(self.rows) * pixel / float(K[0, 0] * K[1, 1]))
+
+    def position(self, depth: float) -> Float[np.ndarray, "3"]:
+        """Where its centre is at a depth, in scene units."""
+        viewmat = self.camera.viewmat.double().numpy()
+        center = depth * self._rays(self.columns, self.rows).mean(0)
+        return viewmat[:3, :3].T @ (center - viewmat[:3, 3])
+
+    def bound(self, capture: Capture, index: int) -> float:
+        """Depth of the static points around it; NaN if there are too few."""
+        static = capture.frame(capture.train[index]).static_mask
+        assert static is not None
+        row, column, depth, inside = self.camera.project(capture.points)
+        row, column, depth = (values[inside & static[row, column]] for values in (row, column, depth))
+        width, height = self.size
+        region = np.zeros((height, width), np.uint8)
+        region[self.rows, self.columns] = 1
+        reach = 2 * max(1, round(AROUND * max(self.size))) + 1
+        around = torch.from_numpy(cv2.dilate(region, np.ones((reach, reach), np.uint8)) > 0)
+        near = depth[around[row * height // self.camera.height, column * width // self.camera.width]]
+        return float(near.quantile(NEAREST)) if len(near) >= MIN_POINTS else math.nan

@@ -1,0 +1,163 @@
+"""Moving objects as connected regions of the masks, followed from frame to frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Int
+
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.motion_check import MIN_SIDE, grey_at, leads_back
+
+MAX_SIDE = 512
+"""Regions are found in masks that are scaled down to this longer side [px]."""
+
+MIN_AREA = 0.002
+"""Minimum size of a region, as a fraction of the image."""
+
+MIN_OVERLAP = 0.3
+"""Overlap of regions of consecutive frames, relative to the smaller one, from which on they show the same object."""
+
+MIN_VISIBLE = 0.5
+"""Fraction of its last whole region from which on an object beside another one is still followed."""
+
+SMOOTHING = 7
+"""Side of the window over which borders between objects are smoothed [px]."""
+
+NOTHING = -1
+"""Label of pixels that show no object."""
+
+
+@dataclass(eq=False)
+class MovingObject:
+    """An object in consecutive frames.
+
+    Attributes:
+        pixels: By index of the training frame, flat indices of its pixels in the scaled mask.
+        whole: The frames in which it is a region by itself and not cut off by the image border.
+        is_mixture: Whether it is several objects that cannot be told apart.
+    """
+
+    pixels: dict[int, Int[np.ndarray, " P"]] = field(default_factory=dict)
+    whole: list[int] = field(default_factory=list)
+    is_mixture: bool = False
+
+
+def scaled_size(camera: Camera) -> tuple[int, int]:
+    """(width, height) of the scaled mask of a camera's frame."""
+    factor = min(1.0, MAX_SIDE / max(camera.size))
+    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+
+
+def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
+    """The objects that the masks of training frames show.
+
+    Where several become one region, optical flow tells which pixels belong to which of them, until they part, or one
+    hides another.
+
+    Args:
+        capture: The capture; frames without a mask show nothing.
+        order: Indices of training frames, by time or backward in time.
+    """
+    follower = _Follower()
+    for index in order:
+        follower.add(index, capture.frame(capture.train[index]))
+    return follower.objects
+
+
+class _Follower:
+    """Follows objects from one frame to the next.
+
+    Attributes:
+        objects: All that were found.
+    """
+
+    def __init__(self) -> None:
+        self.objects: list[MovingObject] = []
+        self._before: Frame | None = None
+        self._labels: Int[np.ndarray, "h w"] | None = None
+
+    def add(self, index: int, frame: Frame) -> None:
+        """Goes on to the training frame of an index."""
+        regions = _regions(frame)
+        labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
+        for region, candidates in zip(regions, self._candidates(regions), strict=True):
+            if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
+                self._divide(region, candidates, frame, labels)
+            else:
+                label = candidates[0] if len(candidates) == 1 else self._new(is_mixture=len(candidates) > 1)
+                labels[region] = label
+                if not _is_cut(region):
+                    self.objects[label].whole.append(index)
+        for label in np.unique(labels[labels != NOTHING]):
+            self.objects[label].pixels[index] = np.flatnonzero(labels == label).astype(np.int32)
+        self._before, self._labels = frame, labels
+
+    def _new(self, is_mixture: bool = False) -> int:
+        self.objects.append(MovingObject(is_mixture=is_mixture))
+        return len(self.objects) - 1
+
+    def _candidates(self, regions: list[Bool[np.ndarray, "h w"]]) -> list[list[int]]:
+        """For each region, the labels of the objects that it goes on with: those that overlap it and no other one."""
+        if self._labels is None or not regions or self._labels.shape != regions[0].shape:
+            return [[] for _ in regions]
+        areas = np.bincount(self._labels[self._labels != NOTHING], minlength=len(self.objects))
+        seen = [self._labels[region & (self._labels != NOTHING)] for region in regions]
+        overlaps = np.array([np.bincount(labels, minlength=len(self.objects)) for labels in seen])
+        smaller = np.minimum(areas, np.array([region.sum() for region in regions])[:, None])
+        linked = overlaps > MIN_OVERLAP * smaller
+        linked[:, linked.sum(0) > 1] = False  # it falls apart
+        return [np.flatnonzero(row).tolist() for row in linked]
+
+    def _divide(
+        self, region: Bool[np.ndarray, "h w"], candidates: list[int], frame: Frame, labels: Int[np.ndarray, "h w"]
+    ) -> None:
+        """Labels the pixels of a region of several objects by where optical flow leads to in the frame before."""
+        assert self._before is not None
+        assert self._labels is not None
+        carried = np.where(region, _carried(self._labels, self._before, frame), NOTHING)
+        distances = [cv2.distanceTransform((carried != k).astype(np.uint8), cv2.DIST_L2, 5) for k in candidates]
+        nearest = np.argmin(distances, axis=0)
+        near = [(region & (nearest == k)).astype(np.float32) for k in range(len(candidates))]
+        parts = np.argmax([cv2.blur(part, (SMOOTHING, SMOOTHING)) for part in near], axis=0)[region]
+        if any(self._is_lost(label, int((parts == k).sum())) for k, label in enumerate(candidates)):
+            labels[region] = self._new(is_mixture=True)
+        else:
+            labels[region] = np.array(candidates)[parts]
+
+    def _is_lost(self, label: int, area: int) -> bool:
+        item = self.objects[label]
+        last = item.whole[-1] if item.whole else next(iter(item.pixels))
+        return area < MIN_VISIBLE * len(item.pixels[last])
+
+
+def _regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
+    """The connected regions of a frame's scaled mask that are large enough."""
+    if frame.static_mask is None:
+        return []
+    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
+    dynamic = cv2.resize(dynamic, scaled_size(frame.camera), interpolation=cv2.INTER_NEAREST_EXACT)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(dynamic, connectivity=4)
+    return [labels == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_AREA * dynamic.size]
+
+
+def _is_cut(region: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a region touches the image border."""
+    return bool(region[[0, -1]].any() or region[:, [0, -1]].any())
+
+
+def _carried(labels: Int[np.ndarray, "h w"], before: Frame, frame: Frame) -> Int[np.ndarray, "h w"]:
+    """The labels of the frame before, carried over by optical flow (DIS); ``NOTHING`` where it does not lead back."""
+    height, width = labels.shape
+    if min(height, width) < MIN_SIDE:
+        return np.full_like(labels, NOTHING)
+    now, then = (grey_at(f, (width, height)) for f in (frame, before))
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = method.calc(now, then, None)
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    column, row = np.rint(x + flow[..., 0]).astype(int), np.rint(y + flow[..., 1]).astype(int)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    found = labels[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.where(inside & leads_back(flow, method.calc(then, now, None)), found, NOTHING)
