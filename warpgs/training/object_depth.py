@@ -84,8 +84,7 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
         capture: The capture, with masks and static points.
 
     Returns:
-        By index of the frame, [h, w] depth in its scaled mask [scene units], the same for all pixels of an object, NaN
-        elsewhere.
+        By index of the frame, [h, w] depth in its scaled mask [scene units], that of round objects, NaN elsewhere.
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     depths: dict[int, Tensor] = {}
@@ -95,12 +94,12 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
                 size = scaled_size(capture.cameras[capture.train[index]])
                 values = depths.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
                 pixels = torch.from_numpy(item.pixels[index]).long()
-                values[pixels] = values[pixels].nan_to_num(nan=depth)
+                values[pixels] = torch.where(values[pixels].isnan(), depth, values[pixels])
     return depths
 
 
-def _depths(item: MovingObject, capture: Capture) -> dict[int, float]:
-    """Depth of an object in each frame that shows it whole or beside another one; none if that cannot be told.
+def _depths(item: MovingObject, capture: Capture) -> dict[int, Float[Tensor, " P"]]:
+    """Depth of an object's pixels in each frame that shows it whole or beside another one; none if it cannot be told.
 
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
@@ -118,7 +117,9 @@ def _depths(item: MovingObject, capture: Capture) -> dict[int, float]:
         found = {index: factor / size for index, size in sizes.items()}
         path = np.stack([views[index].position(found[index]) for index in item.whole])
         choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
-    return min(choices, key=lambda choice: choice[0])[1]
+    return {
+        index: views[index].surface(depth) for index, depth in min(choices, key=lambda choice: choice[0])[1].items()
+    }
 
 
 class _ObjectView:
@@ -159,6 +160,13 @@ class _ObjectView:
         viewmat = self.camera.viewmat.double().numpy()
         center = depth * self._rays(self.columns, self.rows).mean(0)
         return viewmat[:3, :3].T @ (center - viewmat[:3, 3])
+
+    def surface(self, depth: float) -> Float[Tensor, " P"]:
+        """Depth of its pixels if it is round, with that mean."""
+        points = depth * self._rays(self.columns, self.rows)[:, :2]
+        squared = ((points - points.mean(0)) ** 2).sum(1)
+        nearer = np.sqrt(np.maximum(np.quantile(squared, 0.95) - squared, 0.0))
+        return torch.from_numpy(depth + nearer.mean() - nearer).float()
 
     def bound(self, capture: Capture, index: int) -> float:
         """Depth of the static points around it; NaN if there are too few."""
