@@ -305,11 +305,14 @@ def test_dark_images_are_brightened_to_middle_grey_and_black_ones_stay_black(vid
 
 
 @pytest.mark.parametrize("min_gap", MIN_GAPS)
-def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, frames):
+@pytest.mark.parametrize("num_frames", [24, 48])
+def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, num_frames):
+    images, _ = boards.record(num_frames)
+    frames = PosedFrames(images, boards.lens(), boards.poses(num_frames), boards.points())
     revisits = Revisits(frames, Flows(frames.images))
-    gaps = [abs(k - 12) for k in revisits.far_frames(12, 0.2, min_gap)]
+    gaps = [abs(k - num_frames // 2) for k in revisits.far_frames(num_frames // 2, 0.2, min_gap)]
     assert gaps
-    assert min(gaps) == min(min_gap, 24 // 5)  # of a short video at most a fifth
+    assert min(gaps) == min(min_gap, num_frames // 5)  # of a short video at most a fifth
 
 
 def test_evidence_is_found_beside_both_sets_of_far_frames():

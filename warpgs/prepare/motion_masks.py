@@ -169,13 +169,13 @@ def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarra
         outlines = map_frames(lambda k: outline(images[k], probabilities[k]), indices, "outlines", quiet)
         return [clean(mask) for mask in vote(outlines, carried)]
 
-    slow, fast = (graph.dynamic_probabilities(k) for k in range(len(MIN_GAPS)))
-    certain = [smooth(p) > LIKELY for p in fast]
-    masks = outlined(slow)
+    farther, nearer = (graph.dynamic_probabilities(k) for k in range(len(MIN_GAPS)))
+    certain = [smooth(p) > LIKELY for p in nearer]
+    masks = outlined(farther)
     added = sum(int((c & ~m).sum()) for c, m in zip(certain, masks, strict=True))
     masks = confirmed(masks, certain, carried)
     if added > MIN_ADDED * sum(int(m.sum()) for m in masks):
-        masks = [a | b for a, b in zip(masks, outlined(fast), strict=True)]
+        masks = [a | b for a, b in zip(masks, outlined(nearer), strict=True)]
     return masks
 
 

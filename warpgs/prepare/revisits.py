@@ -29,7 +29,7 @@ NUM_AGREEING = 3
 
 MIN_GAPS = (8, 4)
 """Minimum number of frames between a frame and its far frames, of each set. A hand that moves slowly is lost with 4 and
-partly with 6; with 10, a camera that passes shares too little with them (docs/prepare.md has the figures)."""
+partly with 6; with 10, a camera that passes shares too little with them (docs/design/motion-masks.md)."""
 
 MIN_SPACING = 3
 """Minimum number of frames between far frames."""

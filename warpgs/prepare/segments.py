@@ -182,6 +182,7 @@ class Graph:
         for _ in range(NUM_COLOR_ROUNDS):
             odds = COLOR_TRUST * self._sizes * self._log_odds(cells, x)
             x = self._solve(*evidence, np.maximum(-odds, 0.0), np.maximum(odds, 0.0) * unproven)
+        x = x.astype(np.float32)  # a value per pixel of all frames
         return [x[start + frame.labels] for start, frame in zip(self.starts, self.frames, strict=False)]
 
     def _solve(
