@@ -7,6 +7,8 @@ or come close to it at some time, so the largest factor that the bound allows is
 """
 
 import math
+from collections.abc import Callable
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -35,6 +37,12 @@ MIN_POINTS = 3
 NEAREST, TIGHTEST = 0.02, 0.05
 """Quantile of these points' depths that is the bound in a frame; quantile of the frames' bounds that is the bound of
 the factor. Both leave room for outliers."""
+
+MAX_POINTS = 10_000
+"""Maximum number of static points that are projected into each frame."""
+
+Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
+"""Rows, columns and depths [scene units] of points."""
 
 NUM_CHECKED = 8
 """Number of frames that are looked at for known depth of what moves."""
@@ -87,10 +95,11 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
         By index of the frame, [h, w] depth in its scaled mask [scene units], that of round objects, NaN elsewhere.
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
+    points_of = cache(partial(_static_points, capture))
     depths: dict[int, Tensor] = {}
     for frames in (order, order[::-1]):  # by time first; backward, what parts later can be told apart before
         for item in find_objects(capture, frames):
-            for index, depth in _depths(item, capture).items():
+            for index, depth in _depths(item, capture, points_of).items():
                 size = scaled_size(capture.cameras[capture.train[index]])
                 values = depths.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
                 pixels = torch.from_numpy(item.pixels[index]).long()
@@ -98,7 +107,18 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
     return depths
 
 
-def _depths(item: MovingObject, capture: Capture) -> dict[int, Float[Tensor, " P"]]:
+def _static_points(capture: Capture, index: int) -> Points:
+    """Rows and columns in the scaled mask, and depths, of the static points that a training frame shows."""
+    frame = capture.frame(capture.train[index])
+    assert frame.static_mask is not None
+    row, column, depth, inside = frame.camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
+    shown = inside & frame.static_mask[row, column]
+    width, height = scaled_size(frame.camera)
+    row, column = row[shown] * height // frame.camera.height, column[shown] * width // frame.camera.width
+    return row.int(), column.int(), depth[shown]
+
+
+def _depths(item: MovingObject, capture: Capture, points_of: Callable[[int], Points]) -> dict[int, Float[Tensor, " P"]]:
     """Depth of an object's pixels in each frame that shows it whole or beside another one; none if it cannot be told.
 
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
@@ -107,7 +127,7 @@ def _depths(item: MovingObject, capture: Capture) -> dict[int, Float[Tensor, " P
     if item.is_mixture or len(item.whole) < MIN_FRAMES:
         return {}
     views = {index: _ObjectView(pixels, capture.cameras[capture.train[index]]) for index, pixels in item.pixels.items()}
-    bounds = np.array([views[index].bound(capture, index) for index in item.whole])
+    bounds = np.array([views[index].bound(points_of(index)) for index in item.whole])
     if not np.isfinite(bounds).any():
         return {}
     choices = []
@@ -168,16 +188,12 @@ class _ObjectView:
         nearer = np.sqrt(np.maximum(np.quantile(squared, 0.95) - squared, 0.0))
         return torch.from_numpy(depth + nearer.mean() - nearer).float()
 
-    def bound(self, capture: Capture, index: int) -> float:
+    def bound(self, points: Points) -> float:
         """Depth of the static points around it; NaN if there are too few."""
-        static = capture.frame(capture.train[index]).static_mask
-        assert static is not None
-        row, column, depth, inside = self.camera.project(capture.points)
-        row, column, depth = (values[inside & static[row, column]] for values in (row, column, depth))
-        width, height = self.size
-        region = np.zeros((height, width), np.uint8)
+        row, column, depth = points
+        region = np.zeros(self.size[::-1], np.uint8)
         region[self.rows, self.columns] = 1
         reach = 2 * max(1, round(AROUND * max(self.size))) + 1
         around = torch.from_numpy(cv2.dilate(region, np.ones((reach, reach), np.uint8)) > 0)
-        near = depth[around[row * height // self.camera.height, column * width // self.camera.width]]
+        near = depth[around[row, column]]
         return float(near.quantile(NEAREST)) if len(near) >= MIN_POINTS else math.nan
