@@ -91,7 +91,7 @@ PAPER = {
     },
     "Deformable-3DGS: frames of HyperNeRF": {"vrig_factor": 4},
     "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
-    "code of the authors": {"model.dynamic_points": 100_000, "model.dynamic_start": "uniform"},
+    "code of the authors": {"model.dynamic_points": 100_000, "model.dynamic_start": "uniform", "model.tracks": False},
     "no such thing in the paper": {
         "optim.poses": 0.0,
         "exposure": False,

@@ -17,9 +17,8 @@ NetName = Literal["vgg", "alex", "squeeze"]
 
 @dataclass(frozen=True)
 class Bounds:
-    """Range of a number in a config, as metadata of its type: ``depth: Annotated[int, Bounds(min=1)]``.
-
-    Numbers without this metadata have the default range.
+    """Range of a number in a config, as metadata of its type: ``depth: Annotated[int, Bounds(min=1)]``. Others
+    have the default range.
 
     Attributes:
         min, max: Inclusive limits.
@@ -96,8 +95,7 @@ class ModelConfig:
     skip: int = 4
     """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
     deformation: str = "mlp"
-    """Deformation model of the dynamic Gaussians (a key of FIELDS in warpgs/model/fields.py). "splines" takes the place
-    of "mlp" where small things before transparent surroundings move far from frame to frame."""
+    """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
     paths: Annotated[int, Bounds(min=1, max=4096)] = 1
     """Number of splines of the deformation model "splines"; training sets it to the number of things."""
     path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
@@ -116,6 +114,8 @@ class ModelConfig:
     """Maximum number of initial static Gaussians."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
+    tracks: bool = True
+    """Whether small things that move far between frames start on tracks (docs/design/tracks.md)."""
     dynamic_start: Literal["points", "uniform"] = "points"
     """Where dynamic Gaussians start if their depth is unknown: in front of the sparse points around them, or uniformly
     in the scene's box, as in the code of the paper's authors; the paper names no start."""
@@ -152,8 +152,7 @@ class LossConfig:
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     object_depth: bool = False
-    """Whether moving objects whose depth is unknown get one by their size, which they keep, and by the static points
-    that they hide (docs/design/object-depth.md)."""
+    """Whether moving objects of unknown depth get one by their size (docs/design/object-depth.md)."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""
@@ -265,10 +264,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class MaskPerturbation:
-    """Deliberate damage to the training masks, to measure robustness against wrong ones (paper, robustness).
-
-    Evaluation always uses the true masks.
-    """
+    """Deliberate damage to the training masks (paper, robustness); evaluation always uses the true masks."""
 
     erode: int = 0
     """Erode the dynamic region by this many pixels."""

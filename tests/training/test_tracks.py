@@ -8,11 +8,14 @@ import torch
 
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.cameras import Camera
 from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.balls import RADIUS, BallsSize, _balls, balls_capture
+from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
 from warpgs.presets import PRESETS
 from warpgs.rendering import render
+from warpgs.training import tracks as module
 from warpgs.training.fitting import fitted
 from warpgs.training.silhouettes import Region
 from warpgs.training.tracked_start import MAX_FINAL_RATE, MAX_POSITION_RATE, MAX_RATE
@@ -79,8 +82,63 @@ def test_every_ball_has_a_track(tracks, halfway):
 
 
 def test_what_moves_little_from_frame_to_frame_is_not_tracked(tmp_path):
-    slow = balls_capture(tmp_path, BallsSize(side=48, num_frames=80, num_val=2, turns=0.5), quiet=True)
+    slow = balls_capture(tmp_path, BallsSize(side=80, num_frames=60, num_val=2, turns=0.5), quiet=True)
     assert find_tracks(load_capture(slow)) == []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MIN_STEP", 0.0)
+        assert len(find_tracks(load_capture(slow))) == 5
+
+
+def ball_on_white(centers: list[np.ndarray]) -> Capture:
+    """A ball of radius 0.1 that hardly moves, before white, seen from these points by cameras that face the origin."""
+    side, focal, num = 120, 150.0, len(centers)
+    K = torch.tensor([[focal, 0.0, side / 2], [0.0, focal, side / 2], [0.0, 0.0, 1.0]])
+    cameras, empty = {}, {}
+    for k, center in enumerate(centers):
+        forward = -center / np.linalg.norm(center)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.from_numpy(np.stack([right, np.cross(forward, right), forward]))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ torch.from_numpy(center).float()
+        cameras[str(k)] = Camera(viewmat, K, side, side, k / (num - 1))
+        ball = np.array([0.4, 0.0, 0.1 * np.sin(4.0 * k / (num - 1))])
+        u, v, depth = viewmat[:3, :3].numpy() @ ball + viewmat[:3, 3].numpy()
+        y, x = np.mgrid[:side, :side] + 0.5 - side / 2
+        empty[str(k)] = torch.from_numpy(np.hypot(x - focal * u / depth, y - focal * v / depth) > focal * 0.1 / depth)
+
+    def read(name: str) -> Frame:
+        image = torch.full((side, side, 3), 255, dtype=torch.uint8)
+        image[~empty[name]] = torch.tensor([200, 60, 20], dtype=torch.uint8)
+        return Frame(name, cameras[name], image, empty=empty[name])
+
+    points = torch.zeros(0, 3)
+    names = list(cameras)
+    return Capture("ball", cameras, names, [], points, None, read, unmasked="dynamic", background="white")
+
+
+@pytest.mark.parametrize("turns", [0.0, 0.25, 2.0])
+def test_nothing_is_tracked_by_a_camera_that_moves_evenly(turns):
+    """Its own path meets all of its rays."""
+    angles = 2.0 * np.pi * turns * np.linspace(0.0, 1.0, 60)
+    capture = ball_on_white([np.array([3.0 * np.cos(a), 3.0 * np.sin(a), 1.0]) for a in angles])
+    assert find_tracks(capture) == []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MIN_BEND", -1.0)
+        assert bool(find_tracks(capture)) == (turns > 0)
+
+
+def test_the_penalty_is_that_of_fifth_differences():
+    points = np.random.default_rng(0).standard_normal((12, 3))
+    bands = module._difference_penalty(12)
+    matrix = sum(np.diag(band[: 36 - k], -k) for k, band in enumerate(bands))
+    matrix = matrix + np.tril(matrix, -1).T
+    assert points.ravel() @ matrix @ points.ravel() == pytest.approx((np.diff(points, 5, axis=0) ** 2).sum())
+
+
+def test_many_specks_are_not_tracked(capture, monkeypatch):
+    monkeypatch.setattr(module, "MAX_THINGS", 4)
+    assert find_tracks(capture) == []
 
 
 def test_nothing_is_tracked_without_transparent_surroundings_or_with_masks(capture, tmp_path):
@@ -108,6 +166,14 @@ def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
 
 def test_the_paper_starts_without_tracks(capture):
     assert fitted(PRESETS["paper"], capture, print).model.deformation == "mlp"
+
+
+def test_tracks_can_be_switched_off(capture):
+    model = dataclasses.replace(PRESETS["quick"].model, tracks=False)
+    assert fitted(dataclasses.replace(PRESETS["quick"], model=model), capture, print).model.deformation == "mlp"
+    model = dataclasses.replace(model, deformation="splines")
+    with pytest.raises(ValueError, match="splines"):
+        fitted(dataclasses.replace(PRESETS["quick"], model=model), capture, print)
 
 
 def test_splines_are_refused_where_nothing_is_tracked(tmp_path):

@@ -21,12 +21,12 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
     background = capture.background if config.background == "capture" else config.background
     config = dataclasses.replace(config, background=background)
     seen = capture.assuming(config.assume).over(known_background(config, capture))
-    if config.model.dynamic_start == "points" and config.model.deformation in ("mlp", "splines"):
-        if tracks := find_tracks(seen):
-            log(f"{len(tracks)} things move far from frame to frame: dynamic Gaussians start on their tracks")
-            config = for_tracks(config, tracks)
-        elif config.model.deformation == "splines":
-            raise ValueError('model.deformation "splines": no small things are tracked in this capture; use "mlp"')
+    tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
+    if tracks:
+        log(f"{len(tracks)} things move far from frame to frame: dynamic Gaussians start on their tracks")
+        config = for_tracks(config, tracks)
+    elif config.model.deformation == "splines":
+        raise ValueError('model.deformation "splines": no small things are tracked in this capture; use "mlp"')
     bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")

@@ -7,9 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.sampling import evenly_spaced_indices
 
 MIN_PIXELS = 12
 """Minimum size of a region."""
+
+MAX_PIXELS = 1_000
+"""Maximum number of a region's pixels that are kept."""
 
 
 class Region(NamedTuple):
@@ -21,8 +25,8 @@ class Region(NamedTuple):
         center: [3] unit vector from there through the centre of the region.
         radius: Angle of a disc of the region's area [rad].
         lab: [3] mean colour in 8-bit Lab.
-        rays: [P, 3] unit vectors through its pixels.
-        colors: [P, 3] of its pixels in [0, 1].
+        rays: [P, 3] unit vectors through its pixels, at most ``MAX_PIXELS`` of them.
+        colors: [P, 3] of these pixels in [0, 1].
     """
 
     time: float
@@ -53,19 +57,23 @@ def _regions(frame: Frame) -> list[Region]:
     if frame.static_mask is None:
         return []
     camera, image = frame.camera, frame.image.numpy()
-    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
-    rotation = viewmat[:3, :3]
-    origin, to_rays = -rotation.T @ viewmat[:3, 3], rotation.T @ np.linalg.inv(K)
+    to_rays = np.linalg.inv(camera.K.double().numpy() @ camera.viewmat[:3, :3].double().numpy())
+    origin = camera.position.double().numpy()
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(float)
-    count, labels = cv2.connectedComponents((~frame.static_mask.numpy()).astype(np.uint8), connectivity=4)
+    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(dynamic, connectivity=4)
     regions = []
     for label in range(1, count):
-        y, x = np.nonzero(labels == label)
-        if len(x) >= MIN_PIXELS:
-            rays = _unit(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ to_rays.T)
-            radius = float(np.sqrt(len(x) / (np.pi * K[0, 0] * K[1, 1])))
-            sight = camera.time, origin, _unit(rays.mean(0)), radius
-            regions.append(Region(*sight, lab[y, x].mean(0), rays, image[y, x] / 255.0))
+        left, top, width, height, area = stats[label]
+        if area < MIN_PIXELS:
+            continue
+        y, x = np.nonzero(labels[top : top + height, left : left + width] == label)
+        y, x = y + top, x + left
+        rays = _unit(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ to_rays.T)
+        radius = float(np.sqrt(area / (np.pi * float(camera.K[0, 0] * camera.K[1, 1]))))
+        kept = evenly_spaced_indices(int(area), MAX_PIXELS)
+        colors = image[y[kept], x[kept]] / 255.0
+        regions.append(Region(camera.time, origin, _unit(rays.mean(0)), radius, lab[y, x].mean(0), rays[kept], colors))
     return regions
 
 

@@ -6,11 +6,13 @@ its path (trajectory triangulation, Park et al. 2010): the one that most rays me
 penalty on differences of its coefficients (P-splines, Eilers and Marx 1996).
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
@@ -44,6 +46,13 @@ MAX_MISS, MAX_ERROR = 0.5, 1.0
 """Distance, in radii, up to which a ray meets a path; mean distance of rays that a path was found without, above which
 it is none: 0.1 to 0.7 of one ball, hidden now and then, 1.9 of two of similar colours."""
 
+MIN_BEND = 1.0
+"""Minimum median of the second differences of the camera centres, relative to the first ones: the path of a camera that
+moves evenly would meet all of its rays. 0.03 to 0.31 in orbits, 1.7 of a camera at random points."""
+
+MAX_THINGS = 32
+"""Maximum number of things that are tracked."""
+
 MIN_STEP = 0.5
 """Median movement from frame to frame, in diameters, from which on tracks are used."""
 
@@ -67,14 +76,15 @@ def find_tracks(capture: Capture) -> list[Track]:
     """Tracks of the things that a capture shows before transparent surroundings, one per colour.
 
     Returns:
-        None at all if they show too little, if one of them has no path, or if they move little from frame to frame.
+        None at all if the camera moves evenly, if there are too few regions or too many things, if one of them has no
+        path, or if they move little from frame to frame.
     """
-    if capture.assumption != "dynamic" or not capture.has_empty:
+    if capture.assumption != "dynamic" or not capture.has_empty or not _jumps(capture):
         return []
     by_frame = find_regions(capture)
     regions = [region for of_frame in by_frame for region in of_frame]
     count = int(np.quantile([len(of_frame) for of_frame in by_frame], SHOWING_ALL))
-    if count == 0 or len(regions) < MIN_REGIONS * count:
+    if not 0 < count <= MAX_THINGS or len(regions) < MIN_REGIONS * count:
         return []
     labels = _by_color(np.array([region.lab for region in regions]), count)
     regions, labels = _divided(regions, labels, count)
@@ -87,6 +97,16 @@ def find_tracks(capture: Capture) -> list[Track]:
     times = np.unique([capture.cameras[name].time for name in capture.train])
     steps = [np.linalg.norm(np.diff(t.path(times), axis=0), axis=1) / (2.0 * t.radius) for t in tracks]
     return tracks if np.median(steps) >= MIN_STEP else []
+
+
+def _jumps(capture: Capture) -> bool:
+    """Whether the camera is at another place in every frame, instead of moving evenly or not at all."""
+    cameras = sorted((capture.cameras[name] for name in capture.train), key=lambda camera: camera.time)
+    centers = np.stack([camera.position.numpy() for camera in cameras])
+    if len(np.unique([camera.time for camera in cameras])) < MIN_REGIONS:
+        return False
+    step, bend = (np.median(np.linalg.norm(np.diff(centers, order, axis=0), axis=1)) for order in (1, 2))
+    return bool(bend > MIN_BEND * step)
 
 
 def _by_color(colors: Float[np.ndarray, "R 3"], count: int) -> np.ndarray:
@@ -133,7 +153,8 @@ def _track(regions: list[Region], num_frames: int) -> Track | None:
     radius = fit.radius(path)
     if error > MAX_ERROR * radius:
         return None
-    return Track(path, radius, [r for r, miss in zip(regions, misses, strict=True) if miss <= MAX_MISS * radius])
+    shown = [region for region, miss in zip(regions, misses, strict=True) if miss <= MAX_MISS * radius]
+    return Track(path, radius, shown) if len(shown) >= MIN_REGIONS else None
 
 
 class _Fit:
@@ -157,9 +178,7 @@ class _Fit:
         self.blocks = blocks.reshape(len(regions), -1)[:, of_lower]
         self.places = ((row - column) * self.size + column).reshape(len(regions), -1)[:, of_lower]
         self.targets, self.unknowns = targets.reshape(len(regions), -1), unknowns
-        differences = np.diff(np.eye(basis.shape[1]), ORDER, axis=0)
-        penalty = np.kron(differences.T @ differences, np.eye(3))
-        self.penalty = np.array([np.pad(penalty.diagonal(-k), (0, k)) for k in range(3 * ORDER + 1)])
+        self.penalty = _difference_penalty(basis.shape[1])
 
     def path(self, smoothness: float, used: Bool[np.ndarray, " R"] | None = None) -> tuple[BSpline, np.ndarray]:
         """The path by the rays of some regions (of all if None), and the distances [R] of all rays from it."""
@@ -189,3 +208,14 @@ class _Fit:
     def radius(self, path: BSpline) -> float:
         """Radius of a ball that looks as large as the regions [scene units]."""
         return float(np.median(self.angles * np.linalg.norm(path(self.times) - self.origins, axis=1)))
+
+
+def _difference_penalty(count: int) -> Float[np.ndarray, "B D"]:
+    """Lower bands of DᵀD for the differences D of ``count`` points with three coordinates each."""
+    weights = [(-1.0) ** k * math.comb(ORDER, k) for k in range(ORDER + 1)]
+    differences = sparse.diags_array(weights, offsets=range(ORDER + 1), shape=(count - ORDER, count))
+    product = (differences.T @ differences).tocsr()
+    bands = np.zeros((3 * ORDER + 1, 3 * count))
+    for k in range(ORDER + 1):
+        bands[3 * k, : 3 * (count - k)] = np.repeat(product.diagonal(-k), 3)
+    return bands

@@ -96,8 +96,7 @@ class Trainer:
         self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments)
-        has_depth = self.num_aligned + self.num_with_objects > 0
-        self.protocol = Protocol(config, has_depth, pretrains=self.num_aligned > 0)
+        self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, pretrains=self.num_aligned > 0)
         self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
         self._start_from(initialize.initial_scene(config, self.capture, self._generator("points")))
 
@@ -240,6 +239,7 @@ class Trainer:
         deformation = self.scene.deformation
         if isinstance(deformation, SplineDeformation):
             self.scene.dynamic = start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
+            ranks.copy_first_(deformation.homes)
         else:
             self.scene.dynamic = initialize.dynamic_gaussians(config, capture, self.views, self.alignments, generator)
         self._start_from(self.scene)
