@@ -98,6 +98,7 @@ PAPER = {
         "antialias": False,
         "densify.weakest": 0.0,
         "densify.reseed": 0.0,
+        "schedule.fit_motion": 0,
     },
     "decided here, where neither the paper nor the code that it builds upon says anything": {
         "loss.joint": 1.0,

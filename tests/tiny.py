@@ -39,6 +39,7 @@ SCHEDULE = Schedule(
     densify_until=14,
     reset_every=9,
     prune_every=6,
+    fit_motion=4,
     deform_from=3,
     noise_until=10,
     sh_degree_every=5,

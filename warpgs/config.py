@@ -108,8 +108,7 @@ class ModelConfig:
     """Whether the appearance network also changes opacities (paper Eq. 8). Off by default: with one camera at a time
     it fits shadows by fading Gaussians at wrong depths in and out."""
     half: bool = True
-    """On CUDA, run the networks' matrix products in half precision, with sums and weights in single precision; only if
-    ``width`` is a multiple of 8."""
+    """On CUDA, multiply matrices of the networks in half precision, add in single; only if 8 divides ``width``."""
     max_static_points: int = 100_000
     """Maximum number of initial static Gaussians."""
     dynamic_points: int = 20_000
@@ -220,7 +219,7 @@ class DensifyConfig:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Everything that is counted in iterations; ``--iterations`` rescales all of it but ``warmup``.
+    """Everything that is counted in iterations; ``--iterations`` rescales all of it but ``fit_motion`` and ``warmup``.
 
     Except for the lengths of the stages and ``realign_at``, iterations count from the start of stage I.
     """
@@ -241,6 +240,8 @@ class Schedule:
     """Iterations between opacity resets during densification."""
     prune_every: Annotated[int, Bounds(min=1)] = 5_000
     """Iterations between visibility-driven prunings, in stage I."""
+    fit_motion: int = 0
+    """Steps that fit the deformation to dynamic points of known depth before stage I; 0: none (paper)."""
     deform_from: int = 3_000
     """Iteration from which dynamic Gaussians are deformed."""
     appearance_from: int | None = 0
@@ -392,7 +393,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
         name: value if value is None else max(min(value, 1), round(value * factor))
         for name, value in dataclasses.asdict(schedule).items()
     }
-    values["warmup"] = schedule.warmup  # Adam needs as many steps in a short run
+    values["warmup"], values["fit_motion"] = schedule.warmup, schedule.fit_motion  # as many steps in a short run
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)
     values[longest] += config.iterations - sum(values[name] for name in stages)

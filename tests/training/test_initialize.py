@@ -8,6 +8,7 @@ import torch
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
+from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
 from warpgs.training.point_cloud import color_points, gaussians_at, scene_box, subsample, unproject
 from warpgs.training.views import Views
@@ -52,9 +53,10 @@ def make_capture(points, colors=None, inverse_depth=None, num_frames=3):
     return Capture("made up", cameras, names, [], points, colors, read)
 
 
-def dynamic_gaussians(capture, alignments, config=CONFIG):
+def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None):
     views = Views(capture, torch.device("cpu"), 1 << 30)
-    return initialize.dynamic_gaussians(config, capture, views, alignments, generator())
+    deformation = deformation or torch.nn.Identity()
+    return initialize.dynamic_gaussians(config, capture, views, alignments, deformation, generator())
 
 
 def constant_depth():
@@ -350,6 +352,36 @@ def test_without_depth_and_visible_points_dynamic_gaussians_start_at_random_in_t
     center, half_size = scene_box(points)
     assert len(gaussians) == NETWORK.dynamic_points
     assert ((gaussians.means - center).abs() <= half_size).all()
+
+
+WIDE = dataclasses.replace(NETWORK, depth=2, width=32)
+FITTED = dataclasses.replace(CONFIG, model=WIDE, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=300))
+
+
+def new_deformation():
+    torch.manual_seed(0)
+    return make_deformation(WIDE, torch.zeros(3), torch.ones(3))
+
+
+def test_the_deformation_is_fitted_to_dynamic_pixels_of_known_depth():
+    """The block recedes from frame to frame."""
+    alignments = torch.stack([ALIGNMENT[0] * DEPTH / depth for depth in (2.5, 2.6, 2.7)])
+    deformation = new_deformation()
+    capture = make_capture(random_points(9), inverse_depth=constant_depth())
+    means = dynamic_gaussians(capture, alignments, FITTED, deformation).means.detach()
+    assert len(means) == NETWORK.dynamic_points
+    with torch.no_grad():
+        first, last = (
+            CAMERA.project(means + deformation(means, torch.tensor([t]))[:, :3])[2].mean() for t in (0.0, 2 / 3)
+        )
+    assert error(torch.stack([first, last]), torch.tensor([2.5, 2.7])) < 0.05
+
+
+def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
+    deformation = new_deformation()
+    dynamic_gaussians(make_capture(random_points(50)), ALIGNMENT, FITTED, deformation)
+    for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
+        assert torch.equal(ours, new)
 
 
 def test_if_everything_is_assumed_static_there_are_no_dynamic_gaussians():

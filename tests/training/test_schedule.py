@@ -18,6 +18,7 @@ SHORT = Schedule(
     densify_until=60,
     reset_every=20,
     prune_every=30,
+    fit_motion=5,
     deform_from=25,
     appearance_from=35,
     noise_until=40,
@@ -354,16 +355,20 @@ def test_no_stage_of_a_rescaled_run_is_empty(preset, iterations):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_schedule_but_the_warmup_is_scaled_by_the_same_factor(preset):
+def test_every_schedule_but_those_of_adam_is_scaled_by_the_same_factor(preset):
     before = dataclasses.asdict(PRESETS[preset].schedule)
     after = dataclasses.asdict(scaled(with_iterations(preset, 3 * total(PRESETS[preset].schedule))).schedule)
-    assert after == {name: value and (1 if name == "warmup" else 3) * value for name, value in before.items()}
+    assert after == {
+        name: value and (1 if name in ("warmup", "fit_motion") else 3) * value for name, value in before.items()
+    }
 
 
-def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule_but_the_warmup():
+def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule_but_those_of_adam():
     before = dataclasses.asdict(PRESETS["paper"].schedule)
     after = dataclasses.asdict(scaled(with_iterations("paper", 7_200)).schedule)
-    assert after == {name: value and value // (1 if name == "warmup" else 10) for name, value in before.items()}
+    assert after == {
+        name: value and value // (1 if name in ("warmup", "fit_motion") else 10) for name, value in before.items()
+    }
 
 
 @pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])

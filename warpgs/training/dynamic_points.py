@@ -53,6 +53,10 @@ class DynamicPoints(NamedTuple):
     views: Int64[Tensor, " S"]
     depth_known: bool
 
+    def chosen(self, points: Int64[Tensor, " N"] | Bool[Tensor, " S"]) -> "DynamicPoints":
+        """Some of the points."""
+        return DynamicPoints(self.positions[points], self.colors[points], self.views[points], self.depth_known)
+
 
 def max_scale(config: TrainConfig, extent: float) -> float:
     """Maximum standard deviation of initial dynamic Gaussians of unknown depth, by the capture's extent."""
@@ -94,9 +98,8 @@ def unproject_pixels(
     if not depth_known:
         estimated = partial(_depth_before_points, points, generator)
         found = _unproject(views, mask_of, estimated, fraction, generator)
-    chosen = subsample(found[0], max_count, generator)
-    positions, colors, indices = (values[chosen] for values in found)
-    return DynamicPoints(positions, colors, indices, depth_known)
+    positions, colors, indices = found
+    return DynamicPoints(positions, colors, indices, depth_known).chosen(subsample(positions, max_count, generator))
 
 
 def _unproject(

@@ -5,17 +5,21 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 
 from .dynamic_points import max_scale, unproject_pixels
+from .motion_fit import MAX_POINTS, MAX_POINTS_PER_VIEW, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .tracked_start import start_from_tracks
+from .tracks import find_tracks
 from .views import Views
 
 MAX_COLOR_VIEWS = 12
@@ -62,20 +66,28 @@ def dynamic_gaussians(
     capture: Capture,
     views: Views,
     alignments: Float[Tensor, "T 2"],
+    deformation: nn.Module,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth.
+    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation is fitted.
 
     Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
     points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
-    points. If nothing is dynamic, there are none.
+    points. If nothing is dynamic, there are none. What was tracked starts on its tracks.
     """
-    max_count, degree = config.model.dynamic_points, config.model.sh_degree
+    max_count, degree, steps = config.model.dynamic_points, config.model.sh_degree, config.schedule.fit_motion
+    if isinstance(deformation, SplineDeformation):
+        return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return gaussians_at(*_colored_points(config, capture, generator), degree)
-    found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, max_count, generator)
+    count = min(MAX_POINTS, MAX_POINTS_PER_VIEW * len(views)) if steps else max_count
+    found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return Gaussians.empty(0, degree)
+    if steps and found.depth_known:
+        times = torch.tensor([capture.cameras[name].time for name in capture.train])
+        found = fit_motion(deformation, found, times, capture.extent, steps, generator)
+    found = found.chosen(subsample(found.positions, max_count, generator))
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
         positions = random_points(capture.points, max_count, generator)

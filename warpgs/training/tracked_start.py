@@ -11,6 +11,7 @@ from warpgs.config import TrainConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.spline_deformation import SplineDeformation
 
+from . import ranks
 from .dynamic_points import max_scale
 from .point_cloud import gaussians_at, subsample
 from .tracks import Track
@@ -60,6 +61,7 @@ def start_from_tracks(
     chosen = subsample(positions, config.model.dynamic_points, generator)
     gaussians = gaussians_at(positions[chosen], colors[chosen], config.model.sh_degree, max_scale(config, extent))
     deformation.homes.copy_(starts)
+    ranks.copy_first_(deformation.homes)
     deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))
     return gaussians
 

@@ -12,7 +12,6 @@ from warpgs.data.capture import Capture
 from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
-from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.runs import checkpoint
 from warpgs.runs.captures import known_background
 from warpgs.runs.trained import TrainedScene
@@ -30,8 +29,6 @@ from .reseed import gaussians_that_show, lost_fraction, lost_pixels
 from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
-from .tracked_start import start_from_tracks
-from .tracks import find_tracks
 from .views import Views
 
 CHECK_EVERY = 50
@@ -235,13 +232,8 @@ class Trainer:
     def _add_dynamic_gaussians(self) -> None:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned."""
         ranks.any_rank(False)  # finds a lost rank
-        config, capture, generator = self.config, self.capture, self._generator("dynamic")
-        deformation = self.scene.deformation
-        if isinstance(deformation, SplineDeformation):
-            self.scene.dynamic = start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
-            ranks.copy_first_(deformation.homes)
-        else:
-            self.scene.dynamic = initialize.dynamic_gaussians(config, capture, self.views, self.alignments, generator)
+        sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
+        self.scene.dynamic = initialize.dynamic_gaussians(*sources, self._generator("dynamic"))
         self._start_from(self.scene)
 
     # Randomness -------------------------------------------------------------------------------------------------------
