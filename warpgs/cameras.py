@@ -46,6 +46,11 @@ class Camera:
         """A copy on another device."""
         return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
 
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view as an image of another size."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0], device=self.K.device)
+        return dataclasses.replace(self, K=self.K * scale[:, None], width=width, height=height)
+
     @property
     def position(self) -> Float[Tensor, "3"]:
         """[3] centre of the camera in the world."""

@@ -6,6 +6,7 @@ seen, and the factor is bounded, because the object hides the static surfaces ar
 or come close to it at some time, so the largest factor that the bound allows is a good one.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import cache, partial
@@ -23,6 +24,7 @@ from warpgs.data.sampling import evenly_spaced_indices
 
 from .dynamic_points import MIN_KNOWN_FRACTION
 from .objects import MovingObject, find_objects, scaled_size
+from .point_cloud import front_of_ball
 from .views import Views
 
 MIN_FRAMES = 12
@@ -148,52 +150,47 @@ class _ObjectView:
     Args:
         pixels: Flat indices of its pixels in the scaled mask.
         camera: The camera of the frame.
+
+    Attributes:
+        is_cut: Whether it touches the image border.
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
-        width, height = self.size = scaled_size(camera)
-        self.rows, self.columns = np.divmod(pixels, width)
-        self.camera = camera
-        border = (self.rows == 0) | (self.rows == height - 1) | (self.columns == 0) | (self.columns == width - 1)
-        self.is_cut = bool(border.any())
-
-    def _rays(self, columns: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "P 3"]:
-        """Rays of depth 1 through pixels of the scaled mask, in camera space."""
-        scale = self.camera.width / self.size[0], self.camera.height / self.size[1]
-        pixels = np.stack([(columns + 0.5) * scale[0], (rows + 0.5) * scale[1], np.ones(len(rows))], 1)
-        return pixels @ np.linalg.inv(self.camera.K.double().numpy()).T
+        self._camera = camera.resized(*scaled_size(camera))
+        width, height = self._camera.size
+        rows, columns = np.divmod(pixels, width)
+        self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
+        self.is_cut = bool(((rows == 0) | (rows == height - 1) | (columns == 0) | (columns == width - 1)).any())
+        viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4))
+        self._slopes = viewed.unproject(self._rows, self._columns, torch.ones(len(pixels)))[:, :2].contiguous().numpy()
 
     def diameter(self) -> float:
         """Largest distance of two of its pixels at depth 1."""
-        hull = cv2.convexHull(np.stack([self.columns, self.rows], 1))[:, 0]
-        rays = self._rays(*hull.T)
-        return float(np.linalg.norm(rays[:, None] - rays, axis=-1).max())
+        hull = cv2.convexHull(self._slopes)[:, 0]
+        return float(np.linalg.norm(hull[:, None] - hull, axis=-1).max())
 
     def area(self) -> float:
         """Square root of its area at depth 1."""
-        K = self.camera.K
-        pixel = self.camera.width / self.size[0] * self.camera.height / self.size[1]
-        return math.sqrt(len(self.rows) * pixel / float(K[0, 0] * K[1, 1]))
+        return math.sqrt(len(self._rows) / float(self._camera.K[0, 0] * self._camera.K[1, 1]))
 
     def position(self, depth: float) -> Float[np.ndarray, "3"]:
         """Where its centre is at a depth, in scene units."""
-        viewmat = self.camera.viewmat.double().numpy()
-        center = depth * self._rays(self.columns, self.rows).mean(0)
-        return viewmat[:3, :3].T @ (center - viewmat[:3, 3])
+        points = self._camera.unproject(self._rows, self._columns, torch.full(self._rows.shape, depth))
+        return points.mean(0).double().numpy()
 
     def surface(self, depth: float) -> Float[Tensor, " P"]:
         """Depth of its pixels if it is round, with that mean."""
-        points = depth * self._rays(self.columns, self.rows)[:, :2]
-        squared = ((points - points.mean(0)) ** 2).sum(1)
-        nearer = np.sqrt(np.maximum(np.quantile(squared, 0.95) - squared, 0.0))
+        points = depth * self._slopes
+        nearer = front_of_ball(points - points.mean(0))
         return torch.from_numpy(depth + nearer.mean() - nearer).float()
 
     def bound(self, points: Points) -> float:
         """Depth of the static points around it; NaN if there are too few."""
         row, column, depth = points
-        region = np.zeros(self.size[::-1], np.uint8)
-        region[self.rows, self.columns] = 1
-        reach = 2 * max(1, round(AROUND * max(self.size))) + 1
+        width, height = self._camera.size
+        region = np.zeros((height, width), np.uint8)
+        region[self._rows, self._columns] = 1
+        reach = 2 * max(1, round(AROUND * max(width, height))) + 1
         around = torch.from_numpy(cv2.dilate(region, np.ones((reach, reach), np.uint8)) > 0)
         near = depth[around[row, column]]
         return float(near.quantile(NEAREST)) if len(near) >= MIN_POINTS else math.nan

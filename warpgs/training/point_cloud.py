@@ -64,6 +64,15 @@ def random_points(points: Float[Tensor, "P 3"], count: int, generator: torch.Gen
     return center + half_size * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
 
 
+def front_of_ball(offsets: Float[np.ndarray, "P D"]) -> Float[np.ndarray, " P"]:
+    """How far in front of its centre the front of a ball is, at offsets of pixels from the centre.
+
+    The ball is as wide as 95 % of the offsets; beyond, it is 0.
+    """
+    squared = (offsets**2).sum(1)
+    return np.sqrt(np.maximum(np.quantile(squared, 0.95) - squared, 0.0))
+
+
 def subsample(points: Tensor, max_count: int, generator: torch.Generator) -> Tensor:
     """Sorted indices of at most ``max_count`` random points."""
     if points.shape[0] <= max_count:

@@ -13,7 +13,7 @@ from warpgs.model.spline_deformation import SplineDeformation
 
 from . import ranks
 from .dynamic_points import max_scale
-from .point_cloud import gaussians_at, subsample
+from .point_cloud import front_of_ball, gaussians_at, subsample
 from .tracks import Track
 
 MAX_RATE, MAX_FINAL_RATE, MAX_POSITION_RATE = 3e-4, 1e-5, 8e-4
@@ -83,8 +83,6 @@ def _points(track: Track) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
         center = track.path(region.time) - region.origin
         depth = center @ region.center
         points = region.rays * (depth / (region.rays @ region.center))[:, None] - depth * region.center
-        squared = (points**2).sum(1)
-        nearer = np.sqrt(np.maximum(np.quantile(squared, 0.95) - squared, 0.0))
-        offsets.append(points - nearer[:, None] * region.center)
+        offsets.append(points - front_of_ball(points)[:, None] * region.center)
         colors.append(region.colors)
     return torch.from_numpy(np.concatenate(offsets)).float(), torch.from_numpy(np.concatenate(colors)).float()

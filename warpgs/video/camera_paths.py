@@ -268,8 +268,7 @@ def resized(camera: Camera, factor: float) -> Camera:
     width, height = round(camera.width * factor), round(camera.height * factor)
     if min(width, height) < 1:
         raise ValueError(f"an image of {camera.width} × {camera.height} times {factor:g} has no pixels")
-    scale = torch.tensor([width / camera.width, height / camera.height, 1.0], device=camera.K.device)
-    return Camera(camera.viewmat, camera.K * scale[:, None], width, height, camera.time)
+    return camera.resized(width, height)
 
 
 def filling(camera: Camera, size: tuple[int, int]) -> Camera:
