@@ -6,6 +6,7 @@ import torch
 from tests.scenes import error, generator
 from warpgs.config import ModelConfig
 from warpgs.model.fields import make_deformation
+from warpgs.training import motion_fit
 from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.motion_fit import MAX_ERROR, fit_motion
 
@@ -90,18 +91,67 @@ def test_a_thing_is_carried_along_its_own_way(fitted):
             assert error(moved.mean(0), centers(TIMES[view])[thing]) < 0.1  # they are 0.6 apart
 
 
+def beside(center, views):
+    """Grey points on a third ball in some frames, and the others."""
+    positions = torch.tensor(center) + 0.02 * torch.randn(20 * len(views), 3, generator=generator())
+    views = torch.tensor(views).repeat_interleave(20)
+    third = DynamicPoints(positions, torch.full_like(positions, 0.5), views, True)
+    parts = zip(FOUND[:3], third[:3], strict=True)
+    return DynamicPoints(*(torch.cat(part) for part in parts), True)
+
+
+@pytest.mark.parametrize("x", [-0.2, 0.0, 0.2, 0.8])
+def test_a_thing_that_no_canonical_frame_shows_keeps_its_points(x):
+    points, deformation = beside([x, 0.0, 0.7], [16, 17, 18, 19, 20]), new_deformation()
+    canonical = fit(points, deformation)
+    grey = canonical.chosen((canonical.colors == 0.5).all(1))
+    assert len(grey.views) > 0.7 * 5 * 20
+    for view in (16, 20):
+        seen = points.positions[(points.views == view) & (points.colors == 0.5).all(1)]
+        assert torch.cdist(deformed(deformation, grey, view), seen).amin(1).max() <= MAX_ERROR * EXTENT
+
+
 def test_points_that_the_deformation_does_not_reach_are_dropped():
-    stray = torch.tensor([[0.0, 0.9, 0.0]]).expand(5, 3)
-    with_stray = DynamicPoints(
-        torch.cat([FOUND.positions, stray + 0.01 * torch.randn(5, 3, generator=generator())]),
-        torch.cat([FOUND.colors, torch.full((5, 3), 0.5)]),
-        torch.cat([FOUND.views, torch.full((5,), 3)]),
-        True,
+    class Folded(torch.nn.Module):
+        """It moves everything to negative x, so that it cannot reach half of the points."""
+
+        def __init__(self):
+            super().__init__()
+            self.scale = torch.nn.Parameter(torch.zeros(()))
+
+        def forward(self, means, time):
+            offsets = torch.zeros(len(means), 10)
+            offsets[:, 0] = -2.0 * means[:, 0].clamp_min(0.0) * (time != TIMES[10])
+            return offsets + 0.0 * self.scale
+
+    canonical = fit(FOUND, Folded(), 2)
+    assert not ((canonical.positions[:, 0] > 0.2) & (canonical.views != 10)).any()
+    assert 0.2 < len(canonical.views) / len(FOUND.views) < 0.8
+
+
+def test_at_most_so_many_points_of_a_frame_are_compared(monkeypatch):
+    monkeypatch.setattr(motion_fit, "MAX_POINTS_PER_VIEW", 10)
+    sizes = []
+    distance = motion_fit._distance
+    monkeypatch.setattr(motion_fit, "_distance", lambda a, b: sizes.append((len(a), len(b))) or distance(a, b))
+    canonical = fit(FOUND, new_deformation(), 5)
+    assert set(sizes) == {(10, 10)}
+    assert len(canonical.views) > 10 * NUM_VIEWS
+
+
+def test_a_deformation_without_parameters_stays_as_it_is():
+    assert fit(FOUND, torch.nn.Identity()) is FOUND
+
+
+def test_a_fit_that_is_stopped_leaves_the_deformation_as_it_was():
+    deformation, steps = new_deformation(), []
+    stopped = fit_motion(
+        deformation, FOUND, TIMES, EXTENT, 300, generator(), lambda: steps.append(0) or len(steps) == 7
     )
-    deformation = new_deformation()
-    canonical = fit(with_stray, deformation)
-    assert not (canonical.colors == 0.5).any()
-    assert len(canonical.views) > 0.9 * len(FOUND.views)
+    assert stopped is None
+    assert len(steps) == 7
+    for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
+        assert torch.equal(ours, new)
 
 
 def test_a_fit_is_the_same_for_the_same_random_numbers(fitted):

@@ -16,7 +16,7 @@ from warpgs.config import TrainConfig
 from warpgs.evaluation import evaluate_run
 from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
-from warpgs.training import command
+from warpgs.training import command, motion_fit
 from warpgs.training import train as script
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -79,6 +79,17 @@ def test_a_resumed_run_is_bit_identical(data, whole, tmp_path, stop):
     first = tiny.trainer(data, tmp_path)
     assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= stop))
     assert first.iteration == stop
+    resumed(data, tmp_path)
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+def test_a_run_stopped_while_the_deformation_is_fitted_to_points_is_bit_identical(data, whole, tmp_path, monkeypatch):
+    fitting = []
+    take_step = motion_fit._take_step
+    monkeypatch.setattr(motion_fit, "_take_step", lambda *args: fitting.append(0) or take_step(*args))
+    first = tiny.trainer(data, tmp_path)
+    assert not tiny.train(first, tiny.StopWhen(lambda: len(fitting) == 2))
+    assert (first.iteration, len(fitting)) == (first.protocol.stage1.start, 2)
     resumed(data, tmp_path)
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 

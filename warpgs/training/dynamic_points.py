@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
@@ -38,6 +38,11 @@ MAX_SCALE_FRACTION = 0.5
 """Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
 
 
+INVERSION_STEPS, INVERSION_RATE = 12, 0.5
+"""Fixed-point iterations with which a deformation is inverted, and the part of the missing way that each of them goes:
+more would not converge where nearby points move differently."""
+
+
 class DynamicPoints(NamedTuple):
     """Points on what moves, each as one view sees it; on the CPU.
 
@@ -56,6 +61,35 @@ class DynamicPoints(NamedTuple):
     def chosen(self, points: Int64[Tensor, " N"] | Bool[Tensor, " S"]) -> "DynamicPoints":
         """Some of the points."""
         return DynamicPoints(self.positions[points], self.colors[points], self.views[points], self.depth_known)
+
+
+@torch.no_grad()
+def to_canonical(
+    deformation: nn.Module,
+    seen: Float[Tensor, "P 3"],
+    time: Float[Tensor, "1"],
+    start: Float[Tensor, "P 3"],
+    max_error: float,
+) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
+    """Canonical positions x that a deformation d moves to points p at a time: x + d(x, time) = p.
+
+    Args:
+        deformation: As ``fields.FIELDS`` says.
+        seen: [P, 3] the points p.
+        time: [1] in [0, 1].
+        start: [P, 3] positions from which each is searched, by fixed-point iteration.
+        max_error: Distance from p at which a search ends [scene units].
+
+    Returns:
+        The positions, and which of them the deformation moves to within this distance.
+    """
+    found = start
+    for step in range(INVERSION_STEPS + 1):
+        missing = seen - found - deformation(found, time)[:, :3]
+        reached = missing.norm(dim=1) <= max_error
+        if step < INVERSION_STEPS:
+            found = torch.where(reached[:, None], found, found + INVERSION_RATE * missing)
+    return found, reached
 
 
 def max_scale(config: TrainConfig, extent: float) -> float:

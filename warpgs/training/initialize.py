@@ -1,6 +1,7 @@
 """The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 
 from .dynamic_points import max_scale, unproject_pixels
-from .motion_fit import MAX_POINTS, MAX_POINTS_PER_VIEW, fit_motion
+from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
@@ -68,25 +69,30 @@ def dynamic_gaussians(
     alignments: Float[Tensor, "T 2"],
     deformation: nn.Module,
     generator: torch.Generator,
-) -> Gaussians:
+    is_stopped: Callable[[], bool] = bool,
+) -> Gaussians | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation is fitted.
 
     Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
     points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
-    points. If nothing is dynamic, there are none. What was tracked starts on its tracks.
+    points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The result is
+    None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
     """
     max_count, degree, steps = config.model.dynamic_points, config.model.sh_degree, config.schedule.fit_motion
     if isinstance(deformation, SplineDeformation):
         return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return gaussians_at(*_colored_points(config, capture, generator), degree)
-    count = min(MAX_POINTS, MAX_POINTS_PER_VIEW * len(views)) if steps else max_count
+    count = max(max_count, MAX_POINTS) if steps else max_count
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return Gaussians.empty(0, degree)
     if steps and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train])
-        found = fit_motion(deformation, found, times, capture.extent, steps, generator)
+        fitted = fit_motion(deformation, found, times, capture.extent, steps, generator, is_stopped)
+        if fitted is None:
+            return None
+        found = fitted
     found = found.chosen(subsample(found.positions, max_count, generator))
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:

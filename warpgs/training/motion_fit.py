@@ -1,19 +1,23 @@
 """A deformation that follows what moves before any image is compared.
 
-Dynamic Gaussians of all frames form one set in canonical space. A network that starts as "no change" has to carry those
+Dynamic Gaussians of all frames form one set in canonical space. A network that starts as "no change" has to move those
 of every frame to where things are in all others. While it learns that, images pull Gaussians of one object onto another
 one, and no image brings them back: the object that they showed stays lost. So the network is fitted to the dynamic
 points of all frames first.
 """
 
+import copy
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from .dynamic_points import DynamicPoints
+from .dynamic_points import PIXELS_PER_CHUNK, DynamicPoints, to_canonical
+from .point_cloud import subsample
 
 MAX_POINTS, MAX_POINTS_PER_VIEW = 40_000, 2_000
-"""Maximum number of dynamic points of all frames together, and of one frame in the mean."""
+"""Maximum number of dynamic points of all frames together, and of those in one frame that the fit compares."""
 
 WINDOW = 0.015
 """Largest difference in time, of all in [0, 1], between frames that together give the canonical points."""
@@ -29,8 +33,8 @@ HIDDEN_WEIGHT = 0.3
 relative to those of the frame's points to the nearest canonical ones."""
 
 GROWTH = 0.6
-"""Fraction of the iterations after which all frames take part. They enter by their distance in time from the canonical
-points, so that each is close to its solution when it enters."""
+"""Fraction of the steps after which all frames are compared. They follow by their distance in time from the canonical
+points, so that each is close to its solution when it is first compared."""
 
 LEARNING_RATE = 1e-3
 """Rate of Adam."""
@@ -44,70 +48,95 @@ def fit_motion(
     found: DynamicPoints,
     times: Float[Tensor, " T"],
     extent: float,
-    num_iterations: int,
+    num_steps: int,
     generator: torch.Generator,
-) -> DynamicPoints:
+    is_stopped: Callable[[], bool] = bool,
+) -> DynamicPoints | None:
     """Fits a deformation to dynamic points, and moves these to canonical space.
 
-    The points of the frames around one time are the canonical ones. The deformation carries them to the time of each
-    other frame, and the distances between them and the points of that frame are minimized.
+    The points of the frames around one time are the canonical ones. They are deformed to the time of each other frame,
+    and the distances between them and the points of that frame are minimized.
 
     Args:
-        deformation: As ``fields.FIELDS`` says; its parameters are changed.
+        deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
         extent: Extent of the capture [scene units].
-        num_iterations: Number of steps of Adam, each on the points of one frame.
+        num_steps: Number of steps of Adam, each on the points of one frame.
         generator: CPU generator that chooses the frames.
+        is_stopped: Asked after each step whether to stop.
 
     Returns:
-        Those of the points that the deformation carries to where they were seen, at their canonical positions.
+        Those of the points that are deformed to where they were seen, at their canonical positions; None, and the
+        deformation as it was, if stopped.
     """
-    clouds = _Clouds(found, times, extent, next(deformation.parameters()).device)
-    trained = [parameter.requires_grad for parameter in deformation.parameters()]
-    optimizer = torch.optim.Adam(deformation.requires_grad_(True).parameters(), LEARNING_RATE)
-    for iteration in range(num_iterations):
-        view = clouds.draw(iteration / (GROWTH * num_iterations), generator)
-        with torch.enable_grad():
-            _distance(clouds.moved(deformation, view), clouds.seen[view]).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-    for parameter, is_trained in zip(deformation.parameters(), trained, strict=True):
-        parameter.requires_grad_(is_trained)
-    return clouds.canonical(deformation, found)
+    fitted = copy.deepcopy(deformation).requires_grad_(True)
+    parameters = list(fitted.parameters())
+    if not parameters:
+        return found
+    points = _PointsByView(found, times, extent, parameters[0].device, generator)
+    optimizer = torch.optim.Adam(parameters, LEARNING_RATE)
+    for step in range(num_steps):
+        _take_step(fitted, points, points.choose_view(step / (GROWTH * num_steps), generator), optimizer)
+        if is_stopped():
+            return None
+    deformation.load_state_dict(fitted.state_dict())
+    return points.canonical(deformation, found)
 
 
-class _Clouds:
-    """Dynamic points by view, as features: positions and colours in the units in which they are compared.
+@torch.enable_grad()
+def _take_step(deformation: nn.Module, points: "_PointsByView", view: int, optimizer: torch.optim.Adam) -> None:
+    """Fits the deformation a little better to the points of a view."""
+    _distance(points.deformed(deformation, view), points.seen[view]).backward()
+    optimizer.step()
+    optimizer.zero_grad()
+
+
+class _PointsByView:
+    """Dynamic points as features: positions and colours in the units in which they are compared.
 
     Attributes:
         extent: Extent of the capture [scene units].
         unit: Difference of positions that counts as 1 [scene units].
         times: [T, 1] times of all views.
-        seen: [P, 6] features by view.
-        home: [H, 6] features of the canonical points.
+        seen: By view, [P, 6] features of its points, at most ``MAX_POINTS_PER_VIEW``.
+        home: [H, 6] features of the canonical points, likewise.
         order: Views by their distance in time from the canonical points.
         gaps: [V] these distances.
     """
 
-    def __init__(self, found: DynamicPoints, times: Float[Tensor, " T"], extent: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        found: DynamicPoints,
+        times: Float[Tensor, " T"],
+        extent: float,
+        device: torch.device,
+        generator: torch.Generator,
+    ) -> None:
         self.extent, self.unit = extent, POSITION_UNIT * extent
-        features = torch.cat([found.positions / self.unit, found.colors / COLOR_UNIT], 1).to(device)
+        features = self._features(found)
         views, counts = found.views.unique(return_counts=True)
         start = _start_time(times[views], counts)
         self.times = times[:, None].to(device)
-        self.seen = {view: features[(found.views == view).to(device)] for view in views.tolist()}
-        gaps = (times[views] - start).abs()
-        self.home = torch.cat([self.seen[view] for view in views[gaps <= WINDOW].tolist()])
-        self.gaps, order = gaps.sort(stable=True)
+
+        def some(chosen: Bool[Tensor, " S"]) -> Float[Tensor, "P 6"]:
+            indices = chosen.nonzero()[:, 0]
+            return features[indices[subsample(indices, MAX_POINTS_PER_VIEW, generator)]].to(device)
+
+        self.seen = {view: some(found.views == view) for view in views.tolist()}
+        self.home = some((times[found.views] - start).abs() <= WINDOW)
+        self.gaps, order = (times[views] - start).abs().sort(stable=True)
         self.order = views[order].tolist()
 
-    def draw(self, progress: float, generator: torch.Generator) -> int:
-        """A random view among those that take part when a fraction of all has entered."""
+    def _features(self, points: DynamicPoints) -> Float[Tensor, "S 6"]:
+        return torch.cat([points.positions / self.unit, points.colors / COLOR_UNIT], 1)
+
+    def choose_view(self, progress: float, generator: torch.Generator) -> int:
+        """A random view among those that are compared when a fraction of the way to the farthest one is done."""
         count = int((self.gaps <= progress * self.gaps[-1]).sum())
         return self.order[int(torch.randint(count, (), generator=generator))]
 
-    def moved(self, deformation: nn.Module, view: int) -> Float[Tensor, "H 6"]:
+    def deformed(self, deformation: nn.Module, view: int) -> Float[Tensor, "H 6"]:
         """Features of the canonical points at the time of a view."""
         positions, colors = self.home.split(3, 1)
         offsets = deformation(positions * self.unit, self.times[view])[:, :3]
@@ -115,16 +144,25 @@ class _Clouds:
 
     @torch.no_grad()
     def canonical(self, deformation: nn.Module, found: DynamicPoints) -> DynamicPoints:
-        """The points that the deformation reaches, each moved as the canonical point next to it."""
+        """The points that are deformed to where they were seen, at canonical positions.
+
+        Those of a thing that the canonical points show stay beside one of these: found elsewhere, they would move with
+        another thing.
+        """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
-        for view, seen in self.seen.items():
-            moved = self.moved(deformation, view)
-            nearest = torch.cdist(seen, moved).argmin(1)
-            home = (self.home[nearest] - moved[nearest] + seen)[:, :3] * self.unit
-            errors = home + deformation(home, self.times[view])[:, :3] - seen[:, :3] * self.unit
-            chosen = found.views == view
-            positions[chosen] = home.cpu()
-            kept[chosen] = (errors.norm(dim=1) <= MAX_ERROR * self.extent).cpu()
+        largest = MAX_ERROR * self.extent
+        for view in self.seen:
+            deformed = self.deformed(deformation, view)
+            for part in (found.views == view).nonzero()[:, 0].split(PIXELS_PER_CHUNK):
+                seen = self._features(found.chosen(part)).to(deformed.device)
+                distances, nearest = torch.cdist(seen, deformed).min(1)
+                is_shown = distances.square() <= MAX_SQUARED_DISTANCE
+                goal = seen[:, :3] * self.unit
+                beside = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
+                start = torch.where(is_shown[:, None], beside, goal)
+                moved, reached = to_canonical(deformation, goal, self.times[view], start, largest)
+                reached &= ~is_shown | ((moved - start).norm(dim=1) <= largest)
+                positions[part], kept[part] = moved.cpu(), reached.cpu()
         return found._replace(positions=positions).chosen(kept)
 
 
@@ -135,13 +173,13 @@ def _start_time(times: Float[Tensor, " V"], counts: Int64[Tensor, " V"]) -> floa
     return float(times[middle[counts[middle].argmax()]])
 
 
-def _distance(moved: Float[Tensor, "H 6"], seen: Float[Tensor, "P 6"]) -> Float[Tensor, ""]:
+def _distance(deformed: Float[Tensor, "H 6"], seen: Float[Tensor, "P 6"]) -> Float[Tensor, ""]:
     """Robust mean of the squared distances between points, in both directions."""
     with torch.no_grad():
-        distances = torch.cdist(moved, seen)
-        to_moved, to_seen = distances.argmin(0), distances.argmin(1)
-    found = (moved[to_moved] - seen).square().sum(1)
-    hidden = (moved - seen[to_seen]).square().sum(1)
+        distances = torch.cdist(deformed, seen)
+        to_deformed, to_seen = distances.argmin(0), distances.argmin(1)
+    found = (deformed[to_deformed] - seen).square().sum(1)
+    hidden = (deformed - seen[to_seen]).square().sum(1)
     return _robust(found).mean() + HIDDEN_WEIGHT * _robust(hidden).mean()
 
 

@@ -15,7 +15,7 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 
-from .dynamic_points import DynamicPoints, max_scale
+from .dynamic_points import DynamicPoints, max_scale, to_canonical
 from .point_cloud import gaussians_at
 from .schedule import Phase
 from .views import View, Views
@@ -23,9 +23,6 @@ from .views import View, Views
 MAX_LOST_ALPHA = 0.1
 """Alpha of the dynamic image below which a dynamic pixel counts as lost; opacities that were just reset are above it
 where Gaussians overlap."""
-
-INVERSION_STEPS = 8
-"""Fixed-point iterations with which the deformation is inverted."""
 
 MAX_INVERSION_ERROR = 0.01
 """Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
@@ -67,12 +64,11 @@ def gaussians_that_show(
 ) -> Gaussians:
     """Dynamic Gaussians that the network deforms to points, each at the time of its view.
 
-    Their canonical positions x solve x + d(x, t) = p. Points at which the iteration does not come within
-    ``MAX_INVERSION_ERROR`` are dropped.
+    Points that the deformation cannot be inverted at to within ``MAX_INVERSION_ERROR`` are dropped.
 
     Args:
-        found: The points p.
-        scene: Its deformation network d must be in use.
+        found: The points.
+        scene: Its deformation must be in use.
         views: The views of the points.
         config: Degree of spherical harmonics and limits of size.
         extent: Extent of the capture [scene units].
@@ -81,10 +77,7 @@ def gaussians_that_show(
     for index in found.views.unique().tolist():
         chosen = found.views == index
         seen, time = found.positions[chosen].to(views.device), views[index].time
-        x = seen
-        for _ in range(INVERSION_STEPS):
-            x = seen - scene.deformation(x, time)[:, :3]
-        errors = (x + scene.deformation(x, time)[:, :3] - seen).norm(dim=1)
-        canonical[chosen], kept[chosen] = x.cpu(), (errors <= MAX_INVERSION_ERROR * extent).cpu()
+        x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * extent)
+        canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
     largest = max_scale(config, extent)
     return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, largest)

@@ -121,8 +121,9 @@ class Trainer:
         if self.iteration == 0:
             self.save()
         while self.iteration < self.protocol.num_iterations:
-            if self.iteration == self.protocol.stage1.start:
-                self._add_dynamic_gaussians()
+            if self.iteration == self.protocol.stage1.start and not self._add_dynamic_gaussians(interrupt):
+                self.save()
+                return False
             plan = self.protocol.at(self.iteration)
             self.step(plan, self._sample(plan))
             if plan.adapts:
@@ -229,12 +230,18 @@ class Trainer:
                 f"{len(added):,} added there"
             )
 
-    def _add_dynamic_gaussians(self) -> None:
-        """Adds the dynamic Gaussians at the start of stage I, when depth is aligned."""
+    def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None) -> bool:
+        """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
-        self.scene.dynamic = initialize.dynamic_gaussians(*sources, self._generator("dynamic"))
+        found = initialize.dynamic_gaussians(
+            *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
+        )
+        if ranks.any_rank(found is None) or found is None:
+            return False
+        self.scene.dynamic = found
         self._start_from(self.scene)
+        return True
 
     # Randomness -------------------------------------------------------------------------------------------------------
 
