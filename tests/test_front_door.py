@@ -1,6 +1,7 @@
 """``import warpgs``, ``python -m warpgs`` and ``warpgs --help``: public, typed, and quick to start."""
 
 import importlib.metadata
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -74,6 +75,37 @@ def test_train_is_a_command_and_a_script():
     by_command, by_script = run("-m", "warpgs", "train", "--help"), run(str(script), "--help")
     assert by_command.returncode == by_script.returncode == 0
     assert by_command.stdout.replace("warpgs train", "train.py").split() == by_script.stdout.split()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "prepare video capture",
+        "prepare capture --add masks",
+        "sample video.mp4",
+        "import source capture",
+        "check capture",
+        "train",
+        "sweep ablation",
+        "eval run",
+        "view run",
+        "render run",
+        "export run",
+        "report run",
+        "bench",
+    ],
+)
+def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_and_130(command, tmp_path):
+    """As numpy and torch do, whose imports turn it into other errors."""
+    swallow = (
+        "import os\nimport signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nexcept BaseException:\n    pass\n"
+    )
+    for package in ("numpy", "torch"):
+        (tmp_path / f"{package}.py").write_text(swallow)
+    path = os.pathsep.join([str(tmp_path), str(Path(warpgs.__file__).parents[1])])
+    program = [sys.executable, "-m", "warpgs", *command.split()]
+    ended = subprocess.run(program, capture_output=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, b"", b"warpgs: stopped\n")
 
 
 def test_a_command_refuses_wrong_input_in_one_line(tmp_path):

@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from .errors import FAILED, program, run_command, visible
+from .errors import FAILED, ending_at_once, program, run_command, visible
 from .version import version
 
 
@@ -73,9 +73,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     if name == "train":
         return train(rest, "warpgs train")
-    from .command_line import parse  # imports tyro
+    with ending_at_once():
+        from .command_line import parse  # imports tyro
 
-    options = parse(COMMANDS[name].load(), rest, f"warpgs {name}")
+        home = COMMANDS[name].load()
+    options = parse(home, rest, f"warpgs {name}")
     return run_command(options.run)
 
 
@@ -84,10 +86,11 @@ def train(arguments: Sequence[str], prog: str) -> int:
     """``warpgs train`` and ``train.py``: trains, then evaluates; returns the exit code."""
     if "--version" in arguments:
         return main(["--version"])
-    from .command_line import described, one_line_errors
-    from .training import command as training
+    with ending_at_once(prog):
+        from .command_line import described, one_line_errors
+        from .training import command as training
 
-    config = COMMANDS["train"].load()
+        config = COMMANDS["train"].load()
     help_all = "--help-all" in arguments
     if not help_all and not {"-h", "--help"} & set(arguments):
 

@@ -1,10 +1,14 @@
 """Errors of commands: one line on stderr and an exit code."""
 
+import contextlib
 import functools
 import io
 import os
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import ParamSpec
 
 P = ParamSpec("P")
@@ -58,6 +62,33 @@ def _is_output_closed() -> bool:
     except BrokenPipeError:
         return True
     return False
+
+
+@contextlib.contextmanager
+def ending_at_once(prog: str = "warpgs") -> Iterator[None]:
+    """While it lasts, Ctrl-C ends the process with one line and ``INTERRUPTED``, and runs nothing else of it.
+
+    For imports: a KeyboardInterrupt in the middle of one is swallowed by some packages, and others turn it into an
+    ImportError or a RecursionError. Where Ctrl-C is ignored or handled already, and outside of the main thread, which
+    alone handles it, it does nothing.
+
+    Args:
+        prog: Name of the program, which the line starts with.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, f"{prog}: stopped\n".encode())
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def program(main: Callable[P, int]) -> Callable[P, int]:

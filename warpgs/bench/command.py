@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.errors import ending_at_once
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -37,7 +39,7 @@ class Bench:
 
     def run(self) -> None:
         """Measures and prints the results; raises as ``run_bench``."""
-        from .run_bench import run_bench
-
+        with ending_at_once():
+            from .run_bench import run_bench
         for path in run_bench(self):
             print(f"wrote {path}")

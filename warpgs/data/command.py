@@ -7,6 +7,8 @@ from typing import Annotated
 
 import tyro
 
+from warpgs.errors import ending_at_once
+
 
 @dataclass(frozen=True)
 class Check:
@@ -28,8 +30,8 @@ class Check:
         Raises:
             SystemExit: With code 1 if the capture is not fit to train on.
         """
-        from .check import check_capture
-
+        with ending_at_once():
+            from .check import check_capture
         report = check_capture(self.capture, self.dataset, self.factor)
         print(json.dumps(report.plain(), indent=2) if self.as_json else report)
         if not report.is_fit:
@@ -54,7 +56,7 @@ class Import:
     """Print errors only."""
 
     def run(self) -> None:
-        from .import_capture import import_capture
-
+        with ending_at_once():
+            from .import_capture import import_capture
         log = None if self.quiet else print
         import_capture(self.source, self.capture, self.dataset, factor=self.factor, holdout=self.holdout, log=log)

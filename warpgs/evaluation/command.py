@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.config import NetName
+from warpgs.errors import ending_at_once
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,10 @@ class Eval:
 
     def run(self) -> None:
         """Evaluates and prints a summary; raises as ``evaluate_run``."""
-        from warpgs.runs.run import Run
+        with ending_at_once():
+            from warpgs.runs.run import Run
 
-        from .evaluate_run import evaluate_run
-
+            from .evaluate_run import evaluate_run
         weights, capture = (self.lpips, self.lpips_net), None
         if self.data is not None:
             capture = Run.open(self.run_folder, self.device, self.data).open_capture(self.quiet)

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import ending_at_once
+
 
 @dataclass(frozen=True)
 class Export:
@@ -45,6 +47,6 @@ class Export:
 
     def run(self) -> None:
         """Exports and prints a summary; raises as ``export_run``."""
-        from .export_run import export_run
-
+        with ending_at_once():
+            from .export_run import export_run
         print(export_run(self))

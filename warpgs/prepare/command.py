@@ -11,6 +11,8 @@ from typing import Annotated
 
 import tyro
 
+from warpgs.errors import ending_at_once
+
 from .options import CameraMotion, LensModel, Options, Selection
 
 USED_BY_ADD = ("source", "add", "masks", "depth", "weights", "quiet")
@@ -67,15 +69,15 @@ class Prepare:
     def run(self) -> None:
         log = None if self.quiet else partial(print, flush=True)
         if self.add is not None:
-            from .add import AddOptions, add_parts
-
+            with ending_at_once():
+                from .add import AddOptions, add_parts
             self._check_alone()
             add_parts(self.source, AddOptions(self.add.split(","), self.masks, self.depth or "flow", self.weights), log)
             return
         if self.capture is None:
             raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
-        from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
-
+        with ending_at_once():
+            from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
         selection = Selection(self.fps, self.count, self.longest_side, self.start, self.end)
         names = (field.name for field in fields(Options) if field.name != "selection")
         options = Options(selection, **{name: getattr(self, name) for name in names})
@@ -106,8 +108,8 @@ class Sample:
     """Print errors only."""
 
     def run(self) -> None:
-        from .sample import write_sample  # imports torch and Warp
-
+        with ending_at_once():
+            from .sample import write_sample  # imports torch and Warp
         write_sample(self.video, quiet=self.quiet)
         if not self.quiet:
             print(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")

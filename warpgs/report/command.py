@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import ending_at_once
+
 
 @dataclass(frozen=True)
 class Report:
@@ -27,6 +29,6 @@ class Report:
 
     def run(self) -> None:
         """Writes the report and prints a summary; raises as ``write_report``."""
-        from .write_report import write_report
-
+        with ending_at_once():
+            from .write_report import write_report
         print(write_report(self))

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.config import NetName
+from warpgs.errors import ending_at_once
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,6 @@ class Sweep:
 
     def run(self) -> int:
         """Trains and prints the tables; returns the exit code; raises as ``run_sweep``."""
-        from .run_sweep import run_sweep
-
+        with ending_at_once():
+            from .run_sweep import run_sweep
         return run_sweep(self, print)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 from warpgs.config import TrainConfig
-from warpgs.errors import run_command
+from warpgs.errors import ending_at_once, run_command
 from warpgs.presets import PRESETS
 
 ADVICE = (
@@ -54,8 +54,8 @@ def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
 
 def run(config: TrainConfig) -> int:
     """Trains, then evaluates, and prints what happens; returns the exit code."""
-    from .train import UnfitCaptureError, train  # imports torch, which --help does not need
-
+    with ending_at_once():
+        from .train import UnfitCaptureError, train  # imports torch, which --help does not need
     try:
         train(config, log=print)
     except UnfitCaptureError as error:

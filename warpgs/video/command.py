@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import ending_at_once
+
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
 
 MAX_SIDE = 16_384
@@ -57,8 +59,8 @@ class Render:
 
     def run(self) -> None:
         """Renders and prints a summary; raises as ``render_run``."""
-        from .render_run import render_run
-
+        with ending_at_once():
+            from .render_run import render_run
         print(render_run(self))
 
     @property

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import ending_at_once
 from warpgs.posix import share_free_memory
 
 
@@ -29,6 +30,6 @@ class View:
     def run(self) -> None:
         """Serves until Ctrl-C; raises as ``serve``."""
         share_free_memory()  # before there are threads, of which every visit has some of its own
-        from .serve import serve
-
+        with ending_at_once():
+            from .serve import serve
         serve(self, report=partial(print, flush=True), warn=partial(print, file=sys.stderr))
