@@ -114,7 +114,14 @@ def test_importing_errors_imports_no_torch():
 
 @pytest.mark.parametrize(
     ("arguments", "unbuffered"),
-    [(["--help"], ""), (["--help"], "1"), (["train", "--help"], ""), (["--tyro-print-completion", "bash"], "")],
+    [
+        (["--help"], ""),
+        (["--help"], "1"),
+        (["train", "--help"], ""),
+        (["train", "--help-all"], ""),
+        (["train", "--help-all"], "1"),
+        (["--tyro-print-completion", "bash"], ""),
+    ],
 )
 def test_output_that_nobody_reads_is_no_error(arguments, unbuffered):
     """As of ``warpgs --help | head``."""

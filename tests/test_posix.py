@@ -51,12 +51,14 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask")
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.delattr(posix.ctypes, "CDLL")
+    monkeypatch.delattr(posix.select, "poll")
     posix.lower_priority(10)
     posix.unblock_interrupts()
     posix.share_free_memory()
     posix.release_free_memory()
     assert posix.end_with_parent(os.getppid())
     assert not posix.end_with_parent(-1)
+    assert not posix.is_closed_pipe(1)
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         posix.interrupt(child)
     assert child.returncode == -signal.SIGTERM
@@ -71,3 +73,11 @@ def test_free_memory_is_shared_and_returned_only_by_the_c_library_that_can(monke
         posix.share_free_memory()
         posix.release_free_memory()
     assert calls == [(posix.M_ARENA_MAX, 1), 0]
+
+
+def test_a_pipe_is_closed_when_its_reader_is():
+    reader, writer = os.pipe()
+    assert not posix.is_closed_pipe(writer)
+    os.close(reader)
+    assert posix.is_closed_pipe(writer)
+    os.close(writer)

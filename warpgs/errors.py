@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import ParamSpec
 
+from . import posix
+
 P = ParamSpec("P")
 
 FAILED = 2
@@ -56,12 +58,18 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
 
 
 def _is_output_closed() -> bool:
-    """Whether nobody reads standard output any more; what could not be written is still in its buffer."""
+    """Whether nobody reads standard output any more.
+
+    What could not be written may still be in its buffer, so that flushing fails again, or may be lost; then the pipe is
+    asked.
+    """
     try:
         sys.stdout.flush()
+        return posix.is_closed_pipe(sys.stdout.fileno())
     except BrokenPipeError:
         return True
-    return False
+    except OSError:  # no file, as in notebooks and tests
+        return False
 
 
 @contextlib.contextmanager

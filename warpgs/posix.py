@@ -5,6 +5,7 @@ The linter refuses such calls in all other modules.
 
 import ctypes
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -62,3 +63,16 @@ def unblock_interrupts() -> None:
     """Lets SIGINT arrive, which a child inherits blocked from a parent that blocks it; not on Windows."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
+
+def is_closed_pipe(file: int) -> bool:
+    """Whether an open file is a pipe that nobody reads any more; False on Windows, which cannot tell.
+
+    Args:
+        file: File descriptor of the end that is written to.
+    """
+    if not hasattr(select, "poll"):
+        return False
+    asked = select.poll()
+    asked.register(file, select.POLLOUT)
+    return any(event & select.POLLERR for _, event in asked.poll(0))
