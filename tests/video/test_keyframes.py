@@ -90,7 +90,7 @@ def test_a_single_keyframe_gives_a_constant_path(path):
         ({}, "must have either a view, or a position and a target, or a viewmat"),
         ({"view": "0", "position": [0, 0, 0], "target": [0, 0, 1], "time": 0}, "must have either a view"),
         ({"position": [0, 0, 0], "time": 0}, "must have either a view"),
-        ({"view": "9", "time": 0}, "test has no view '9'"),
+        ({"view": "9", "time": 0}, "test has no view '9'; its first is 0$"),
         ({"view": ["0"], "time": 0}, r"test has no view \['0'\]"),
         ({"view": "0"}, "time must be a number, got None"),
         ({"view": "0", "time": "0"}, "time must be a number, got '0'"),

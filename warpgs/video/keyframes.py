@@ -154,7 +154,9 @@ def _posed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Ca
     if "view" in value:
         view = value["view"]
         if not isinstance(view, str) or view not in capture.cameras:
-            raise ValueError(f"{name}: {capture.name} has no view {reprlib.repr(view)}")
+            raise ValueError(
+                f"{name}: {capture.name} has no view {reprlib.repr(view)}; its first is {capture.train[0]}"
+            )
         return capture.cameras[view]
     if "viewmat" in value:
         return _from_matrices(name, value, first)
