@@ -109,6 +109,14 @@ def test_positional_arguments_have_names(command, metavars, capsys):
             "warpgs render: --layers must be one of all, alpha, depth, dynamic, joint, static, got ",
         ),
         (
+            ["train", "--factor", "2", "capture"],
+            "warpgs train: unrecognized options: capture; a capture is given by --data capture\n",
+        ),
+        (
+            ["train", "--dataset", "nerfds"],
+            "warpgs train: --dataset says how the capture of --data is read: add --data",
+        ),
+        (
             ["train", "--resume", "r", "--seed", "1"],
             "warpgs train: --resume takes all but --data, --device, --iterations and --lpips from",
         ),

@@ -27,7 +27,7 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     The default preset is ``quick`` for the built-in scene and ``best`` for captures.
 
     Raises:
-        ValueError: If a run is resumed with other options.
+        ValueError: If a run is resumed with other options, or a capture or its layout is given in a wrong way.
     """
     options = {argument.split("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")}
     if "--resume" in options and (others := sorted(options - RESUMING)):
@@ -35,12 +35,19 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
             "--resume takes all but --data, --device, --iterations and --lpips from the run's config.json: omit "
             f"{others[0]}"
         )
+    if "--dataset" in options and not options & {"--data", "--help"}:
+        raise ValueError("--dataset says how the capture of --data is read: add --data CAPTURE")
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", choices=list(PRESETS))
     first.add_argument("--data")
     known, _ = first.parse_known_args(list(arguments))
     preset = known.preset or ("best" if known.data else "quick")
-    return tyro.cli(TrainConfig, default=PRESETS[preset], args=list(arguments), prog=prog)
+    default = PRESETS[preset]
+    config, unknown = tyro.cli(TrainConfig, default=default, args=list(arguments), prog=prog, return_unknown_args=True)
+    if unknown:
+        advice = "" if unknown[0].startswith("-") else f"; a capture is given by --data {unknown[0]}"
+        raise ValueError(f"unrecognized options: {', '.join(unknown)}{advice}")
+    return config
 
 
 def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
