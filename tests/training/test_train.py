@@ -276,6 +276,15 @@ def test_train_logs_its_folder_and_the_metrics(config):
     assert any("PSNR" in line for line in lines)
 
 
+@pytest.mark.parametrize(("preset", "is_slow"), [("best", True), ("paper", True), ("patient", False), (None, False)])
+def test_a_preset_for_a_gpu_says_so_on_the_cpu(config, preset, is_slow, monkeypatch):
+    monkeypatch.setattr(script, "_train", lambda *arguments, **options: None)
+    monkeypatch.setattr(script, "_evaluate", lambda *arguments: None)
+    lines = []
+    warpgs.train(dataclasses.replace(config, preset=preset), log=lines.append)
+    assert any(f"the preset {preset} is for a GPU" in line for line in lines) == is_slow
+
+
 def test_without_depth_training_says_so_and_needs_no_pretraining(config):
     lines = []
     warpgs.train(dataclasses.replace(config, depth=False), log=lines.append)

@@ -28,6 +28,10 @@ from .trainer import Trainer
 Log = Callable[[str], None]
 """Receives lines for the user, such as ``print``."""
 
+CPU_ADVICE = (
+    "the preset {} is for a GPU; on two CPU cores, --preset patient --factor 2 takes 10 to 20 minutes, and quick 3"
+)
+
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 
 
@@ -91,6 +95,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         log = log if is_first else None
         trainer = make_trainer(config, log)
         _describe(trainer, log or _ignore)
+        _advise(config, trainer, log or _ignore)
         is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
         _train(trainer, is_changed, callbacks, quiet=log is None)
     if is_first:
@@ -155,6 +160,12 @@ def _describe(trainer: Trainer, log: Log) -> None:
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
         log(f"depth of moving objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
+
+
+def _advise(config: TrainConfig, trainer: Trainer, log: Log) -> None:
+    """Logs what speaks for other options: a preset that is slow on the CPU."""
+    if config.resume is None and trainer.config.device == "cpu" and config.preset in ("best", "paper"):
+        log(CPU_ADVICE.format(config.preset))
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
