@@ -296,6 +296,23 @@ def test_train_resumes_with_the_config_of_the_run(config):
     assert warpgs.train(TrainConfig(resume=config.out)).config.schedule == config.schedule
 
 
+def test_a_finished_run_that_is_resumed_says_so(config):
+    lines = []
+    warpgs.train(config, log=lines.append)
+    assert not any("is finished" in line for line in lines)
+    warpgs.train(TrainConfig(resume=config.out), log=lines.append)
+    assert f"training is finished ({tiny.LENGTH} iterations), and the run is evaluated again" in "\n".join(lines)
+
+
+def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(script, "evaluate_run", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=f"run it with warpgs eval {config.out}$"):
+        warpgs.train(config)
+
+
 def test_train_raises_on_an_unknown_dataset_or_model(config):
     for changes in ({"dataset": "imaginary"}, {"model": dataclasses.replace(tiny.MODEL, deformation="imaginary")}):
         with pytest.raises(ValueError, match="imaginary"):

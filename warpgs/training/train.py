@@ -32,6 +32,8 @@ CPU_ADVICE = (
     "the preset {} is for a GPU; on two CPU cores, --preset patient --factor 2 takes 10 to 20 minutes, and quick 3"
 )
 
+FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
+
 NO_DEPTH = ": training without depth, and without the pretraining that needs it"
 
 
@@ -104,12 +106,17 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
 
 
 def _evaluate(trainer: Trainer, log: Log | None) -> None:
-    """Evaluates what was trained and logs the results."""
+    """Evaluates what was trained and logs the results; a KeyboardInterrupt says how to evaluate later."""
     quiet, log = log is None, log or _ignore
     if trainer.views.poses is not None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
-    log(evaluate_run(trainer.run, capture, device=trainer.config.device, quiet=quiet))
+    try:
+        log(evaluate_run(trainer.run, capture, device=trainer.config.device, quiet=quiet))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"training is done, evaluation stopped; run it with warpgs eval {trainer.run}"
+        ) from None
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 
 
@@ -163,9 +170,11 @@ def _describe(trainer: Trainer, log: Log) -> None:
 
 
 def _advise(config: TrainConfig, trainer: Trainer, log: Log) -> None:
-    """Logs what speaks for other options: a preset that is slow on the CPU."""
+    """Logs what speaks for other options: a preset that is slow on the CPU, a run that is finished already."""
     if config.resume is None and trainer.config.device == "cpu" and config.preset in ("best", "paper"):
         log(CPU_ADVICE.format(config.preset))
+    if config.resume is not None and trainer.iteration == trainer.protocol.num_iterations:
+        log(FINISHED.format(trainer.iteration))
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
