@@ -80,6 +80,7 @@ def test_a_run_ends_with_a_summary_of_its_metrics(finished):
     assert run.returncode == 0, run.stderr
     assert "PSNR" in run.stdout
     assert "LPIPS not measured" in run.stdout
+    assert "MS-SSIM not measured (a side is below 161 px)" in run.stdout
 
 
 def test_a_run_says_how_far_its_depth_can_be_trusted(finished):

@@ -20,6 +20,7 @@ from warpgs.video.writer import Video
 
 from .evaluate import OnView, evaluate, write_views
 from .lpips import find
+from .metrics import MIN_MS_SSIM_SIDE
 from .motion import jitter
 from .poses import alignment
 
@@ -122,6 +123,8 @@ def _summary(values: dict[str, Any]) -> str:
     if values["lpips_net"] is None:
         lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
     similarity = f"SSIM {show('ssim', 4)}, MS-SSIM {show('ms_ssim', 4)}"
+    if values["ms_ssim"] is None:
+        similarity += f" (a side is below {MIN_MS_SSIM_SIDE} px)"
     lines = [
         f"{values['num_views']} views: PSNR {show('psnr', 2, ' dB')}, {similarity}, {lpips}",
         f"static region {show('psnr_static', 2, ' dB')}, dynamic region {show('psnr_dynamic', 2, ' dB')}, {motion}",
