@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import pytest
 
 import warpgs
+from warpgs import version
 from warpgs.cli import COMMANDS
 
 HEAVY = {"torch", "warp", "cv2", "pycolmap", "viser", "scipy", "skimage", "av", "tensorboard"}
@@ -58,6 +59,13 @@ def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
     missing = Mock(side_effect=importlib.metadata.PackageNotFoundError)
     monkeypatch.setattr(importlib.metadata.Distribution, "from_name", missing)
     assert warpgs.__version__ == "0+unknown"
+
+
+def test_an_extra_comes_from_the_checkout_or_from_the_index(monkeypatch, tmp_path):
+    checkout = Path(version.__file__).parents[1]
+    assert version.install_command("viewer") == f"pip install -e '{checkout}[viewer]'"
+    monkeypatch.setattr(version, "__file__", str(tmp_path / "warpgs" / "version.py"))
+    assert version.install_command("viewer") == "pip install 'warpgs[viewer]'"
 
 
 def test_the_package_is_typed():

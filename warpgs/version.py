@@ -1,4 +1,6 @@
-"""The version of the package."""
+"""How the package is installed: its version, and where its extras come from."""
+
+from pathlib import Path
 
 
 def version() -> str:
@@ -9,3 +11,11 @@ def version() -> str:
         return metadata.version("warpgs")
     except metadata.PackageNotFoundError:
         return "0+unknown"
+
+
+def install_command(extra: str) -> str:
+    """How to install an extra of the package: from the checkout that it runs from, or else from the package index."""
+    checkout = Path(__file__).parents[1]
+    if (checkout / "pyproject.toml").exists():
+        return f"pip install -e '{checkout}[{extra}]'"
+    return f"pip install 'warpgs[{extra}]'"

@@ -16,6 +16,7 @@ from warpgs.prepare.depth_anything import network_size, predict
 from warpgs.prepare.networks import load, normalized
 from warpgs.prepare.sam2 import choose_prompts, track
 from warpgs.prepare.weights import DEPTH_ANYTHING, SAM2, find_weights
+from warpgs.version import install_command
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 
@@ -96,7 +97,7 @@ def test_the_error_without_the_package_says_what_to_install(tmp_path, capsys, mo
         assert main(["prepare", str(shots), str(tmp_path / "capture"), *options]) == 2
         written = capsys.readouterr().err
         assert written.count("\n") == 1
-        assert f"{' '.join(options)} needs the package transformers: pip install 'warpgs[networks]'" in written
+        assert f"{' '.join(options)} needs the package transformers: {install_command('networks')}" in written
     assert not (tmp_path / "capture").exists()
 
 

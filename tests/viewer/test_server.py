@@ -18,6 +18,7 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs
 from tests.campaign.browser import Browser
 from tests.viewer import watched
 from warpgs.cli import main
+from warpgs.version import install_command
 from warpgs.viewer import serve, server
 from warpgs.viewer.command import View
 from warpgs.viewer.renderer import Renderer
@@ -188,7 +189,7 @@ def test_an_invalid_port_is_refused_in_one_line(run, capsys, port):
 
 def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert "pip install 'warpgs[viewer]'" in error_line(capsys, run)
+    assert f"the viewer needs viser: {install_command('viewer')}" in error_line(capsys, run)
 
 
 def test_a_folder_that_is_not_a_run_is_refused_in_one_line(tmp_path, capsys):

@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from warpgs.files import read_json, require_file
+from warpgs.version import install_command
 
 MAX_BYTES = 8 << 30
 """Maximum size of a file of weights [bytes]; the largest network has a fifth of that."""
@@ -57,7 +58,7 @@ def find_weights(network: Network, folder: Path | None) -> Path:
         ValueError: If the weights are not found, which the message says how to get, or a file is not a regular one.
     """
     if find_spec("transformers") is None:
-        raise ImportError(f"{network.option} needs the package transformers: pip install 'warpgs[networks]'")
+        raise ImportError(f"{network.option} needs the package transformers: {install_command('networks')}")
     folders = _cached(network) if folder is None else [folder, *sorted(p for p in folder.glob("*") if p.is_dir())]
     found = next((p for p in folders if _model_type(p) == network.model_type and any(p.glob("*.safetensors"))), None)
     if found is None:

@@ -15,7 +15,7 @@ class Sweep:
     """Trains every variant on every capture with every seed, on this machine or a Ray cluster; writes the tables.
 
     Each training is a run folder of its own. After Ctrl-C or an error, the same command continues. Exit code 1 if a
-    training failed twice. Needs Ray: pip install 'warpgs[sweep]'.
+    training failed twice. Needs Ray, which the extra sweep installs (docs/cluster.md).
     """
 
     sweep: Annotated[str, tyro.conf.arg(metavar="SWEEP"), tyro.conf.Positional]

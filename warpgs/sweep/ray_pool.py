@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from warpgs.errors import one_line
+from warpgs.version import install_command
 
 from .scheduler import ClusterGoneError, Result
 from .worker import GRACE_SECONDS, Job, run_job
@@ -35,7 +36,7 @@ def _import_ray(address: str | None) -> Any:
     try:
         import ray
     except ImportError as error:
-        raise ImportError("a sweep needs Ray: pip install 'warpgs[sweep]'") from error
+        raise ImportError(f"a sweep needs Ray: {install_command('sweep')}") from error
     return ray
 
 

@@ -10,6 +10,7 @@ from contextlib import suppress
 
 from warpgs.errors import one_line
 from warpgs.posix import lower_priority
+from warpgs.version import install_command
 
 from .command import View
 from .source import Source, open_source
@@ -33,7 +34,7 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
         OSError: If the server cannot listen on the address.
     """
     if importlib.util.find_spec("viser") is None:
-        raise ImportError("the viewer needs viser: pip install 'warpgs[viewer]'")
+        raise ImportError(f"the viewer needs viser: {install_command('viewer')}")
     from .server import Viewer, check_address
 
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
