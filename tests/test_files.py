@@ -15,6 +15,7 @@ import pytest
 
 from warpgs.files import (
     complete_or_absent,
+    kept_if_used,
     natural_order,
     partial_path,
     read_array,
@@ -112,6 +113,32 @@ def test_hidden_folders_of_the_user_are_kept(tmp_path):
     with complete_or_absent(tmp_path / "capture"):
         pass
     assert mine.is_file()
+
+
+def test_a_new_folder_in_which_nothing_is_written_is_removed_with_its_new_parents(tmp_path):
+    (tmp_path / "old").mkdir()
+    with kept_if_used(tmp_path / "old/new/newer", ("index",)):
+        (tmp_path / "old/new/newer/index").touch()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "old"]
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_folder_that_existed_or_is_used_is_kept(tmp_path, before):
+    folder = tmp_path / "new/newer"
+    if before:
+        folder.mkdir(parents=True)
+    with kept_if_used(folder, ("index",)):
+        (folder / "index").touch()
+        if not before:
+            (folder / "result").touch()
+    assert (folder / "index").exists()
+
+
+def test_a_file_in_the_place_of_a_folder_is_refused_and_kept(path):
+    path.write_text("text")
+    with pytest.raises(FileExistsError), kept_if_used(path):
+        pass
+    assert path.read_text() == "text"
 
 
 def test_files_that_differ_in_their_suffix_have_different_partial_paths(tmp_path):

@@ -10,7 +10,7 @@ import reprlib
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -104,6 +104,36 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
                     raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+@contextmanager
+def kept_if_used(folder: Path, bookkeeping: Collection[str] = ()) -> Iterator[None]:
+    """Makes a folder, with its parents, and removes what it has made of them if nothing was written there in the end.
+
+    Args:
+        folder: The folder; one that exists is kept as it is.
+        bookkeeping: Names of files that alone are not worth keeping.
+
+    Raises:
+        OSError: If the folder cannot be made.
+    """
+    made = [folder, *(parent for parent in folder.parents if not parent.exists())]
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir()  # at once whether it is new: another process may make it, too
+    except FileExistsError:
+        if not folder.is_dir():
+            raise
+        made = []
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # of folders that are not empty
+            if made and {path.name for path in folder.iterdir()} <= set(bookkeeping):
+                for path in folder.iterdir():
+                    path.unlink()
+            for path in made:
+                path.rmdir()
 
 
 def _remove_abandoned(folder: Path) -> None:

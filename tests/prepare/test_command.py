@@ -11,7 +11,8 @@ from warpgs.prepare.cameras import Cameras
 
 def test_a_wrong_source_ends_with_exit_code_2_and_one_line(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("not a video")
-    assert main(["prepare", str(tmp_path / "notes.txt"), str(tmp_path / "capture")]) == 2
+    assert main(["prepare", str(tmp_path / "notes.txt"), str(tmp_path / "captures" / "capture")]) == 2
+    assert not (tmp_path / "captures").exists()
     written = capsys.readouterr()
     assert written.err.startswith("warpgs: ")
     assert written.err.count("\n") == 1

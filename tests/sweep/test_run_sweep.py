@@ -70,6 +70,15 @@ def sweep(tmp_path, monkeypatch, finished_run):
     return run
 
 
+def test_a_sweep_without_ray_leaves_no_folder(sweep, tmp_path, monkeypatch):
+    def missing(*_):
+        raise ImportError("a sweep needs Ray")
+
+    monkeypatch.setattr(module, "RayPool", missing)
+    assert sweep()[0] == 2
+    assert not (tmp_path / "out").exists()
+
+
 def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
     code, trained = sweep()
     assert code == 0

@@ -6,6 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from warpgs.files import kept_if_used
+
 from .cameras import MISLED, Cameras, NoCamerasError
 from .checks import check_options
 from .journal import Journal
@@ -49,7 +51,7 @@ def prepare(
     chosen = {"source": source, **asdict(options), "depth": options.depth_method}
     journal = Journal(root, json.loads(json.dumps(chosen, default=lambda p: str(p.resolve()))), force, log)
     if not (was_finished := journal.is_finished):
-        with journal.explain_full_disk():
+        with journal.explain_full_disk(), kept_if_used(journal.work):
             _run_steps(source, options, journal)
     report = journal.report()
     for note in report["notes"] if was_finished else []:  # the steps have logged them otherwise

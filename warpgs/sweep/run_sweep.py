@@ -8,9 +8,9 @@ from typing import Any
 
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.errors import FAILED, one_line
-from warpgs.files import read_json, write_json
+from warpgs.files import kept_if_used, read_json, write_json
 from warpgs.presets import PRESETS
-from warpgs.runs.run import lock_folder
+from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board
 from .cells import Cell, find_scenes, is_started, plan_cells
@@ -52,8 +52,7 @@ def run_sweep(options: Sweep, log: Log) -> int:
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
-    out.mkdir(parents=True, exist_ok=True)
-    with lock_folder(out):
+    with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
         _check_index(out, cells)
         board = Board(out, cells, log)
         return _run(options, spec, board, peers, log)
