@@ -243,7 +243,7 @@ class Schedule:
     fit_motion: int = 0
     """Steps that fit the deformation to dynamic points of known depth before stage I; 0: none (paper)."""
     deform_from: int = 3_000
-    """Iteration from which dynamic Gaussians are deformed."""
+    """Iteration from which dynamic Gaussians are deformed; 0 where the deformation was fitted to points."""
     appearance_from: int | None = 0
     """Iteration from which the appearance network changes static Gaussians; in stage II alone if None (paper, section
     Training Protocol). By then moving shadows have become Gaussians at wrong depths (docs/results.md)."""

@@ -384,6 +384,17 @@ def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
         assert torch.equal(ours, new)
 
 
+@pytest.mark.parametrize(
+    ("assume", "depth", "steps", "fits"),
+    [("masks", True, 5, True), ("masks", False, 5, False), ("masks", True, 0, False), ("dynamic", True, 5, False)],
+)
+def test_the_deformation_is_fitted_where_masks_and_depth_show_what_moves(assume, depth, steps, fits):
+    capture = make_capture(random_points(50), inverse_depth=constant_depth() if depth else None).assuming(assume)
+    config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=steps))
+    views = Views(capture, torch.device("cpu"), 1 << 30)
+    assert initialize.fits_motion(config, capture, views, ALIGNMENT) == fits
+
+
 def test_if_everything_is_assumed_static_there_are_no_dynamic_gaussians():
     capture = make_capture(random_points(9), inverse_depth=constant_depth()).assuming("static")
     assert len(dynamic_gaussians(capture, ALIGNMENT)) == 0

@@ -254,6 +254,12 @@ def test_the_progress_of_a_network_covers_its_iterations(name, first):
     assert network_progress(name) == pytest.approx(expected)
 
 
+def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_stage_1():
+    made = Protocol(CONFIG, has_depth=True, fits_motion=True)
+    assert [made.phase_at(k).use_deformation for k in (STAGE1 - 1, STAGE1)] == [False, True]
+    assert not Protocol(CONFIG, has_depth=True).phase_at(STAGE1).use_deformation
+
+
 @pytest.mark.parametrize(("name", "start"), [("deformation", "deform_from"), ("appearance", "appearance_from")])
 def test_the_progress_of_a_network_that_starts_in_stage_2_covers_stage_2(name, start):
     expected = [0.0] * STAGE2 + [k / (END - STAGE2) for k in range(END - STAGE2)]

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced_indices
 
 from .point_cloud import subsample, unproject
 from .views import View, Views
@@ -21,6 +22,9 @@ MAX_PIXELS_PER_GAUSSIAN = 8
 MIN_KNOWN_FRACTION = 0.1
 """Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
 known only where nothing moves."""
+
+NUM_CHECKED = 8
+"""Number of views in which the known depth of what moves is looked for."""
 
 NUM_NEAREST_POINTS = 8
 """Number of points around a dynamic pixel that its depth is estimated from where it is unknown."""
@@ -61,6 +65,18 @@ class DynamicPoints(NamedTuple):
     def chosen(self, points: Int64[Tensor, " N"] | Bool[Tensor, " S"]) -> "DynamicPoints":
         """Some of the points."""
         return DynamicPoints(self.positions[points], self.colors[points], self.views[points], self.depth_known)
+
+
+@torch.no_grad()
+def is_depth_known(views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
+    """Whether the depth of enough dynamic pixels is known, of a few views."""
+    known = total = 0
+    for index in evenly_spaced_indices(len(views), NUM_CHECKED):
+        view = views[index]
+        depth = _metric_depth(alignments, index, view, ~view.static_mask)
+        known += int((depth.isfinite() & ~view.static_mask).sum())
+        total += int((~view.static_mask).sum())
+    return total > 0 and known >= MIN_KNOWN_FRACTION * total
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 
-from .dynamic_points import max_scale, unproject_pixels
+from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .tracked_start import start_from_tracks
@@ -61,6 +61,11 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     return points, color_points(points, views)
 
 
+def fits_motion(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
+    """Whether the deformation is fitted to points before stage I: where masks and depth show what moves."""
+    return config.schedule.fit_motion > 0 and capture.assumption == "masks" and is_depth_known(views, alignments)
+
+
 @torch.no_grad()
 def dynamic_gaussians(
     config: TrainConfig,
@@ -78,11 +83,12 @@ def dynamic_gaussians(
     points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The result is
     None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
     """
-    max_count, degree, steps = config.model.dynamic_points, config.model.sh_degree, config.schedule.fit_motion
+    max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if isinstance(deformation, SplineDeformation):
         return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return gaussians_at(*_colored_points(config, capture, generator), degree)
+    steps = config.schedule.fit_motion if fits_motion(config, capture, views, alignments) else 0
     count = max(max_count, MAX_POINTS) if steps else max_count
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:

@@ -144,10 +144,9 @@ class _PointsByView:
 
     @torch.no_grad()
     def canonical(self, deformation: nn.Module, found: DynamicPoints) -> DynamicPoints:
-        """The points that are deformed to where they were seen, at canonical positions.
+        """The points that are deformed to where they were seen, each at its place beside the nearest canonical point.
 
-        Those of a thing that the canonical points show stay beside one of these: found elsewhere, they would move with
-        another thing.
+        Only what no canonical point shows is searched elsewhere: the rest would be found where another thing is.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
         largest = MAX_ERROR * self.extent
@@ -158,10 +157,9 @@ class _PointsByView:
                 distances, nearest = torch.cdist(seen, deformed).min(1)
                 is_shown = distances.square() <= MAX_SQUARED_DISTANCE
                 goal = seen[:, :3] * self.unit
-                beside = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
-                start = torch.where(is_shown[:, None], beside, goal)
+                start = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
                 moved, reached = to_canonical(deformation, goal, self.times[view], start, largest)
-                reached &= ~is_shown | ((moved - start).norm(dim=1) <= largest)
+                reached &= ~is_shown | (moved == start).all(1)
                 positions[part], kept[part] = moved.cpu(), reached.cpu()
         return found._replace(positions=positions).chosen(kept)
 

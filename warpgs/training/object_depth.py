@@ -20,9 +20,8 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
-from warpgs.data.sampling import evenly_spaced_indices
 
-from .dynamic_points import MIN_KNOWN_FRACTION
+from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_objects, scaled_size
 from .point_cloud import front_of_ball
 from .views import Views
@@ -46,9 +45,6 @@ MAX_POINTS = 10_000
 Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
 
-NUM_CHECKED = 8
-"""Number of frames that are looked at for known depth of what moves."""
-
 
 def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> int:
     """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
@@ -64,7 +60,8 @@ def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, align
     Returns:
         The number of views that have such depth now.
     """
-    if not (config.loss.object_depth and config.depth) or capture.assumption != "masks" or _is_known(capture):
+    is_wanted = config.loss.object_depth and config.depth and capture.assumption == "masks"
+    if not is_wanted or is_depth_known(views, alignments):
         return 0
     count = 0
     for index, depth in object_depth(capture).items():
@@ -74,17 +71,6 @@ def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, align
             views.set_object_depth(index, alignments[index], depth)
             count += 1
     return count
-
-
-def _is_known(capture: Capture) -> bool:
-    """Whether frames have the depth of what moves."""
-    known = total = 0
-    for index in evenly_spaced_indices(len(capture.train), NUM_CHECKED):
-        frame = capture.frame(capture.train[index])
-        if frame.static_mask is not None and frame.inverse_depth is not None:
-            known += int((frame.inverse_depth.isfinite() & ~frame.static_mask).sum())
-            total += int((~frame.static_mask).sum())
-    return known > MIN_KNOWN_FRACTION * total
 
 
 def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:

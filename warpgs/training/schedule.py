@@ -129,9 +129,10 @@ class Protocol:
         config: Config whose schedule is rescaled already (``config.scaled``).
         has_depth: Whether any view has depth to compare.
         pretrains: Whether that includes depth of the static region, which pretraining needs.
+        fits_motion: Whether the deformation is fitted to points before stage I, in which it is in use at once then.
     """
 
-    def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True) -> None:
+    def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True, fits_motion: bool = False) -> None:
         self.config = config
         self.has_depth = has_depth
         schedule = config.schedule
@@ -144,7 +145,8 @@ class Protocol:
         self.stage2 = Stage("stage2", pretrain + stage1, pretrain + stage1 + stage2)
         self.num_iterations = self.stage2.end
         # Iterations of stage I from which the networks are in use; in stage II they always are.
-        starts = {"deformation": schedule.deform_from, "appearance": schedule.appearance_from}
+        deform_from = 0 if fits_motion else schedule.deform_from
+        starts = {"deformation": deform_from, "appearance": schedule.appearance_from}
         self._network_starts = {name: stage1 if k is None else min(k, stage1) for name, k in starts.items()}
         self._reseed_from = self._network_starts["deformation"] + schedule.warmup
 

@@ -93,7 +93,8 @@ class Trainer:
         self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments)
-        self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, pretrains=self.num_aligned > 0)
+        fits = initialize.fits_motion(config, self.capture, self.views, self.alignments)
+        self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, self.num_aligned > 0, fits)
         self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
         self._start_from(initialize.initial_scene(config, self.capture, self._generator("points")))
 
