@@ -95,14 +95,11 @@ def test_a_run_stopped_while_the_deformation_is_fitted_to_points_is_bit_identica
 
 
 def test_a_run_resumed_after_every_iteration_is_bit_identical(data, whole, tmp_path):
-    finished = tiny.train(tiny.trainer(data, tmp_path), tiny.StopWhen(lambda: True))
-    sessions = 1
-    while not finished:
+    for last in range(1, tiny.LENGTH + 1):
         trainer = tiny.trainer(data, tmp_path)
         trainer.restore_newest(print)
-        finished = tiny.train(trainer, tiny.StopWhen(lambda: True)) or trainer.iteration == tiny.LENGTH
-        sessions += 1
-    assert sessions == tiny.LENGTH
+        tiny.train(trainer, tiny.StopWhen(lambda trainer=trainer, last=last: trainer.iteration >= last))
+        assert trainer.iteration == last
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
 
 
