@@ -89,9 +89,12 @@ def test_entirely_dynamic_masks_are_an_error(root):
     assert "everything as dynamic" in texts(check_capture(root), "error")
 
 
-def test_missing_masks_are_a_warning(root):
+def test_missing_masks_are_an_error_that_says_how_to_make_them(root):
     shutil.rmtree(root / "resized_mask")
-    assert "no masks" in texts(check_capture(root, "nerfds"), "warning")
+    report = check_capture(root, "nerfds")
+    assert not report.is_fit
+    assert "no masks: make them with warpgs prepare CAPTURE --add masks" in texts(report, "error")
+    assert "cameras" in {finding.topic for finding in report.findings}
 
 
 def test_every_damaged_file_is_named(root):

@@ -273,7 +273,7 @@ def test_an_empty_branch_resumes(data, run, assume):
 
 def test_a_capture_without_masks_is_refused_with_advice(data, run):
     shutil.rmtree(data / "resized_mask")
-    with pytest.raises(ValueError, match=r"has no mask of the dynamic region.*--assume static"):
+    with pytest.raises(ValueError, match=r"has no mask of the dynamic region.*--add masks.*--assume static"):
         script.make_trainer(dataclasses.replace(tiny.CONFIG, data=data, out=run, dataset="nerfds"))
 
 

@@ -106,7 +106,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
     except ValueError as error:
         return Report(root, [Finding("error", "files", str(error))])
     findings = [Finding("note", "layout", f"read as {dataset or recognize(root)}"), *_counts(capture), *_files(capture)]
-    if not any(f.level == "error" for f in findings):
+    if not any(f.level == "error" and f.topic != "masks" for f in findings):
         findings += [*_geometry(capture, SAMPLES), *_turning(capture), *_depth(capture), *_motion(capture)]
     return Report(root, findings)
 
@@ -168,7 +168,8 @@ def _files(capture: Capture) -> Iterator[Finding]:
     if capture.assumption == "dynamic":
         yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
     elif not dynamic:
-        yield Finding("warning", "masks", "there are no masks; training needs them, or --assume static or dynamic")
+        advice = "make them with warpgs prepare CAPTURE --add masks, or train with --assume static or dynamic"
+        yield Finding("error", "masks", f"there are no masks: {advice}")
     elif max(dynamic) == 0.0:
         yield Finding("warning", "masks", "the masks mark nothing as dynamic")
     elif min(dynamic) == 1.0:

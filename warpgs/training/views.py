@@ -184,7 +184,7 @@ class Views:
         if frame.static_mask is None:
             raise ValueError(
                 f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
-                "give the capture masks, or train with --assume static or --assume dynamic"
+                "make masks with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
         depth = depth.half()
