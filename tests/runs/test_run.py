@@ -222,6 +222,11 @@ def test_a_folder_without_a_config_is_refused(tmp_path):
         read_config(tmp_path)
 
 
+def test_a_folder_that_does_not_exist_is_refused_as_that(tmp_path):
+    with pytest.raises(ValueError, match=r"/missing does not exist$"):
+        read_config(tmp_path / "missing")
+
+
 def test_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("{}")
     with pytest.raises(ValueError, match="is not a run folder"):
@@ -230,9 +235,15 @@ def test_a_file_is_refused(tmp_path):
 
 def test_a_folder_with_files_is_not_trained_into(tmp_path, capture):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: continue it with --resume {tmp_path}"):
+    with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: choose another --out"):
         create(TrainConfig(out=tmp_path), capture)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_folder_that_exists_can_be_resumed(tmp_path, capture):
+    folder = create(dataclasses.replace(tiny.CONFIG, out=tmp_path / "run"), capture)
+    with pytest.raises(ValueError, match=rf"{folder} exists and is not empty: continue it with --resume {folder}, or"):
+        new_folder(TrainConfig(out=folder), capture)
 
 
 def test_a_file_is_not_trained_into(tmp_path, capture):

@@ -39,9 +39,12 @@ def read_config(folder: Path) -> TrainConfig:
     """The training config of a run folder.
 
     Raises:
-        ValueError: If the folder has no config.json, or the file is damaged or has unknown or mistyped fields.
+        ValueError: If the folder or its config.json does not exist, or the file is damaged or has unknown or mistyped
+            fields.
     """
     path = folder / NAME
+    if not folder.exists():
+        raise ValueError(f"{folder} does not exist")
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
     values = _with_old_meaning(read_json(path, max_bytes=MAX_BYTES))

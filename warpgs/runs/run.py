@@ -48,9 +48,8 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
         stem = Path("runs") / "-".join(filter(None, (capture.name, config.preset)))
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or not _is_empty(folder)):
-        raise ValueError(
-            f"{folder} exists and is not empty: continue it with --resume {folder}, or choose another --out"
-        )
+        advice = f"continue it with --resume {folder}, or " if (folder / NAME).exists() else ""
+        raise ValueError(f"{folder} exists and is not empty: {advice}choose another --out")
     return folder
 
 
