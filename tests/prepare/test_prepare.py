@@ -208,8 +208,10 @@ def test_a_capture_finished_before_there_was_an_option_stays_finished(made, shot
 
 
 def test_other_options_require_force(made, shots):
-    with pytest.raises(ValueError, match=r"other options \(holdout\).*--force"):
+    with pytest.raises(ValueError, match=r"other options \(holdout 8, now 4\).*--force"):
         prepare(shots, made, holdout=4)
+    with pytest.raises(ValueError, match=r"other options \(count None, now 5\).*--force"):
+        prepare(shots, made, holdout=8, selection=Selection(count=5))
 
 
 def test_an_interrupted_preparation_continues_after_the_last_finished_step(shots, tmp_path, monkeypatch):

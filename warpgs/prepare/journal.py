@@ -78,10 +78,11 @@ class Journal:
         if state.get("version") != VERSION and "finished" not in done:
             return {}, []  # the intermediate files of an earlier version differ
         begun = {"camera": "moving", **begun}  # the only one before there was the option
-        changed = [key for key in self._options if begun.get(key) != self._options[key]]
+        before, now = _flat(begun), _flat(self._options)
+        changed = [f"{key} {before.get(key)}, now {now[key]}" for key in now if before.get(key) != now[key]]
         if changed and "capture" in done:
             raise ValueError(
-                f"{self.root} was made with other options ({', '.join(changed)}): choose another folder, or replace "
+                f"{self.root} was made with other options ({'; '.join(changed)}): choose another folder, or replace "
                 "it with --force"
             )
         return ({}, []) if changed else (done, notes)  # an unfinished capture starts afresh with the new options
@@ -181,3 +182,9 @@ class Journal:
         write_json(
             self.work / STATE, {"version": VERSION, "options": self._options, "done": self._done, "notes": self.notes}
         )
+
+
+def _flat(options: dict[str, Any]) -> dict[str, Any]:
+    """Options by name, also those in groups."""
+    groups = {key: value if isinstance(value, dict) else {key: value} for key, value in options.items()}
+    return {key: value for group in groups.values() for key, value in group.items()}
