@@ -19,8 +19,13 @@ def main() -> None:
     parser.add_argument("--view", type=int, default=0, help="index of the training view whose camera is used")
     parser.add_argument("--out", type=Path, default=Path("time.png"), help="file to write (default: time.png)")
     options = parser.parse_args()
-    scene = warpgs.open_run(options.run)
-    capture = scene.open_capture()
+    try:
+        scene = warpgs.open_run(options.run)
+        capture = scene.open_capture()
+    except ValueError as error:
+        parser.error(str(error))
+    if not 0 <= options.view < len(capture.train):
+        parser.error(f"--view must be from 0 to {len(capture.train) - 1}, got {options.view}")
     camera = capture.cameras[capture.train[options.view]]
     rendering = scene.render(camera, options.time, branches=True)  # .joint, .static and .dynamic
     write_png(options.out, to_bytes(rendering.joint.image))

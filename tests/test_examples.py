@@ -104,3 +104,14 @@ def test_the_notebook_about_a_run_renders_it(finished_run, capsys):
     assert left["strip"].shape == (camera.height, 5 * camera.width, 3)
     assert left["closer"].size == camera.size
     assert "scene units" in capsys.readouterr().out
+
+
+def test_rendering_a_view_or_a_run_that_does_not_exist_is_an_error_of_one_line(run, finished_run, tmp_path, capsys):
+    for arguments, words in (
+        ((finished_run, "--view", 1000), "--view must be from 0 to"),
+        ((tmp_path / "no",), "not exist"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            run("render_a_time", *arguments)
+        assert ended.value.code == 2
+        assert words in capsys.readouterr().err.splitlines()[-1]
