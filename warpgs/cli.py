@@ -76,8 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with ending_at_once():
         from .command_line import parse  # imports tyro
 
-        home = COMMANDS[name].load()
-    options = parse(home, rest, f"warpgs {name}")
+        command = COMMANDS[name].load()
+    options = parse(command, rest, f"warpgs {name}")
     return run_command(options.run)
 
 

@@ -129,7 +129,7 @@ def test_points_that_the_deformation_does_not_reach_are_dropped():
     assert 0.2 < len(canonical.views) / len(FOUND.views) < 0.8
 
 
-def test_at_most_so_many_points_of_a_frame_are_compared(monkeypatch):
+def test_the_points_of_each_frame_are_subsampled(monkeypatch):
     monkeypatch.setattr(motion_fit, "MAX_POINTS_PER_VIEW", 10)
     sizes = []
     distance = motion_fit._distance

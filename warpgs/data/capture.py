@@ -25,6 +25,9 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 Assumption = Literal["masks", "static", "dynamic"]
 """What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
+MASKS_REMEDY = "with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
+"""How to go on without masks: the end of a message that says what to make."""
+
 Background = Literal["black", "white"]
 """Colour behind all Gaussians."""
 

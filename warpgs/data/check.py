@@ -15,7 +15,7 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.errors import visible
 
-from .capture import MIN_EXTENT, Capture, Frame
+from .capture import MASKS_REMEDY, MIN_EXTENT, Capture, Frame
 from .depth_alignment import DepthProblem, align_to_points, alignment_problem, is_unusable, relative_errors
 from .loaders import load_capture, recognize
 from .motion_check import are_comparable, motion_between
@@ -168,8 +168,7 @@ def _files(capture: Capture) -> Iterator[Finding]:
     if capture.assumption == "dynamic":
         yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
     elif not dynamic:
-        advice = "make them with warpgs prepare CAPTURE --add masks, or train with --assume static or dynamic"
-        yield Finding("error", "masks", f"there are no masks: {advice}")
+        yield Finding("error", "masks", f"the capture has no masks: make them {MASKS_REMEDY}")
     elif max(dynamic) == 0.0:
         yield Finding("warning", "masks", "the masks mark nothing as dynamic")
     elif min(dynamic) == 1.0:

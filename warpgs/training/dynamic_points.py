@@ -73,7 +73,7 @@ def is_depth_known(views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
     known = total = 0
     for index in evenly_spaced_indices(len(views), NUM_CHECKED):
         view = views[index]
-        depth = _metric_depth(alignments, index, view, ~view.static_mask)
+        depth = depth_alignment.metric_depth(view.inverse_depth, alignments[index])
         known += int((depth.isfinite() & ~view.static_mask).sum())
         total += int((~view.static_mask).sum())
     return total > 0 and known >= MIN_KNOWN_FRACTION * total

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import MASKS_REMEDY, Capture, Frame
 from warpgs.model.poses import PoseCorrections
 
 
@@ -184,7 +184,7 @@ class Views:
         if frame.static_mask is None:
             raise ValueError(
                 f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
-                "make masks with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
+                f"make masks {MASKS_REMEDY}"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
         depth = depth.half()
