@@ -2,10 +2,11 @@
 
 Monocular depth is inverse depth up to a scale and an offset, so target = 1 / (scale inverse + offset). For each pixel,
 
-    error = |depth - target|,      v_depth = v sign(depth - target).
+    error = max(|depth - target| - margin target, 0),      v_depth = v sign(depth - target) where error > 0.
 
-Both are 0 in pixels that are not compared: outside the region, where the rendered opacity is at most a half, and where
-the target is unknown (NaN fails the comparison) or close to infinity.
+The margin is the relative error of the target; with a margin of 0 this is Eq. 14. Both are 0 in pixels that are not
+compared: outside the region, where the rendered opacity is at most a half, and where the target is unknown (NaN fails
+the comparison) or close to infinity.
 """
 
 import warp as wp
@@ -24,13 +25,17 @@ def depth_difference(
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
     region: wp.array[wp.uint8],
+    margin: wp.array[float],
     p: int,
 ) -> float:
-    """Depth minus target; 0 in pixels that are not compared."""
+    """Depth minus the nearest end of target ± margin; 0 between these, and in pixels that are not compared."""
     result = float(0.0)
     aligned = alignment[0] * inverse_depth[p] + alignment[1]
     if region[p] != wp.uint8(0) and alpha[p] > MIN_OPACITY and aligned > MIN_INVERSE_DEPTH:
-        result = depth[p] - 1.0 / aligned
+        target = 1.0 / aligned
+        difference = depth[p] - target
+        allowed = margin[0] * target
+        result = difference - wp.clamp(difference, -allowed, allowed)
     return result
 
 
@@ -42,11 +47,12 @@ def depth_error_fwd(
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
     region: wp.array[wp.uint8],
+    margin: wp.array[float],
     errors: wp.array[float],
 ):
     """One thread for each pixel."""
     p = first + wp.tid()
-    errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, region, p))
+    errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, region, margin, p))
 
 
 @wp.kernel(enable_backward=False)
@@ -57,11 +63,12 @@ def depth_error_bwd(
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
     region: wp.array[wp.uint8],
+    margin: wp.array[float],
     scale: float,
     v_sum: wp.array[float],
     v_depth: wp.array[float],
 ):
     """One thread for each pixel; ``v_sum`` [1] times ``scale`` is the gradient of the sum of all errors."""
     p = first + wp.tid()
-    difference = depth_difference(depth, alpha, inverse_depth, alignment, region, p)
+    difference = depth_difference(depth, alpha, inverse_depth, alignment, region, margin, p)
     v_depth[p] = scale * v_sum[0] * abs_derivative(difference)

@@ -148,6 +148,9 @@ class LossConfig:
     depth_tolerance: float = 0.0
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
     by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
+    depth_margin: float = 0.0
+    """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse
+    points are not penalized: the images know better. 0: every error is (paper)."""
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     object_depth: bool = False

@@ -14,7 +14,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import render
 from warpgs.training.loss_terms import TERMS
-from warpgs.training.losses import LossTerm, dynamic_loss, image_loss, static_loss
+from warpgs.training.losses import DepthTrust, LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import Sample, Step
 from warpgs.training.views import Views, mask_border
@@ -182,7 +182,7 @@ def compared_depth(depth, alpha, target, region):
     """The depth loss against a target, which is passed as inverse depth before alignment."""
     scale, offset = ALIGNMENT.double()
     inverse_depth = ((1.0 / target.double() - offset) / scale).float()
-    return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region)
+    return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region, torch.tensor(0.0))
 
 
 def test_the_depth_loss_is_that_of_equation_14():
@@ -254,7 +254,7 @@ def make_gaussians(chosen):
     return Gaussians(*(value[chosen].contiguous() for value in values))
 
 
-def prepared(stage, loss=LOSS, at=0, trust=1.0, schedule=SCHEDULE, **options):
+def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **options):
     """A scene, the plan of an iteration of a stage, by default of the first, and a step that trains the scene."""
     frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
     capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
@@ -264,7 +264,8 @@ def prepared(stage, loss=LOSS, at=0, trust=1.0, schedule=SCHEDULE, **options):
     plan = Protocol(config, has_depth=True).at(STAGES[stage] + at)
     assert plan.phase.stage == stage
     views = Views(capture, torch.device("cpu"), 1 << 30, loss.mask_margin)
-    return scene, plan, Step(config, scene, views, ALIGNMENTS, torch.tensor([trust]), capture.extent)
+    trusts = DepthTrust(*torch.tensor(trust)[:, None])
+    return scene, plan, Step(config, scene, views, ALIGNMENTS, trusts, capture.extent)
 
 
 def terms_of(stage, loss=LOSS, schedule=SCHEDULE):
@@ -369,12 +370,23 @@ def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
     _, plan, step = prepared("stage1")
     step(plan, Sample(0, 0.0, PURPLE))
     whole = step.take_means().terms
-    _, plan, step = prepared("stage1", trust=0.25)
+    _, plan, step = prepared("stage1", trust=(0.25, 0.0))
     step(plan, Sample(0, 0.0, PURPLE))
     part = step.take_means().terms
     for name in ("depth", "depth_dynamic"):
         assert part[name] == pytest.approx(0.25 * whole[name], rel=1e-6)
     assert part["static"] == whole["static"]
+
+
+def test_a_margin_frees_small_errors_of_the_static_depth_alone():
+    found = {}
+    for margin in (0.0, 0.2, 1e3):
+        _, plan, step = prepared("stage1", trust=(1.0, margin))
+        step(plan, Sample(0, 0.0, PURPLE))
+        found[margin] = step.take_means().terms
+    assert 0.0 < found[0.2]["depth"] < found[0.0]["depth"]
+    assert found[1e3]["depth"] == 0.0
+    assert found[1e3]["depth_dynamic"] == found[0.0]["depth_dynamic"] > 0.0
 
 
 def test_the_joint_term_compares_the_joint_image_with_the_whole_ground_truth():

@@ -20,6 +20,7 @@ from warpgs.model.splats import Splats
 from warpgs.presets import PRESETS
 from warpgs.runs.run import Run
 from warpgs.runtime.graphs import WARM_UPS
+from warpgs.training.losses import DepthTrust
 from warpgs.training.point_cloud import scene_box
 from warpgs.training.schedule import IterationPlan, Phase, Protocol
 from warpgs.training.step import Sample, Step
@@ -100,6 +101,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     capture = random_capture(splats, camera)
     views = Views(capture, torch.device(device), config.resident_bytes)
     alignments = torch.tensor([[1.0, 0.0]], device=device).repeat(NUM_VIEWS, 1)
+    trust = DepthTrust(torch.ones(NUM_VIEWS, device=device), torch.zeros(NUM_VIEWS, device=device))
     dynamic = in_disc(splats.means, camera)
     scene = random_scene(splats, dynamic).to(device)
     if device == "cuda":
@@ -107,13 +109,13 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     protocol = Protocol(config, has_depth=True)
     result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
     for stage in (protocol.stage1, protocol.stage2):
-        step = Step(config, scene, views, alignments, torch.ones(NUM_VIEWS, device=device), capture.extent)
+        step = Step(config, scene, views, alignments, trust, capture.extent)
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     scene = random_scene(splats, torch.zeros_like(dynamic)).to(device)
     loss = dataclasses.replace(config.loss, branches_in_stage2="no")
     plain_config = dataclasses.replace(config, static_geometry=True, loss=loss)
-    step = Step(plain_config, scene, views, alignments, torch.ones(NUM_VIEWS, device=device), capture.extent)
+    step = Step(plain_config, scene, views, alignments, trust, capture.extent)
     plain = dataclasses.replace(plan, phase=plain_phase(plan.phase))
     result["3dgs_ms"] = statistics.median(_times(step, plain, device, repeats))
     if device == "cuda":

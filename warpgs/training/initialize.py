@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from warpgs.config import RenderSettings, TrainConfig
+from warpgs.config import LossConfig, RenderSettings, TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
@@ -17,6 +17,7 @@ from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 
 from .dynamic_points import is_depth_known, max_scale, unproject_pixels
+from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .tracked_start import start_from_tracks
@@ -119,17 +120,17 @@ class DepthAlignment(NamedTuple):
     alignments: Float[Tensor, "T 2"]
     errors: Float[Tensor, "T 2"]
 
-    def trust(self, tolerance: float) -> Float[Tensor, " T"]:
-        """Factor of each view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``.
-
-        It is 0 for depth that is not to be used. Views with too few points have the median of the others.
-        """
-        if tolerance == 0.0:
-            return torch.ones_like(self.errors[:, 0])
-        trust = 1.0 / (1.0 + (self.errors[:, 0] / tolerance) ** 2)
-        known, refused = self.errors[:, 0].isfinite(), depth_alignment.is_unusable(self.errors)
-        typical = trust[known].median() if bool(known.any()) else trust.new_tensor(1.0)
-        return torch.where(refused, 0.0, torch.where(known, trust, typical))
+    def trust(self, loss: LossConfig) -> DepthTrust:
+        """How much each view's depth is trusted; views with too few points have the median error of the others."""
+        errors = self.errors[:, 0]
+        known = errors.isfinite()
+        typical = errors[known].median() if bool(known.any()) else errors.new_tensor(0.0)
+        errors = torch.where(known, errors, typical)
+        weight = torch.ones_like(errors)
+        if loss.depth_tolerance:
+            refused = depth_alignment.is_unusable(self.errors)
+            weight = torch.where(refused, 0.0, 1.0 / (1.0 + (errors / loss.depth_tolerance) ** 2))
+        return DepthTrust(weight, loss.depth_margin * errors)
 
 
 @torch.no_grad()

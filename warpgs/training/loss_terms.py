@@ -35,26 +35,31 @@ def joint(inputs: LossInputs) -> Float[Tensor, ""]:
     return losses.image_loss(inputs.rendering.joint.image, inputs.view.image, inputs.config.ssim)
 
 
-def _depth_error(inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"]) -> Float[Tensor, ""]:
-    """The error of a layer's depth in a region, times the trust in the view's depth."""
+def _depth_error(
+    inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"], margin: Float[Tensor, ""]
+) -> Float[Tensor, ""]:
+    """The error of a layer's depth in a region, times the weight of the view's depth."""
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
     assert inputs.depth_trust is not None
     # The op skips pixels with an opacity of at most a half.
     alpha = layer.alpha if inputs.config.depth_gate else torch.ones_like(layer.alpha)
-    error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region)
-    return error * inputs.depth_trust
+    error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region, margin)
+    return error * inputs.depth_trust.weight
 
 
 def depth(inputs: LossInputs) -> Float[Tensor, ""]:
     """The depth of the static image in the static region (Eq. 14)."""
-    return _depth_error(inputs, inputs.rendering.static, inputs.view.static_mask)
+    assert inputs.depth_trust is not None
+    return _depth_error(inputs, inputs.rendering.static, inputs.view.static_mask, inputs.depth_trust.margin)
 
 
 def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The depth of the dynamic image in the dynamic region."""
-    return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask)
+    """The depth of the dynamic image in the dynamic region; nothing else tells it, so every error counts."""
+    assert inputs.depth_trust is not None
+    no_margin = torch.zeros_like(inputs.depth_trust.margin)
+    return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask, no_margin)
 
 
 TERMS: dict[str, LossTerm] = {

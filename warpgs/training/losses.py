@@ -16,6 +16,18 @@ from .schedule import IterationPlan, Phase
 from .views import View
 
 
+class DepthTrust(NamedTuple):
+    """How much the aligned depth of views is trusted, by its error at the sparse points.
+
+    Attributes:
+        weight: Factor of the terms of depth, in [0, 1]; 0 = the depth is not used. See ``LossConfig.depth_tolerance``.
+        margin: Relative error of the static depth that is not penalized. See ``LossConfig.depth_margin``.
+    """
+
+    weight: Float[Tensor, "*T"]
+    margin: Float[Tensor, "*T"]
+
+
 class LossInputs(NamedTuple):
     """What a term of the loss is computed from.
 
@@ -26,8 +38,7 @@ class LossInputs(NamedTuple):
         rendering: Joint, static and dynamic image; with depth where ``Phase.with_depth``.
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
-        depth_trust: Factor of the view's depth errors, in [0, 1]; see ``LossConfig.depth_tolerance``. None like
-            ``alignment``.
+        depth_trust: How much the view's depth is trusted. None like ``alignment``.
     """
 
     config: LossConfig
@@ -36,7 +47,7 @@ class LossInputs(NamedTuple):
     rendering: Rendering
     backgrounds: Float[Tensor, "3 3"]
     alignment: Float[Tensor, "2"] | None
-    depth_trust: Float[Tensor, ""] | None
+    depth_trust: DepthTrust | None
 
 
 class LossTerm(NamedTuple):

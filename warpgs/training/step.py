@@ -19,7 +19,7 @@ from . import optimizer as optim
 from . import ranks
 from .densify import GradientStatistics
 from .loss_terms import TERMS
-from .losses import LossInputs
+from .losses import DepthTrust, LossInputs
 from .schedule import IterationPlan, Phase
 from .step_inputs import StepInputs
 from .views import View, Views
@@ -66,7 +66,7 @@ class Step:
         scene: What is trained; on the device of the views.
         views: Training views.
         alignments: [T, 2] scale and offset of each view's inverse depth; may be changed in place.
-        depth_trust: [T] factor of the depth errors of each view.
+        depth_trust: [T] how much the depth of each view is trusted.
         extent: Extent of the capture [scene units].
 
     Attributes:
@@ -82,7 +82,7 @@ class Step:
         scene: SplitScene,
         views: Views,
         alignments: Float[Tensor, "T 2"],
-        depth_trust: Float[Tensor, " T"],
+        depth_trust: DepthTrust,
         extent: float,
     ) -> None:
         self.config, self.scene, self.views, self.extent = config, scene, views, extent
@@ -151,8 +151,7 @@ class Step:
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
-        alignment = self.alignments.index_select(0, self._index)[0] if phase.with_depth else None
-        trust = self._depth_trust.index_select(0, self._index)[0] if phase.with_depth else None
+        alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
@@ -163,6 +162,12 @@ class Step:
         self.optimizer.zero_grad()
         self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
+
+    def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
+        """Alignment of the depth of the view whose index is on the device, and how much it is trusted."""
+        values = (self.alignments, *self._depth_trust)
+        alignment, *trust = (tensor.index_select(0, self._index)[0] for tensor in values)
+        return alignment, DepthTrust(*trust)
 
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase; without depth all gradients are those of images."""

@@ -155,10 +155,10 @@ def _describe(trainer: Trainer, log: Log) -> None:
     if jumps := int((trainer.gains != 1.0).any(1).sum()):
         low, high = trainer.gains.min().item(), trainer.gains.max().item()
         log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")
-    refused = int((trainer.depth_trust == 0).sum())
+    refused = int((trainer.depth_trust.weight == 0).sum())
     if num_aligned and trainer.protocol.phase_at(0).with_depth:
         used = trainer.alignments.isfinite().all(1)
-        error, trust = trainer.depth_errors[used].median().item(), trainer.depth_trust[used].median().item()
+        error, trust = trainer.depth_errors[used].median().item(), trainer.depth_trust.weight[used].median().item()
         log(f"depth is off by {error:.1%} at the sparse points, its weight is {trust:.2f} (medians)")
     if refused:
         log(f"depth of {refused} of {num_views} views is hardly better than a constant and is not used")

@@ -63,7 +63,7 @@ class Trainer:
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of moving objects gives their depth.
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
-        depth_trust: [T] factor of each view's depth errors, in [0, 1]; 0 = the depth is not used.
+        depth_trust: [T] how much each view's depth is trusted.
         seconds: Training time of earlier sessions of this run [s].
         callbacks: Called after regular checks and before checkpoints, off the clock.
 
@@ -89,8 +89,8 @@ class Trainer:
         found = initialize.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
         for tensor in found:
             ranks.copy_first_(tensor)
-        self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss.depth_tolerance)
-        self.alignments = torch.where(self.depth_trust[:, None] > 0, found.alignments, torch.nan)
+        self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss)
+        self.alignments = torch.where(self.depth_trust.weight[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
         self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments)
         fits = initialize.fits_motion(config, self.capture, self.views, self.alignments)
@@ -174,7 +174,7 @@ class Trainer:
             aligned = initialize.align_to_rendering(
                 self.alignments, self.views, scene, sh_degree, self.config.antialias
             )
-            self.alignments.copy_(torch.where(self.depth_trust[:, None] > 0, aligned, torch.nan))
+            self.alignments.copy_(torch.where(self.depth_trust.weight[:, None] > 0, aligned, torch.nan))
         if plan.densify:
             self._densify(plan.remove_large)
         if plan.prune:
