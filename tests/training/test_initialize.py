@@ -11,6 +11,7 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
 from warpgs.training.point_cloud import color_points, gaussians_at, scene_box, subsample, unproject
+from warpgs.training.schedule import Protocol
 from warpgs.training.views import Views
 
 CAMERA = make_camera()
@@ -53,10 +54,12 @@ def make_capture(points, colors=None, inverse_depth=None, num_frames=3):
     return Capture("made up", cameras, names, [], points, colors, read)
 
 
-def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None):
+def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None, fits=None):
+    """Those of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
     views = Views(capture, torch.device("cpu"), 1 << 30)
-    deformation = deformation or torch.nn.Identity()
-    return initialize.dynamic_gaussians(config, capture, views, alignments, deformation, generator())
+    fits = initialize.fits_motion(config, capture, views, alignments) if fits is None else fits
+    protocol, deformation = Protocol(config, True, fits_motion=fits), deformation or torch.nn.Identity()
+    return initialize.dynamic_gaussians(protocol, capture, views, alignments, deformation, generator())
 
 
 def constant_depth():
@@ -356,6 +359,8 @@ def test_without_depth_and_visible_points_dynamic_gaussians_start_at_random_in_t
 
 WIDE = dataclasses.replace(NETWORK, depth=2, width=32)
 FITTED = dataclasses.replace(CONFIG, model=WIDE, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=300))
+RECEDING = torch.stack([ALIGNMENT[0] * DEPTH / depth for depth in (2.5, 2.6, 2.7)])
+"""With these alignments the dynamic block recedes from frame to frame."""
 
 
 def new_deformation():
@@ -364,11 +369,9 @@ def new_deformation():
 
 
 def test_the_deformation_is_fitted_to_dynamic_pixels_of_known_depth():
-    """The block recedes from frame to frame."""
-    alignments = torch.stack([ALIGNMENT[0] * DEPTH / depth for depth in (2.5, 2.6, 2.7)])
     deformation = new_deformation()
     capture = make_capture(random_points(9), inverse_depth=constant_depth())
-    means = dynamic_gaussians(capture, alignments, FITTED, deformation).means.detach()
+    means = dynamic_gaussians(capture, RECEDING, FITTED, deformation).means.detach()
     assert len(means) == NETWORK.dynamic_points
     with torch.no_grad():
         first, last = (
@@ -382,6 +385,16 @@ def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
     dynamic_gaussians(make_capture(random_points(50)), ALIGNMENT, FITTED, deformation)
     for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
         assert torch.equal(ours, new)
+
+
+def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
+    """The protocol decides before depth is realigned, and then uses the deformation from the start of stage I."""
+    capture = make_capture(random_points(9), inverse_depth=constant_depth())
+    for fits in (False, True):
+        deformation = new_deformation()
+        dynamic_gaussians(capture, RECEDING, FITTED, deformation, fits)
+        pairs = zip(deformation.parameters(), new_deformation().parameters(), strict=True)
+        assert all(torch.equal(ours, new) for ours, new in pairs) != fits
 
 
 @pytest.mark.parametrize(

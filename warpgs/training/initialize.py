@@ -20,6 +20,7 @@ from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .schedule import Protocol
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
 from .views import Views
@@ -69,7 +70,7 @@ def fits_motion(config: TrainConfig, capture: Capture, views: Views, alignments:
 
 @torch.no_grad()
 def dynamic_gaussians(
-    config: TrainConfig,
+    protocol: Protocol,
     capture: Capture,
     views: Views,
     alignments: Float[Tensor, "T 2"],
@@ -77,26 +78,26 @@ def dynamic_gaussians(
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
 ) -> Gaussians | None:
-    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation is fitted.
+    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the protocol may fit the deformation.
 
     Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
     points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
     points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The result is
     None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
     """
+    config = protocol.config
     max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if isinstance(deformation, SplineDeformation):
         return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return gaussians_at(*_colored_points(config, capture, generator), degree)
-    steps = config.schedule.fit_motion if fits_motion(config, capture, views, alignments) else 0
-    count = max(max_count, MAX_POINTS) if steps else max_count
+    count = max(max_count, MAX_POINTS) if protocol.fits_motion else max_count
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return Gaussians.empty(0, degree)
-    if steps and found.depth_known:
-        times = torch.tensor([capture.cameras[name].time for name in capture.train])
-        fitted = fit_motion(deformation, found, times, capture.extent, steps, generator, is_stopped)
+    if protocol.fits_motion and found.depth_known:
+        times, steps = [capture.cameras[name].time for name in capture.train], config.schedule.fit_motion
+        fitted = fit_motion(deformation, found, torch.tensor(times), capture.extent, steps, generator, is_stopped)
         if fitted is None:
             return None
         found = fitted

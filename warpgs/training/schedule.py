@@ -134,7 +134,7 @@ class Protocol:
 
     def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True, fits_motion: bool = False) -> None:
         self.config = config
-        self.has_depth = has_depth
+        self.has_depth, self.fits_motion = has_depth, fits_motion
         schedule = config.schedule
         pretrain = schedule.pretrain if config.dap and has_depth and pretrains else 0
         # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.

@@ -234,7 +234,7 @@ class Trainer:
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
         ranks.any_rank(False)  # finds a lost rank
-        sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
+        sources = (self.protocol, self.capture, self.views, self.alignments, self.scene.deformation)
         found = initialize.dynamic_gaussians(
             *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
         )
