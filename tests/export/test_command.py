@@ -47,7 +47,7 @@ def export(run, tmp_path, **options):
     """Exports in the scene's coordinates, if the format has this option."""
     writer = WRITERS.get(options.get("format", "ply"))
     up = {"up": "scene"} if writer and "up" in writer.options else {}
-    return export_run(Export(run, out=tmp_path / "out", quiet=True, **{**up, **options}))
+    return export_run(Export(run, **{"out": tmp_path / "out", "quiet": True, **up, **options}))
 
 
 def names(tmp_path):
@@ -162,6 +162,28 @@ def test_a_page_starts_at_the_middle_view_and_follows_the_training_cameras(run, 
     assert start.title == "the run"
 
 
+@pytest.mark.parametrize(
+    ("file", "options"),
+    [
+        ("a.ply", {}),
+        ("a.ply", {"format": "compressed"}),
+        ("a.html", {"format": "html", "keys": 2}),
+        ("a.glb", {"format": "glb"}),
+    ],
+)
+def test_a_file_can_be_given_instead_of_a_folder(run, tmp_path, file, options):
+    path = tmp_path / "new" / file
+    assert export(run, tmp_path, out=path, **options).startswith(f"{path}: ")
+    assert [written.name for written in path.parent.iterdir()] == [file]
+    assert path.is_file()
+
+
+def test_a_folder_may_be_called_like_a_file(run, tmp_path):
+    (folder := tmp_path / "a.ply").mkdir()
+    export(run, tmp_path, out=folder, layers="apart")
+    assert sorted(path.name for path in folder.iterdir()) == ["dynamic.ply", "static.ply"]
+
+
 # Formats ------------------------------------------------------------------------------------------------------------
 
 
@@ -180,9 +202,9 @@ def test_another_format_takes_one_entry(run, tmp_path, monkeypatch):
         export(run, tmp_path, format="count", frames=2)
 
 
-def test_an_unknown_format_is_refused_with_the_names_of_all(run, tmp_path):
+def test_an_unknown_format_is_refused_with_the_names_of_all_before_the_run_is_opened(tmp_path):
     with pytest.raises(ValueError, match=f"--format must be one of {', '.join(WRITERS)}, got 'splat'"):
-        export(run, tmp_path, format="splat")
+        export(tmp_path / "no run", tmp_path, format="splat")
 
 
 def test_the_help_names_every_format(capsys):
@@ -279,6 +301,10 @@ def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
         ({"seconds": 5.0}, "--seconds is for --format usd and 4dgs and html, not for ply"),
         ({"max_megabytes": 256.0}, "--max-megabytes is for --format html, not for ply"),
         ({"format": "html", "layers": "static"}, "--layers is for --format .*, not for html"),
+        ({"out": Path("a.ply"), "format": "spz"}, "--out a.ply is a file of --format ply and compressed, not of spz"),
+        ({"out": Path("a.html")}, "--out a.html is a file of --format html, not of ply"),
+        ({"out": Path("a.ply"), "frames": 2}, "--frames writes several files: --out must be a folder, not a file as a"),
+        ({"out": Path("a.ply"), "layers": "apart"}, "--layers apart writes several files: --out must be a folder"),
         ({"max_gaussians": 0}, "--max-gaussians must be at least 1"),
         ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),

@@ -20,7 +20,7 @@ class Export:
     spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). usd: OpenUSD with
     time samples. 4dgs: container of moving scenes. html: one web page that plays the scene offline."""
     out: Path | None = None
-    """Output folder; RUN/export by default."""
+    """Output folder, or output file if this ends as files of the format do (scene.ply); RUN/export by default."""
     time: float | None = None
     """Time of a file, in [0, 1]; 0 by default."""
     frames: int | None = None

@@ -28,6 +28,7 @@ def export_run(options: Export) -> str:
         OSError: If a file cannot be written.
     """
     _check_format(options)
+    _check_out(options)
     _check_values(options)
     run = Run.open(options.run_folder, "cpu", options.data)
     job = Job(run, options, Clouds(run.trained_scene()))
@@ -48,6 +49,19 @@ def _check_format(options: Export) -> None:
         if getattr(options, field.name) != field.default:
             formats = " and ".join(name for name, writer in WRITERS.items() if field.name in writer.options)
             raise ValueError(f"{_flag(field.name)} is for --format {formats}, not for {options.format}")
+
+
+def _check_out(options: Export) -> None:
+    """Refuses a file as ``--out`` that is not of the format, or that is one for several."""
+    out = options.out
+    formats = [name for name, writer in WRITERS.items() if out and out.suffix and out.suffix == writer.suffix]
+    if out is None or not formats or out.is_dir():
+        return
+    if options.format not in formats:
+        raise ValueError(f"--out {out} is a file of --format {' and '.join(formats)}, not of {options.format}")
+    if options.frames is not None or options.layers == "apart":
+        several = "--layers apart" if options.frames is None else "--frames"
+        raise ValueError(f"{several} writes several files: --out must be a folder, not a file as {out}")
 
 
 def _check_values(options: Export) -> None:

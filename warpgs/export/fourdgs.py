@@ -22,12 +22,12 @@ PROFILE = "fine"
 
 
 def write_fourdgs(job: Job) -> str:
-    """Writes scene.4dgs; returns a summary.
+    """Writes one file; returns a summary.
 
     Raises:
         OSError: If it cannot be written, or fourdgs is not installed; the message says which.
     """
-    options, path = job.options, job.folder / "scene.4dgs"
+    options, path = job.options, job.file("scene.4dgs")
     keys, seconds = options.keys or KEYS, options.seconds or SECONDS
     fourdgs = required(path, "fourdgs", "fourdgs")
     file, writer = (required(path, f"fourdgs.keyframe_delta_{name}", "fourdgs") for name in ("file", "writer"))
@@ -62,4 +62,4 @@ def _arrays(cloud: Cloud, velocity: np.ndarray, time: float, seconds: float) -> 
     }
 
 
-FOURDGS = Writer(write_fourdgs, OPTIONS)
+FOURDGS = Writer(write_fourdgs, OPTIONS, ".4dgs")

@@ -37,6 +37,11 @@ class Job:
         """The output folder."""
         return self.options.out or self.options.run_folder / "export"
 
+    def file(self, name: str) -> Path:
+        """Where a file of this name is written: ``--out`` if that ends as it does, else in the output folder."""
+        out = self.folder
+        return out if out.suffix == Path(name).suffix and not out.is_dir() else out / name
+
     @property
     def capture(self) -> Capture | None:
         """The capture of the run, opened on first use, because that can take a minute; None if it cannot be opened."""
@@ -93,7 +98,9 @@ class Writer(NamedTuple):
     Attributes:
         write: Writes the files and returns a summary to print.
         options: Names of those options of ``Export`` that apply to this format but not to every other.
+        suffix: End of its file names, with the dot; ``--out`` may be such a file. Empty if it has to be a folder.
     """
 
     write: Callable[[Job], str]
     options: tuple[str, ...]
+    suffix: str = ""

@@ -130,7 +130,7 @@ def _check_memory(job: Job, keys: int) -> None:
 
 
 def _write(job: Job) -> str:
-    options, path = job.options, job.folder / "scene.html"
+    options, path = job.options, job.file("scene.html")
     keys = options.keys or KEYS
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
@@ -141,5 +141,5 @@ def _write(job: Job) -> str:
     return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.capture_note}"
 
 
-PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"))
+PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"), ".html")
 """The format "html"."""

@@ -23,7 +23,7 @@ def per_time(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool 
         write_cloud: Writes a cloud and returns the size of the file [bytes].
         y_up: Whether readers assume that y points up, as in glTF, instead of down, as in the PLY file of 3DGS.
     """
-    return Writer(partial(_write, suffix, write_cloud, y_up), OPTIONS)
+    return Writer(partial(_write, suffix, write_cloud, y_up), OPTIONS, Path(f"scene{suffix}").suffix)
 
 
 def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, job: Job) -> str:
@@ -40,9 +40,9 @@ def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, j
         for name in names:
             rows = cloud.finite if name == "scene" else cloud.finite & (cloud.is_dynamic == (name == "dynamic"))
             file = name + suffix if options.frames is None else _numbered(name, suffix, k)
-            size += write_cloud(folder / file, cloud.select(rows))
+            size += write_cloud(job.file(file), cloud.select(rows))
             num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
-    one, several = f"{folder / file}: {max_count:,} Gaussians", f"{num_files} files of up to {max_count:,} Gaussians"
+    one, several = f"{job.file(file)}: {max_count:,} Gaussians", f"{num_files} files of up to {max_count:,} Gaussians"
     written = one if num_files == 1 else f"{several} in {folder}"
     return f"{written}, {size / 1e6:.1f} MB\n{job.up_note}"
 

@@ -22,12 +22,12 @@ PARTS = ("extent", "positions", "orientations", "scales", "opacities", "coeffici
 
 
 def write_usd(job: Job) -> str:
-    """Writes scene.usdc; returns a summary.
+    """Writes one file; returns a summary.
 
     Raises:
         OSError: If it cannot be written, or usd-core is not installed; the message says which.
     """
-    options, path = job.options, job.folder / "scene.usdc"
+    options, path = job.options, job.file("scene.usdc")
     keys, seconds = options.keys or KEYS, options.seconds or SECONDS
     Usd, UsdGeom, UsdVol = (required(path, f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "UsdVol"))
     stage = Usd.Stage.CreateInMemory()
@@ -119,4 +119,4 @@ def _to_usd(name: str, values: np.ndarray) -> Any:
     return types.get(name, Vt.Vec3fArray).FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-USD = Writer(write_usd, OPTIONS)
+USD = Writer(write_usd, OPTIONS, ".usdc")
