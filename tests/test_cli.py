@@ -33,8 +33,9 @@ def shown(capsys, *arguments):
     return capsys.readouterr().out
 
 
-def test_the_list_of_commands_fits_on_a_screen(capsys):
-    assert main(["--help"]) == 0
+@pytest.mark.parametrize("option", ["--help", "-h", "--help-all"])
+def test_the_list_of_commands_fits_on_a_screen(option, capsys):
+    assert main([option]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 24
     assert max(map(len, lines)) <= 90

@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
-    if name in ("--help", "-h"):
+    if name in ("--help", "-h", "--help-all"):
         print(usage())
         return 0
     if name == "--version" or rest == ["--version"]:
@@ -120,7 +120,8 @@ def usage() -> str:
         commands:
         {commands}
 
-        warpgs COMMAND --help shows the options of a command; warpgs --version shows the version.
+        warpgs COMMAND --help shows the options of a command, warpgs train --help-all
+        all options of train; warpgs --version shows the version.
         """
     return textwrap.dedent(text).format(commands="\n".join(lines)).strip()
 
