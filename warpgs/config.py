@@ -97,7 +97,7 @@ class ModelConfig:
     deformation: str = "mlp"
     """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
     paths: Annotated[int, Bounds(min=1, max=4096)] = 1
-    """Number of splines of the deformation model "splines"; training sets it to the number of things."""
+    """Number of splines of the deformation model "splines"; training sets it to the number of objects."""
     path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
     """Number of control points of each of them; training sets it by the number of frames."""
     sh_degree: int = 1
@@ -114,7 +114,7 @@ class ModelConfig:
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
     tracks: bool = True
-    """Whether small things that move far between frames start on tracks (docs/design/tracks.md)."""
+    """Whether small objects that move far between frames start on tracks (docs/design/tracks.md)."""
     dynamic_start: Literal["points", "uniform"] = "points"
     """Where dynamic Gaussians start if their depth is unknown: in front of the sparse points around them, or uniformly
     in the scene's box, as in the code of the paper's authors; the paper names no start."""

@@ -1,4 +1,4 @@
-"""The built-in capture of small things that move far: its layout, its motion, and that it is the same everywhere."""
+"""The built-in capture of small objects that move far: its layout, its motion, and that it is the same everywhere."""
 
 import numpy as np
 import pytest

@@ -86,7 +86,7 @@ def test_the_shape_and_the_place_of_what_moves_change():
     assert float((masks[0] & masks[1]).sum()) < 0.7 * float(masks[0].sum())
 
 
-def test_a_network_is_wrong_by_a_few_percent_smoothly_and_moving_things_by_more():
+def test_a_network_is_wrong_by_a_few_percent_smoothly_and_moving_objects_by_more():
     flat, nothing = np.full((90, 160), 30_000.0), np.zeros((90, 160), bool)
     flat[:, :80] = 20_000.0
     errors = DegradedDepth(80)

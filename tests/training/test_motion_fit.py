@@ -11,16 +11,16 @@ from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.motion_fit import MAX_ERROR, fit_motion
 
 NUM_VIEWS, NUM_POINTS = 21, 40
-"""Frames, and points on each of two things in a frame."""
+"""Frames, and points on each of two objects in a frame."""
 EXTENT = 2.0
 TIMES = torch.linspace(0, 1, NUM_VIEWS)
 COLORS = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
-"""Of the two things."""
+"""Of the two objects."""
 MODEL = ModelConfig(position_bands=4, time_bands=4, depth=3, width=64, skip=2, half=False)
 
 
 def centers(time):
-    """[2, 3] of things that change places: each comes to where the other one was."""
+    """[2, 3] of objects that change places: each comes to where the other one was."""
     angle = torch.pi * (time - 0.5)
     side = 0.3 * torch.stack([angle.cos(), angle.sin(), 0.0 * angle])
     return torch.stack([side, -side])
@@ -73,7 +73,7 @@ def test_canonical_points_are_deformed_to_where_they_were_seen(fitted):
         assert torch.cdist(deformed(deformation, canonical, view), seen).amin(1).max() <= MAX_ERROR * EXTENT
 
 
-def test_each_thing_is_one_cluster_in_canonical_space(fitted):
+def test_each_object_is_one_cluster_in_canonical_space(fitted):
     canonical, _ = fitted
     first, second = (canonical.positions[(canonical.colors == color).all(1)] for color in COLORS)
     spread = max((points - points.mean(0)).norm(dim=1).max() for points in (first, second))
@@ -81,14 +81,14 @@ def test_each_thing_is_one_cluster_in_canonical_space(fitted):
     assert (first.mean(0) - second.mean(0)).norm() > 0.5
 
 
-def test_a_thing_is_carried_along_its_own_way(fitted):
+def test_an_object_is_carried_along_its_own_way(fitted):
     canonical, deformation = fitted
-    for color, thing in zip(COLORS, (0, 1), strict=True):
+    for color, label in zip(COLORS, (0, 1), strict=True):
         points = canonical.chosen((canonical.colors == color).all(1)).positions
         for view in range(NUM_VIEWS):
             with torch.no_grad():
                 moved = points + deformation(points, TIMES[view : view + 1])[:, :3]
-            assert error(moved.mean(0), centers(TIMES[view])[thing]) < 0.1  # they are 0.6 apart
+            assert error(moved.mean(0), centers(TIMES[view])[label]) < 0.1  # they are 0.6 apart
 
 
 def beside(center, views):
@@ -101,7 +101,7 @@ def beside(center, views):
 
 
 @pytest.mark.parametrize("x", [-0.2, 0.0, 0.2, 0.8])
-def test_a_thing_that_no_canonical_frame_shows_keeps_its_points(x):
+def test_an_object_that_no_canonical_frame_shows_keeps_its_points(x):
     points, deformation = beside([x, 0.0, 0.7], [16, 17, 18, 19, 20]), new_deformation()
     canonical = fit(points, deformation)
     grey = canonical.chosen((canonical.colors == 0.5).all(1))

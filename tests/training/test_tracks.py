@@ -1,4 +1,4 @@
-"""Tracks of small things that move far between frames, and trainings that start on them."""
+"""Tracks of small objects that move far between frames, and trainings that start on them."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def ball_centers(times: np.ndarray) -> np.ndarray:
     return np.array([[body.center for body in _balls(time, SIZE)] for time in times]) / UNITS
 
 
-def test_a_region_of_two_things_is_divided_by_their_colours():
+def test_a_region_of_two_objects_is_divided_by_their_colours():
     random = np.random.default_rng(0)
     rays = np.stack([np.linspace(-0.1, 0.1, 200), np.zeros(200), np.ones(200)], 1)
     red, blue = (
@@ -137,7 +137,7 @@ def test_the_penalty_is_that_of_fifth_differences():
 
 
 def test_many_specks_are_not_tracked(capture, monkeypatch):
-    monkeypatch.setattr(module, "MAX_THINGS", 4)
+    monkeypatch.setattr(module, "MAX_OBJECTS", 4)
     assert find_tracks(capture) == []
 
 
@@ -161,7 +161,7 @@ def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
     assert (found.optim.networks, found.optim.means) == (MAX_RATE, MAX_POSITION_RATE)
     assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
-    assert "5 things move far from frame to frame: dynamic Gaussians start on their tracks" in lines
+    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in lines
 
 
 def test_the_paper_starts_without_tracks(capture):
@@ -178,7 +178,7 @@ def test_tracks_can_be_switched_off(capture):
 
 def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
     config = TrainConfig(model=dataclasses.replace(TrainConfig().model, deformation="splines"))
-    with pytest.raises(ValueError, match="no small things are tracked"):
+    with pytest.raises(ValueError, match="no small objects are tracked"):
         fitted(config, load_capture(tiny.write(tmp_path)), print)
 
 

@@ -1,4 +1,4 @@
-"""The built-in capture ``builtin:balls``: small things that move far between frames, seen by a camera that jumps.
+"""The built-in capture ``builtin:balls``: small objects that move far between frames, seen by a camera that jumps.
 
 The layout is that of D-NeRF: 200×200 images with alpha, a camera at a random point of a hemisphere in every frame, no
 masks, no depth and no points. Five balls circle over nothing, two diameters from frame to frame; each evaluation frame

@@ -1,4 +1,4 @@
-"""Deformation along paths: each thing moves along a spline of its own, and a network adds what is left."""
+"""Deformation along paths: each object moves along a spline of its own, and a network adds what is left."""
 
 import torch
 from jaxtyping import Float
@@ -12,14 +12,14 @@ from .mlp_deformation import MlpDeformation
 class SplineDeformation(nn.Module):
     """The movement of the nearest home, a uniform cubic B-spline over time, plus the offsets of ``MlpDeformation``.
 
-    For small things that move far between frames, which a network alone finds neither nor follows exactly.
+    For small objects that move far between frames, which a network alone finds neither nor follows exactly.
 
     Args:
         config: ``paths`` and ``path_points`` are the sizes of the splines; the others are those of the network.
         center, half_size: [3] box of the scene.
 
     Attributes:
-        homes: [K, 3] canonical positions of the things [scene units].
+        homes: [K, 3] canonical positions of the objects [scene units].
         paths: [K, C, 3] control points of their positions over time, from 0 to 1 [scene units].
     """
 
@@ -39,7 +39,7 @@ class SplineDeformation(nn.Module):
         return self.network(means, time) + nn.functional.pad(moved, (0, 7))
 
     def positions(self, time: Float[Tensor, "1"]) -> Float[Tensor, "K 3"]:
-        """Positions of the things at a time; outside [0, 1], the first or last piece of the splines goes on."""
+        """Positions of the objects at a time; outside [0, 1], the first or last piece of the splines goes on."""
         pieces = self.paths.shape[1] - 3
         first = (time * pieces).floor().clamp(0, pieces - 1)
         f = time * pieces - first

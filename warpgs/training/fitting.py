@@ -23,10 +23,10 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
     seen = capture.assuming(config.assume).over(known_background(config, capture))
     tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
     if tracks:
-        log(f"{len(tracks)} things move far from frame to frame: dynamic Gaussians start on their tracks")
+        log(f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks")
         config = for_tracks(config, tracks)
     elif config.model.deformation == "splines":
-        raise ValueError('model.deformation "splines": no small things are tracked in this capture; use "mlp"')
+        raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')
     bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")

@@ -1,7 +1,7 @@
 """A deformation that follows what moves before any image is compared.
 
 Dynamic Gaussians of all frames form one set in canonical space. A network that starts as "no change" has to move those
-of every frame to where things are in all others. While it learns that, images pull Gaussians of one object onto another
+of every frame to their positions in all others. While it learns that, images pull Gaussians of one object onto another
 one, and no image brings them back: the object that they showed stays lost. So the network is fitted to the dynamic
 points of all frames first.
 """
@@ -146,7 +146,7 @@ class _PointsByView:
     def canonical(self, deformation: nn.Module, found: DynamicPoints) -> DynamicPoints:
         """The points that are deformed to where they were seen, each at its place beside the nearest canonical point.
 
-        Only what no canonical point shows is searched elsewhere: the rest would be found where another thing is.
+        Only what no canonical point shows is searched elsewhere: the rest would be found where another object is.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
         largest = MAX_ERROR * self.extent

@@ -41,9 +41,9 @@ def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
 def start_from_tracks(
     tracks: list[Track], deformation: SplineDeformation, config: TrainConfig, extent: float, generator: torch.Generator
 ) -> Gaussians:
-    """Dynamic Gaussians on things that were tracked, and the paths along which these move.
+    """Dynamic Gaussians on objects that were tracked, and the paths along which these move.
 
-    They start where the things are farthest from each other, so that canonical positions tell them apart.
+    They start where the objects are farthest from each other, so that canonical positions tell them apart.
 
     Args:
         tracks: At least one.
@@ -67,7 +67,7 @@ def start_from_tracks(
 
 
 def _time_apart(tracks: list[Track]) -> float:
-    """The time of a frame at which the smallest distance between two things is largest."""
+    """The time of a frame at which the smallest distance between two objects is largest."""
     times = np.unique([region.time for track in tracks for region in track.regions])
     paths = np.stack([track.path(times) for track in tracks])
     distances = np.linalg.norm(paths[:, None] - paths[None], axis=-1)
@@ -76,7 +76,7 @@ def _time_apart(tracks: list[Track]) -> float:
 
 
 def _points(track: Track) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-    """Offsets from the path and colours of what all frames see of a thing, as if it were round."""
+    """Offsets from the path and colours of what all frames see of an object, as if it were round."""
     offsets: list[np.ndarray] = []
     colors: list[np.ndarray] = []
     for region in track.regions:

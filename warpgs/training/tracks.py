@@ -1,6 +1,6 @@
-"""Tracks of small things that move far between frames, as the start of what deforms.
+"""Tracks of small objects that move far between frames, as the start of what deforms.
 
-Where a thing moves farther than its size from frame to frame, comparing colours where it is not says nothing about
+Where an object moves farther than its size from frame to frame, comparing colours where it is not says nothing about
 where it is: Gaussians become transparent instead of following. But the rays through the centres of its silhouettes fix
 its path (trajectory triangulation, Park et al. 2010): the one that most rays meet and that is smooth, a spline with a
 penalty on differences of its coefficients (P-splines, Eilers and Marx 1996).
@@ -27,7 +27,7 @@ MIN_PART = 0.15
 """Fraction of a region's pixels from which on their colours make a part of it."""
 
 SHOWING_ALL = 0.75
-"""Quantile of the frames' numbers of regions that is the number of things: in many frames, one hides another."""
+"""Quantile of the frames' numbers of regions that is the number of objects: in many frames, one hides another."""
 
 DEGREE, ORDER = 3, 5
 """Degree of the splines; order of the differences that are penalized (3 made paths up to ten times less precise)."""
@@ -50,8 +50,8 @@ MIN_BEND = 1.0
 """Minimum median of the second differences of the camera centres, relative to the first ones: the path of a camera that
 moves evenly would meet all of its rays. 0.03 to 0.31 in orbits, 1.7 of a camera at random points."""
 
-MAX_THINGS = 32
-"""Maximum number of things that are tracked."""
+MAX_OBJECTS = 32
+"""Maximum number of objects that are tracked."""
 
 MIN_STEP = 0.5
 """Median movement from frame to frame, in diameters, from which on tracks are used."""
@@ -59,7 +59,7 @@ MIN_STEP = 0.5
 
 @dataclass(frozen=True)
 class Track:
-    """The path of a thing.
+    """The path of an object.
 
     Attributes:
         path: Its position [3] over time [scene units].
@@ -73,10 +73,10 @@ class Track:
 
 
 def find_tracks(capture: Capture) -> list[Track]:
-    """Tracks of the things that a capture shows before transparent surroundings, one per colour.
+    """Tracks of the objects that a capture shows before transparent surroundings, one per colour.
 
     Returns:
-        None at all if the camera moves evenly, if there are too few regions or too many things, if one of them has no
+        None at all if the camera moves evenly, if there are too few regions or too many objects, if one of them has no
         path, or if they move little from frame to frame.
     """
     if capture.assumption != "dynamic" or not capture.has_empty or not _jumps(capture):
@@ -84,7 +84,7 @@ def find_tracks(capture: Capture) -> list[Track]:
     by_frame = find_regions(capture)
     regions = [region for of_frame in by_frame for region in of_frame]
     count = int(np.quantile([len(of_frame) for of_frame in by_frame], SHOWING_ALL))
-    if not 0 < count <= MAX_THINGS or len(regions) < MIN_REGIONS * count:
+    if not 0 < count <= MAX_OBJECTS or len(regions) < MIN_REGIONS * count:
         return []
     labels = _by_color(np.array([region.lab for region in regions]), count)
     regions, labels = _divided(regions, labels, count)
@@ -116,7 +116,7 @@ def _by_color(colors: Float[np.ndarray, "R 3"], count: int) -> np.ndarray:
 
 
 def _divided(regions: list[Region], labels: np.ndarray, count: int) -> tuple[list[Region], np.ndarray]:
-    """The regions and their labels, with those of several things divided by the colours of their pixels.
+    """The regions and their labels, with those of several objects divided by the colours of their pixels.
 
     Pixels go to the most likely of normal distributions, one per label, of the regions whose colours are most typical.
     """
