@@ -5,7 +5,7 @@ import pytest
 
 from tests.data.captures import dynamic_block
 from warpgs.config import MaskPerturbation
-from warpgs.data.masks import perturb
+from warpgs.data.masks import connected_regions, perturb
 
 STATIC = np.ones((120, 160), dtype=bool)
 STATIC[30:90, 40:110] = False
@@ -13,6 +13,15 @@ STATIC[30:90, 40:110] = False
 
 def num_dynamic(static):
     return int((~static).sum())
+
+
+def test_regions_are_connected_by_sides_and_have_a_minimum_area():
+    mask = np.zeros((6, 8), bool)
+    mask[0:2, 0:2] = mask[2:4, 2:5] = mask[5, 7] = True
+    regions = connected_regions(mask, 4)
+    assert [int(region.sum()) for region in regions] == [4, 6]
+    assert np.array_equal(regions[0] | regions[1] | (np.arange(48).reshape(6, 8) == 47), mask)
+    assert connected_regions(np.zeros((3, 4), bool), 1) == []
 
 
 def test_no_perturbation_changes_nothing():

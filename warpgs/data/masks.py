@@ -1,4 +1,4 @@
-"""Perturbation of training masks (paper, robustness under mask perturbations)."""
+"""Masks: their connected regions, and their perturbation for training (paper, robustness)."""
 
 import hashlib
 
@@ -13,6 +13,12 @@ HOLE_RADIUS = 0.03
 
 MAX_RADIUS = 256
 """Maximum radius of erosion and dilation [px]."""
+
+
+def connected_regions(mask: Bool[np.ndarray, "H W"], min_area: int) -> list[Bool[np.ndarray, "H W"]]:
+    """The connected regions of a mask that have at least ``min_area`` pixels; diagonal neighbours are not connected."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    return [labels == k for k in range(1, len(stats)) if stats[k, cv2.CC_STAT_AREA] >= min_area]
 
 
 def check_perturbation(perturbation: MaskPerturbation) -> None:

@@ -1,5 +1,6 @@
 """Moving objects as connected regions of the masks, followed from frame to frame."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Int
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.masks import connected_regions
 from warpgs.data.motion_check import MIN_SIDE, grey_at, leads_back
 
 MAX_SIDE = 512
@@ -139,8 +141,7 @@ def _regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
         return []
     dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
     dynamic = cv2.resize(dynamic, scaled_size(frame.camera), interpolation=cv2.INTER_NEAREST_EXACT)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(dynamic, connectivity=4)
-    return [labels == k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= MIN_AREA * dynamic.size]
+    return connected_regions(dynamic > 0, math.ceil(MIN_AREA * dynamic.size))
 
 
 def _is_cut(region: Bool[np.ndarray, "h w"]) -> bool:

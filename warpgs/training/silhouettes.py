@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.masks import connected_regions
 from warpgs.data.sampling import evenly_spaced_indices
 
 MIN_PIXELS = 12
@@ -60,18 +61,12 @@ def _regions(frame: Frame) -> list[Region]:
     to_rays = np.linalg.inv(camera.K.double().numpy() @ camera.viewmat[:3, :3].double().numpy())
     origin = camera.position.double().numpy()
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(float)
-    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(dynamic, connectivity=4)
     regions = []
-    for label in range(1, count):
-        left, top, width, height, area = stats[label]
-        if area < MIN_PIXELS:
-            continue
-        y, x = np.nonzero(labels[top : top + height, left : left + width] == label)
-        y, x = y + top, x + left
+    for region in connected_regions(~frame.static_mask.numpy(), MIN_PIXELS):
+        y, x = np.nonzero(region)
         rays = _unit(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ to_rays.T)
-        radius = float(np.sqrt(area / (np.pi * float(camera.K[0, 0] * camera.K[1, 1]))))
-        kept = evenly_spaced_indices(int(area), MAX_PIXELS)
+        radius = float(np.sqrt(len(x) / (np.pi * float(camera.K[0, 0] * camera.K[1, 1]))))
+        kept = evenly_spaced_indices(len(x), MAX_PIXELS)
         colors = image[y[kept], x[kept]] / 255.0
         regions.append(Region(camera.time, origin, _unit(rays.mean(0)), radius, lab[y, x].mean(0), rays[kept], colors))
     return regions
