@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
 
@@ -57,9 +57,7 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     if min(size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
     a, b = (grey_at(frame, size) for frame in (first, second))
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = method.calc(a, b, None)
-    agrees = leads_back(flow, method.calc(b, a, None))
+    flow, agrees = flow_between(a, b)
     distance = _epipolar_distance(first, second, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
     textured = gradient > max(np.quantile(gradient, 0.6), 8.0)
@@ -83,14 +81,21 @@ def are_comparable(first: Camera, second: Camera) -> bool:
     return float(relative.trace()) >= 1.0 + 2.0 * math.cos(math.radians(MAX_ANGLE))
 
 
-def leads_back(forward: Float[np.ndarray, "H W 2"], backward: Float[np.ndarray, "H W 2"]) -> Bool[np.ndarray, "H W"]:
-    """Whether the backward flow at the end of the forward flow is its opposite, up to a pixel and 5 % of its length."""
-    height, width = forward.shape[:2]
+def flow_between(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]
+) -> tuple[Float[np.ndarray, "H W 2"], Bool[np.ndarray, "H W"]]:
+    """Optical flow (DIS) from one grey image to another, and whether the flow back is its opposite at its end.
+
+    Up to a pixel and 5 % of its length. Both sides of the images are at least ``MIN_SIDE``.
+    """
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    forward, backward = method.calc(first, second, None), method.calc(second, first, None)
+    height, width = first.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     far = (1e4,) * 4
     target = x + forward[..., 0], y + forward[..., 1]
     returned = cv2.remap(backward, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=far)
-    return np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
+    return forward, np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
 
 
 def grey_at(frame: Frame, size: tuple[int, int]) -> np.ndarray:

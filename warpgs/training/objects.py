@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.masks import connected_regions
-from warpgs.data.motion_check import MIN_SIDE, grey_at, leads_back
+from warpgs.data.motion_check import MIN_SIDE, flow_between, grey_at
 
 MAX_SIDE = 512
 """Regions are found in masks that are scaled down to this longer side [px]."""
@@ -154,11 +154,9 @@ def _carried(labels: Int[np.ndarray, "h w"], before: Frame, frame: Frame) -> Int
     height, width = labels.shape
     if min(height, width) < MIN_SIDE:
         return np.full_like(labels, NOTHING)
-    now, then = (grey_at(f, (width, height)) for f in (frame, before))
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = method.calc(now, then, None)
+    flow, leads_back = flow_between(*(grey_at(f, (width, height)) for f in (frame, before)))
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     column, row = np.rint(x + flow[..., 0]).astype(int), np.rint(y + flow[..., 1]).astype(int)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     found = labels[row.clip(0, height - 1), column.clip(0, width - 1)]
-    return np.where(inside & leads_back(flow, method.calc(then, now, None)), found, NOTHING)
+    return np.where(inside & leads_back, found, NOTHING)
