@@ -24,6 +24,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
+from warpgs.visualize import to_bytes
 
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
@@ -161,7 +162,7 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
         time = k / (size.num_frames - 1)
         image, depth, static = trace(time, shift, size)
         rotation, position = _pose(time, shift)
-        writer.write_image(folder, name, (image.clamp(0, 1) * 255).round().byte().numpy())
+        writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
         writer.write_camera(folder, name, _lens(size), rotation.round(9), position.round(9))
         if side == "left":

@@ -15,6 +15,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
+from warpgs.visualize import to_bytes
 
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
@@ -143,7 +144,7 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
     for name, (side, k, shift) in zip(times, progress(jobs, "creating the built-in scene", quiet), strict=True):
         camera, image, depth, bodies = trace(k / (scene.num_frames - 1), shift, scene, device)
         static = bodies < num_static
-        writer.write_image(folder, name, (image.clamp(0, 1) * 255).round().byte().numpy())
+        writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
         writer.write_camera(folder, name, _lens(camera), camera.viewmat[:3, :3].numpy(), camera.position.numpy())
         if side == "left":

@@ -19,6 +19,7 @@ from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 from warpgs.video.encodings import ENCODINGS
 from warpgs.video.writer import Video
+from warpgs.visualize import to_bytes
 
 RATE = 12.0
 """Frames per second."""
@@ -79,7 +80,7 @@ def _frame(clutter: list[Body], time: float, size: SampleSize) -> UInt8[np.ndarr
     lamp = torch.tensor([[0.8, -2.2, 3.4], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])  # small: sharp shadows
     bodies = as_tensors([*clutter, *_moving(time)], cpu)
     traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
-    return (traced.image.clamp(0, 1) * 255).round().byte().numpy()
+    return to_bytes(traced.image)
 
 
 def _camera(time: float, size: SampleSize) -> Camera:
