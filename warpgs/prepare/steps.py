@@ -75,15 +75,8 @@ class Steps:
         weak_features: bool = False,
     ) -> Cameras:
         """The cameras of the named frames, from features outside of the masks."""
-        settings = Settings(
-            self.options.lens,
-            masks.folder if masks else None,
-            thorough,
-            weak_features,
-            self._focal,
-            known=self._known_lens,
-            turns=self.options.camera == "turning",
-        )
+        folder = masks.folder if masks else None
+        settings = replace(self._settings, masks=folder, thorough=thorough, weak_features=weak_features)
 
         def make(path: Path) -> str:
             if self.options.camera == "still":
@@ -94,16 +87,7 @@ class Steps:
 
     def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
         """The cameras of the first pass, refined with the matches outside of the masks."""
-        settings = Settings(
-            self.options.lens,
-            masks.folder,
-            thorough=True,
-            weak_features=first.weak_features,
-            focal=self._focal,
-            refine=True,
-            known=self._known_lens,
-            turns=self.options.camera == "turning",
-        )
+        settings = replace(self._settings, masks=masks.folder, weak_features=first.weak_features, refine=True)
 
         def make(path: Path) -> str:
             if self.options.camera == "still":
@@ -131,6 +115,12 @@ class Steps:
             self.journal.notes.append(f"the focal length is assumed, {focal:.0f} px: frames of a tripod do not tell it")
         poses = np.tile(np.eye(4)[:3], (len(names), 1, 1))
         return Cameras(names, lens, poses, np.zeros((0, 3)), 0.0, 0.0)
+
+    @property
+    def _settings(self) -> Settings:
+        """What the options say of every pass."""
+        turns = self.options.camera == "turning"
+        return Settings(self.options.lens, focal=self._focal, known=self._known_lens, turns=turns)
 
     @property
     def _focal(self) -> float | None:
