@@ -44,7 +44,7 @@ COMMANDS = {
     "report": Command(".report.command:Report", "write one HTML file about runs"),
     "bench": Command(".bench.command:Bench", "measure rendering times"),
 }
-"""All commands, in the order of a user's way."""
+"""All commands, in the order in which they are used."""
 
 TRAIN_OPTIONS = (
     *("data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "assume", "exposure"),

@@ -12,7 +12,7 @@ from warpgs.model.splats import Splats
 
 @torch.no_grad()
 def jitter(splats_at: Callable[[float], Splats], times: Sequence[float]) -> float | None:
-    """How far dynamic Gaussians are off their way, halfway between two neighbouring times.
+    """How far dynamic Gaussians deviate from straight paths, halfway between two neighbouring times.
 
     Σ o ‖p(½ (t₀ + t₁)) − ½ (p(t₀) + p(t₁))‖ / Σ o ‖p(t₁) − p(t₀)‖ over all neighbouring times and all dynamic
     Gaussians, with their positions p and opacities o. It is 0 for motion along straight lines at constant speed, and
@@ -25,7 +25,7 @@ def jitter(splats_at: Callable[[float], Splats], times: Sequence[float]) -> floa
     Returns:
         None if there are fewer than two times or if nothing moves.
     """
-    deviation, way = 0.0, 0.0
+    deviation, length = 0.0, 0.0
     ordered = sorted(set(times))
     at_times = (_dynamic(splats_at(time)) for time in ordered)
     for (start, end), ((before, opacities), (after, _)) in zip(
@@ -33,8 +33,8 @@ def jitter(splats_at: Callable[[float], Splats], times: Sequence[float]) -> floa
     ):
         middle, _ = _dynamic(splats_at(0.5 * (start + end)))
         deviation += (opacities * (middle - 0.5 * (before + after)).norm(dim=1)).sum().item()
-        way += (opacities * (after - before).norm(dim=1)).sum().item()
-    return deviation / way if way > 0 else None
+        length += (opacities * (after - before).norm(dim=1)).sum().item()
+    return deviation / length if length > 0 else None
 
 
 def _dynamic(splats: Splats) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:

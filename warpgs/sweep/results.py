@@ -24,7 +24,7 @@ def notes_of(board: Board) -> list[str]:
     """Paragraphs below the tables: how much has finished, how long it took, and what failed and why."""
     seconds = [metrics.get("train_seconds") for metrics in board.metrics.values()]
     hours = sum(value for value in seconds if isinstance(value, int | float)) / 3600.0
-    notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {hours:.2f} hours of training in all."]
+    notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {hours:.2f} hours of training in total."]
     reasons: dict[str, list[str]] = {}
     for name, error in board.errors.items():
         if board.states[name] != "finished":

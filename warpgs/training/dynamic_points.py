@@ -43,8 +43,8 @@ MAX_SCALE_FRACTION = 0.5
 
 
 INVERSION_STEPS, INVERSION_RATE = 12, 0.5
-"""Fixed-point iterations with which a deformation is inverted, and the part of the missing way that each of them goes:
-more would not converge where nearby points move differently."""
+"""Fixed-point iterations with which a deformation is inverted, and the fraction of the remaining distance that each of
+them moves a point: more would not converge where nearby points move differently."""
 
 
 class DynamicPoints(NamedTuple):
