@@ -25,6 +25,9 @@ from .errors import FAILED, visible
 
 Options = TypeVar("Options")
 
+RunFolder = Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
+"""A positional argument: the folder of a run."""
+
 METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH"}
 
 

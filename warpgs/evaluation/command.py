@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from warpgs.command_line import RunFolder
 from warpgs.config import NetName
 from warpgs.errors import ending_at_once
 
@@ -17,7 +16,7 @@ class Eval:
     If training corrected camera poses (preset best), held-out cameras are aligned to the scene by their images first.
     """
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
+    run_folder: RunFolder
     """Run folder."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from warpgs.command_line import RunFolder
 from warpgs.errors import ending_at_once
 
 
@@ -13,7 +12,7 @@ from warpgs.errors import ending_at_once
 class Export:
     """Exports the newest checkpoint of a run for other programs, at one time or moving."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
+    run_folder: RunFolder
     """Run folder."""
     format: str = "ply"
     """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.

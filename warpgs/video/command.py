@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.command_line import RunFolder
 from warpgs.errors import ending_at_once
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
@@ -19,7 +20,7 @@ MAX_SIDE = 16_384
 class Render:
     """Renders a run's newest checkpoint to images and a video."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
+    run_folder: RunFolder
     """Run folder."""
     path: PathName | None = None
     """Camera path: the evaluation views (default); a fixed camera over time; the training camera's path at one fixed

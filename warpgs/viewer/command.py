@@ -3,11 +3,9 @@
 import sys
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
-
+from warpgs.command_line import RunFolder
 from warpgs.errors import ending_at_once
 from warpgs.posix import share_free_memory
 
@@ -16,7 +14,7 @@ from warpgs.posix import share_free_memory
 class View:
     """Shows a run in the browser: move through space and time, switch layers, look through the training cameras."""
 
-    run_folder: Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
+    run_folder: RunFolder
     """Run folder."""
     host: str = "127.0.0.1"
     """Address to listen on. By default only this machine can connect; 0.0.0.0 accepts connections from everywhere."""
