@@ -11,7 +11,7 @@ from warpgs.ops.ssim import ssim
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    "errors config presets files posix progress command_line version",
+    "errors bounds config presets files posix progress command_line version",
     "kernels",
     "runtime",
     "ops",

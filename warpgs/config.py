@@ -2,41 +2,14 @@
 
 import dataclasses
 import math
-import reprlib
-import typing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-MAX_VALUE = 10**15
-"""Maximum of every number that has no smaller one."""
+from .bounds import Bounds, check_bounds
 
 NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Range of a number in a config, as metadata of its type: ``depth: Annotated[int, Bounds(min=1)]``. Others
-    have the default range.
-
-    Attributes:
-        min, max: Inclusive limits.
-        positive: Whether 0 is excluded as well.
-    """
-
-    min: int = 0
-    max: int | float = MAX_VALUE
-    positive: bool = False
-
-    def check(self, name: str, value: int | float) -> None:
-        """Raises ValueError, naming the option, if the value is out of range or not a number."""
-        if not value >= self.min:
-            raise ValueError(f"{name} must be a number of at least {self.min}, got {value}")
-        if value > self.max:
-            raise ValueError(f"{name} must be a number of at most {self.max}, got {reprlib.repr(value)}")
-        if self.positive and value == 0:
-            raise ValueError(f"{name} must be positive, got 0")
 
 
 @dataclass(frozen=True)
@@ -353,7 +326,7 @@ def validate(config: TrainConfig) -> None:
     Raises:
         ValueError: If a number is out of its range; the message names it.
     """
-    _check_bounds("", config)
+    check_bounds("", config)
     model, schedule = config.model, config.schedule
     if not model.appearance_degree <= model.sh_degree <= 3:
         raise ValueError(
@@ -367,17 +340,6 @@ def validate(config: TrainConfig) -> None:
         )
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
-
-
-def _check_bounds(prefix: str, config: Any) -> None:
-    """Checks every number of a dataclass, and of those inside, against the bounds beside its field."""
-    for name, hint in typing.get_type_hints(type(config), include_extras=True).items():
-        value = getattr(config, name)
-        if dataclasses.is_dataclass(value):
-            _check_bounds(f"{prefix}{name}.", value)
-        elif isinstance(value, int | float):
-            bounds = (data for data in getattr(hint, "__metadata__", ()) if isinstance(data, Bounds))
-            next(bounds, Bounds()).check(prefix + name, value)
 
 
 def scaled(config: TrainConfig) -> TrainConfig:
