@@ -24,8 +24,8 @@ def depth_difference(
     alpha: wp.array[float],
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
-    region: wp.array[wp.uint8],
     margin: wp.array[float],
+    region: wp.array[wp.uint8],
     p: int,
 ) -> float:
     """Depth minus the nearest end of target ± margin; 0 between these, and in pixels that are not compared."""
@@ -46,13 +46,13 @@ def depth_error_fwd(
     alpha: wp.array[float],
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
-    region: wp.array[wp.uint8],
     margin: wp.array[float],
+    region: wp.array[wp.uint8],
     errors: wp.array[float],
 ):
     """One thread for each pixel."""
     p = first + wp.tid()
-    errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, region, margin, p))
+    errors[p] = wp.abs(depth_difference(depth, alpha, inverse_depth, alignment, margin, region, p))
 
 
 @wp.kernel(enable_backward=False)
@@ -62,13 +62,13 @@ def depth_error_bwd(
     alpha: wp.array[float],
     inverse_depth: wp.array[float],
     alignment: wp.array[float],
-    region: wp.array[wp.uint8],
     margin: wp.array[float],
+    region: wp.array[wp.uint8],
     scale: float,
     v_sum: wp.array[float],
     v_depth: wp.array[float],
 ):
     """One thread for each pixel; ``v_sum`` [1] times ``scale`` is the gradient of the sum of all errors."""
     p = first + wp.tid()
-    difference = depth_difference(depth, alpha, inverse_depth, alignment, region, margin, p)
+    difference = depth_difference(depth, alpha, inverse_depth, alignment, margin, region, p)
     v_depth[p] = scale * v_sum[0] * abs_derivative(difference)

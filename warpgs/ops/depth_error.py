@@ -20,8 +20,7 @@ def depth_error(
 ) -> Float[Tensor, ""]:
     """Mean over the image of max(|depth − target| − margin · target, 0) [scene units]; Eq. 14 with a margin of 0.
 
-    target = 1 / (scale · inverse_depth + offset). Pixels that are not compared count as zero. Differentiable in
-    ``depth`` only.
+    target = 1 / (scale · inverse_depth + offset); 0 where not compared. Differentiable in ``depth`` only.
 
     Args:
         depth: [H, W] rendered depth of one branch, normalised by opacity [scene units].
@@ -37,14 +36,9 @@ def depth_error(
     _check_inputs({"depth": depth, "alpha": alpha, "inverse_depth": inverse_depth}, alignment, region, margin)
     num_pixels, mask = depth.numel(), region.view(torch.uint8).view(-1)
 
-    def arrays(tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """The inputs of both kernels."""
-        *floats, margin = (t.view(-1) for t in tensors)
-        return *floats, mask, margin
-
     def op(*tensors: Tensor) -> Recorded:
         errors = tensors[0].new_empty(num_pixels)
-        launch(kernels.depth_error_fwd, num_pixels, *arrays(tensors), errors, work=LITTLE_WORK)
+        launch(kernels.depth_error_fwd, num_pixels, *(t.view(-1) for t in tensors), mask, errors, work=LITTLE_WORK)
         return Recorded((errors.mean(),), backward, tensors)
 
     def backward(saved: tuple[Tensor, ...], v_outputs: Gradients) -> Gradients:
@@ -52,11 +46,10 @@ def depth_error(
         assert v_mean is not None
         v_depth = torch.empty_like(saved[0])
         outputs = (1.0 / num_pixels, v_mean.view(1), v_depth.view(-1))
-        launch(kernels.depth_error_bwd, num_pixels, *arrays(saved), *outputs, work=LITTLE_WORK)
+        launch(kernels.depth_error_bwd, num_pixels, *(t.view(-1) for t in saved), mask, *outputs, work=LITTLE_WORK)
         return v_depth, None, None, None, None
 
-    constants = (alpha, inverse_depth, alignment, margin)
-    return differentiable(op, depth, *(tensor.detach() for tensor in constants))[0]
+    return differentiable(op, depth, *(t.detach() for t in (alpha, inverse_depth, alignment, margin)))[0]
 
 
 def _check_inputs(images: dict[str, Tensor], alignment: Tensor, region: Tensor, margin: Tensor) -> None:
