@@ -96,6 +96,7 @@ PAPER = {
     "no such thing in the paper": {
         "optim.poses": 0.0,
         "exposure": False,
+        "try_masks": False,
         "antialias": False,
         "densify.weakest": 0.0,
         "densify.reseed": 0.0,

@@ -17,7 +17,7 @@ from torch.distributed import TCPStore
 from warpgs.config import TrainConfig
 from warpgs.files import write_json
 from warpgs.runs.checkpoint import _hash
-from warpgs.training import command, ranks
+from warpgs.training import command, mask_trial, ranks
 from warpgs.training import train as script
 from warpgs.training.step import Step
 from warpgs.training.trainer import Trainer
@@ -169,3 +169,12 @@ def with_differences(folder: Path, config: TrainConfig, what: str) -> int:
         whole = script.open_capture
         script.open_capture = lambda *_: dataclasses.replace(c := whole(*_), points=c.points + 1e-3)
     return command_with(config)
+
+
+def try_masks(folder: Path, config: TrainConfig) -> None:
+    """Each rank finds another quality without masks, above and below that with them, and writes what it assumes."""
+    without = 31.0 if os.environ["RANK"] == "0" else 29.0
+    mask_trial.held_out_psnr = lambda _, __, assume, ___: 30.0 if assume == "masks" else without
+    with ranks.joined():
+        trainer = script.make_trainer(config)
+        write_json(folder / f"rank{ranks.rank()}.json", {"assume": trainer.config.assume})

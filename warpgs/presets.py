@@ -30,6 +30,7 @@ BEST = TrainConfig(
     static_appearance=True,
     exposure=True,
     antialias=True,
+    try_masks=True,
     model=ModelConfig(
         position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
     ),
@@ -107,6 +108,7 @@ PATIENT = dataclasses.replace(
 QUICK = dataclasses.replace(
     PATIENT,
     preset="quick",
+    try_masks=False,  # a trial is as long as two trainings of this preset
     model=dataclasses.replace(PATIENT.model, time_bands=4, sh_degree=1, max_static_points=4_000, dynamic_points=1_500),
     densify=dataclasses.replace(PATIENT.densify, gradient=4e-4, max_gaussians=10_000),
     schedule=Schedule(

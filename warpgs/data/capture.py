@@ -163,6 +163,12 @@ class Capture:
         capture.cameras, capture._moved = self.cameras | dict(cameras), self._moved | set(cameras)
         return capture
 
+    def split(self, train: Sequence[str], val: Sequence[str]) -> "Capture":
+        """The same capture with other frames to train and to evaluate on; the captures have one cache of frames."""
+        capture = copy.copy(self)
+        capture.train, capture.val = tuple(train), tuple(val)
+        return capture
+
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.
 

@@ -1,13 +1,18 @@
-"""Images, masks and depth of other programs: of any resolution, resized to that of the camera."""
+"""Images, masks and depth of any resolution, resized to that of the camera; captures of smaller images."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
 
+from warpgs.cameras import Camera
 from warpgs.files import read_array
 
+from .capture import Capture, Frame
 from .images import MAX_PIXELS, decode, fill_transparent, is_bright, to_8_bits
 
 WHITE = 255
@@ -107,6 +112,30 @@ def resize_mask(static: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[
         return static
     dynamic = cv2.resize(np.where(static, 0, 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA)
     return dynamic == 0
+
+
+def reduced_capture(capture: Capture, max_side: int) -> Capture:
+    """The capture with frames of at most ``max_side`` pixels along the larger side; larger frames are averaged."""
+    cameras = {name: _reduced_camera(camera, max_side) for name, camera in capture.cameras.items()}
+    return replace(capture, cameras=cameras, read=lambda name: _reduced_frame(capture.frame(name), cameras[name]))
+
+
+def _reduced_camera(camera: Camera, max_side: int) -> Camera:
+    factor = min(1.0, max_side / max(camera.size))
+    return camera.resized(*(max(1, round(side * factor)) for side in camera.size))
+
+
+def _reduced_frame(frame: Frame, camera: Camera) -> Frame:
+    """A frame in the size of a camera; pixels are dynamic where any part of them is, and empty where all of it is."""
+
+    def whole(mask: Tensor | None) -> Tensor | None:
+        return None if mask is None else torch.from_numpy(resize_mask(mask.numpy(), camera.size))
+
+    depth = frame.inverse_depth
+    if depth is not None:
+        depth = torch.from_numpy(cv2.resize(depth.numpy(), camera.size, interpolation=cv2.INTER_NEAREST_EXACT))
+    image = torch.from_numpy(resize(frame.image.numpy(), camera.size))
+    return Frame(frame.name, camera, image, whole(frame.static_mask), depth, whole(frame.covisible), whole(frame.empty))
 
 
 def check_shape(path: Path, what: str, stored: tuple[int, int], size: tuple[int, int]) -> None:

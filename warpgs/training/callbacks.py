@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.errors import one_line
 from warpgs.evaluation.metrics import psnr
@@ -53,6 +55,13 @@ Callback = Callable[[Progress], object]
 """Called every 50 iterations and at checkpoints, off the clock; training stops if it returns true."""
 
 
+@torch.no_grad()
+def render_and_compare(scene: TrainedScene, frame: Frame) -> tuple[Float[Tensor, "H W 3"], float]:
+    """The joint image of a frame's camera, and its PSNR [dB]."""
+    image = scene.render(frame.camera).joint.image.clamp(0, 1)
+    return image, psnr(image, frame.image.to(image.device).float() / 255.0)
+
+
 class HeldOut:
     """Adds PSNR and images of a few evaluation views to TensorBoard, seldom; a callback.
 
@@ -78,8 +87,8 @@ class HeldOut:
             self._failed = True
             return
         for frame in frames:
-            image = progress.scene.render(frame.camera).joint.image.clamp(0, 1)
-            values.append(psnr(image, frame.image.to(image.device).float() / 255.0))
+            image, value = render_and_compare(progress.scene, frame)
+            values.append(value)
             self._logger.add_image(f"held-out/{frame.name}", reduced(to_bytes(image), HELD_OUT_WIDTH), iteration)
             if not self._has_truth:
                 self._logger.add_image(

@@ -22,6 +22,7 @@ from .callbacks import Callback, HeldOut, Previewer
 from .fitting import fitted
 from .interrupt import Interrupt
 from .logger import TrainingLogger
+from .mask_trial import with_trusted_masks
 from .schedule import extended
 from .trainer import Trainer
 
@@ -215,8 +216,8 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
-    config = fitted(config, capture, log)
     _compare_ranks(config, capture)
+    config = fitted(with_trusted_masks(config, capture, log, quiet), capture, log)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
     if ranks.is_first():

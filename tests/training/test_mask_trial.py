@@ -1,0 +1,132 @@
+"""Estimated masks are tried out, and not used if held-out frames are better without them."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from tests import tiny, two_ranks
+from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.data.loaders import load_capture
+from warpgs.data.synthetic import builtin_capture
+from warpgs.training import mask_trial
+from warpgs.training.mask_trial import held_out_psnr, with_trusted_masks
+
+LENGTH = 60
+pytestmark = pytest.mark.usefixtures("quickly")
+
+CONFIG = dataclasses.replace(tiny.CONFIG, preset="best", app=False, try_masks=True, background="black")
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """A trial that takes a second."""
+    schedule = dataclasses.replace(tiny.SCHEDULE, stage1=LENGTH - 6, stage2=0)
+    monkeypatch.setattr(mask_trial, "TRIAL", dataclasses.replace(tiny.CONFIG, schedule=schedule))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture of 17 frames whose masks are estimates that miss everything that moves."""
+    scene = dataclasses.replace(tiny.SCENE, num_frames=17)
+    root = builtin_capture(tmp_path_factory.mktemp("masks"), scene, quiet=True)
+    index = root / "dataset.json"
+    index.write_text(json.dumps(json.loads(index.read_text()) | {"masks": "estimated"}))
+    for file in root.glob("resized_mask/*/*.png"):
+        cv2.imwrite(str(file), np.full_like(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), 255))
+    return root
+
+
+@pytest.fixture
+def qualities(monkeypatch):
+    """PSNR with and without the masks, instead of trainings."""
+    found = {"masks": 30.0, "dynamic": 30.0}
+    monkeypatch.setattr(mask_trial, "held_out_psnr", lambda config, capture, assume, quiet: found[assume])
+    return found
+
+
+def decide(folder, config=CONFIG):
+    lines: list[str] = []
+    return with_trusted_masks(config, load_capture(folder), lines.append, quiet=True).assume, lines
+
+
+def test_both_trainings_are_made_and_the_better_one_is_followed(folder, monkeypatch):
+    measured = []
+
+    def measure(config, capture, assume, quiet):
+        measured.append((assume, held_out_psnr(config, capture, assume, quiet)))
+        return measured[-1][1]
+
+    monkeypatch.setattr(mask_trial, "held_out_psnr", measure)
+    monkeypatch.setattr(mask_trial, "MIN_GAIN", 0.0)
+    assume, lines = decide(folder)
+    (_, following), (_, ignoring) = measured
+    assert [name for name, _ in measured] == ["masks", "dynamic"]
+    assert following != ignoring
+    assert assume == ("dynamic" if ignoring > following else "masks")
+    assert f"{following:.1f} dB with the masks and {ignoring:.1f} dB without" in lines[-1]
+
+
+@pytest.mark.parametrize(("without", "assume"), [(29.0, "masks"), (30.45, "masks"), (30.6, "dynamic")])
+def test_masks_are_used_unless_none_are_clearly_better(folder, qualities, without, assume):
+    qualities["dynamic"] = without
+    found, lines = decide(folder)
+    assert found == assume
+    assert f"30.0 dB with the masks and {without:.1f} dB without" in lines[-1]
+
+
+@pytest.mark.parametrize("changes", [{"assume": "static"}, {"try_masks": False}])
+def test_masks_that_are_not_in_question_are_not_tried(folder, qualities, changes):
+    qualities["dynamic"] = 40.0
+    config = dataclasses.replace(CONFIG, **changes)
+    assert decide(folder, config) == (config.assume, [])
+
+
+def test_given_masks_and_few_frames_are_not_tried(folder, qualities):
+    qualities["dynamic"] = 40.0
+    capture = load_capture(folder)
+    few, given = capture.split(capture.train[:15], ()), load_capture(folder)
+    given.estimated_masks = False
+    for other in (few, given):
+        assert with_trusted_masks(CONFIG, other, print, quiet=True) == CONFIG
+
+
+def test_the_trial_sees_small_images(folder, monkeypatch):
+    sizes = set()
+
+    def psnr(config, capture, assume, quiet):
+        sizes.add(capture.frame(capture.train[0]).image.shape)
+        return 30.0
+
+    monkeypatch.setattr(mask_trial, "held_out_psnr", psnr)
+    monkeypatch.setattr(mask_trial, "MAX_SIDE", 16)
+    decide(folder)
+    assert sizes == {(12, 16, 3)}
+
+
+def test_held_out_frames_are_not_trained_on(folder, monkeypatch):
+    trained = []
+
+    class Watched(mask_trial.Trainer):
+        def __init__(self, config, capture, run):
+            super().__init__(config, capture, run)
+            trained.append((config, capture.train, capture.val, run))
+
+    monkeypatch.setattr(mask_trial, "Trainer", Watched)
+    capture = load_capture(folder)
+    assert np.isfinite(held_out_psnr(dataclasses.replace(CONFIG, iterations=5_000), capture, "dynamic"))
+    [(config, train, val, run)] = trained
+    assert val == (capture.train[4], capture.train[12])
+    assert sorted((*train, *val)) == sorted(capture.train)
+    assert (config.schedule.num_iterations, config.iterations, config.assume) == (LENGTH, None, "dynamic")
+    assert not config.app  # a switch of the run
+    assert not run.exists()
+
+
+def test_all_ranks_follow_the_decision_of_the_first(folder, tmp_path):
+    config = dataclasses.replace(CONFIG, data=folder, out=tmp_path / "ranks" / "run")
+    assert two_ranks.start(tmp_path / "ranks", two_ranks.try_masks, config) == [0, 0]
+    found = [json.loads((tmp_path / "ranks" / f"rank{k}.json").read_text()) for k in (0, 1)]
+    assert found == [{"assume": "dynamic"}, {"assume": "dynamic"}]
