@@ -42,13 +42,13 @@ def rotation_offset(offsets: wp.array2d[float], i: int) -> wp.vec4:
 @wp.kernel(enable_backward=False)
 def activate_fwd(
     first: int,
-    first_row: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     logit_opacities: wp.array[float],
     offsets: wp.array2d[float],
     logit_residuals: wp.array[float],
+    first_row: int,
     out_means: wp.array[wp.vec3],
     out_quats: wp.array[wp.vec4],
     out_scales: wp.array[wp.vec3],
@@ -75,7 +75,6 @@ def activate_fwd(
 @wp.kernel(enable_backward=False)
 def activate_bwd(
     first: int,
-    first_row: int,
     quats: wp.array[wp.vec4],
     offsets: wp.array2d[float],
     scales: wp.array[wp.vec3],
@@ -84,6 +83,7 @@ def activate_bwd(
     v_out_quats: wp.array[wp.vec4],
     v_out_scales: wp.array[wp.vec3],
     v_out_opacities: wp.array[float],
+    first_row: int,
     v_means: wp.array[wp.vec3],
     v_quats: wp.array[wp.vec4],
     v_log_scales: wp.array[wp.vec3],
@@ -113,10 +113,10 @@ def activate_bwd(
 @wp.kernel(enable_backward=False)
 def join_sh_fwd(
     first: int,
-    first_row: int,
     sh_dc: wp.array2d[wp.vec3],
     sh_rest: wp.array2d[wp.vec3],
     residuals: wp.array2d[wp.vec3],
+    first_row: int,
     sh: wp.array2d[wp.vec3],
 ):
     """One thread for each Gaussian and basis, which writes that coefficient of all three colours."""
@@ -137,8 +137,8 @@ def join_sh_fwd(
 @wp.kernel(enable_backward=False)
 def join_sh_bwd(
     first: int,
-    first_row: int,
     v_sh: wp.array2d[wp.vec3],
+    first_row: int,
     v_sh_dc: wp.array2d[wp.vec3],
     v_sh_rest: wp.array2d[wp.vec3],
     v_residuals: wp.array2d[wp.vec3],

@@ -204,11 +204,11 @@ def test_every_image_equals_that_of_its_splats_rendered_alone(make, seed, monkey
     launch_on_cpu = launch.launch_on_cpu
     for backwards in (False, True):  # as on a GPU, where a branch's image may begin before the joint one ends
 
-        def run_kernel(kernel, dim, arguments, work, backwards=backwards):
+        def run_kernel(kernel, dim, arguments, per_shard, work, backwards=backwards):
             if not backwards or kernel.func.__name__ != "composite_fwd":
-                return launch_on_cpu(kernel, dim, arguments, work)
+                return launch_on_cpu(kernel, dim, arguments, per_shard, work)
             for thread in reversed(range(dim)):
-                command_for(kernel, torch.device("cpu"), 1)(1, thread, arguments, None, 0)
+                command_for(kernel, torch.device("cpu"), 1)(1, thread, (*arguments, *per_shard), None)
 
         monkeypatch.setattr(launch, "launch_on_cpu", run_kernel)
         result = ours(inputs, size, is_dynamic=dynamic)

@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from tests.scenes import as_leaves, gradients, make_camera, make_splats
+from tests.scenes import as_leaves, generator, gradients, make_camera, make_splats
+from warpgs.kernels.mlp import relu_bwd
 from warpgs.kernels.projection import project_fwd
 from warpgs.rendering import render
 from warpgs.runtime import launch as launching
@@ -31,6 +32,17 @@ def test_a_kernel_argument_of_a_wrong_type_is_refused(quats):
 def test_a_kernel_argument_that_is_not_contiguous_is_refused():
     with pytest.raises(TypeError, match="scales must be contiguous"):
         launch(torch.ones(7, 4), torch.ones(3, 7).T)
+
+
+def test_leading_axes_of_a_kernel_argument_are_flattened():
+    features, gradients = torch.randn(2, 6, 8, generator=generator()).half()
+    expected, sums = torch.zeros(2, 2, 8)
+    launching.launch(relu_bwd, 2, features, gradients.clone(), expected)
+    assert expected.any()
+    odd = features.view(3, 1, 2, 8).transpose(1, 2)  # contiguous, whatever the stride of an axis of size one is
+    assert odd.is_contiguous()
+    launching.launch(relu_bwd, 2, odd, gradients.view(1, 6, 8), sums)
+    assert torch.equal(sums, expected)
 
 
 def image_and_gradients(seed: int) -> list[torch.Tensor]:

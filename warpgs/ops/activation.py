@@ -76,7 +76,7 @@ def _activate(*tensors: Any) -> Recorded:
     N, new = num_static + len(tensors[half]), tensors[0].new_empty
     out = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))
     for branch, first_row in zip(branches, (0, num_static), strict=True):
-        launch(kernels.activate_fwd, len(branch[0]), first_row, *branch, *out)
+        launch(kernels.activate_fwd, len(branch[0]), *branch, first_row, *out)
     return Recorded(tuple(out), _activate_backward, (*tensors, out.scales, out.opacities))
 
 
@@ -91,7 +91,7 @@ def _activate_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradient
         v_raw = [torch.empty_like(t) for t in branch[:NUM_GEOMETRY]]
         v_offsets = None if offsets is None else torch.empty_like(offsets)
         inputs = (quats, offsets, scales, opacities, *v_out)
-        launch(kernels.activate_bwd, len(quats), first_row, *inputs, *v_raw, v_offsets)
+        launch(kernels.activate_bwd, len(quats), *inputs, first_row, *v_raw, v_offsets)
         gradients += [*v_raw, v_offsets, None if logit_residuals is None else v_raw[-1]]
     return gradients
 
@@ -128,7 +128,7 @@ def _join_sh(bases: int, *tensors: Any) -> Recorded:
     num_static = len(tensors[0])
     sh = tensors[0].new_empty(num_static + len(tensors[3]), bases, 3)
     for parts, first_row in ((tensors[:3], 0), (tensors[3:], num_static)):
-        launch(kernels.join_sh_fwd, len(parts[0]) * bases, first_row, *parts, sh)
+        launch(kernels.join_sh_fwd, len(parts[0]) * bases, *parts, first_row, sh)
     return Recorded((sh,), _join_sh_backward, tensors)
 
 
@@ -137,7 +137,7 @@ def _join_sh_backward(saved: tuple[Any, ...], v_outputs: Gradients) -> Gradients
     assert v_sh is not None
     v_inputs = [None if t is None else torch.empty_like(t) for t in saved]
     for k, first_row in ((0, 0), (3, len(saved[0]))):
-        launch(kernels.join_sh_bwd, len(saved[k]) * v_sh.shape[1], first_row, v_sh, *v_inputs[k : k + 3])
+        launch(kernels.join_sh_bwd, len(saved[k]) * v_sh.shape[1], v_sh, first_row, *v_inputs[k : k + 3])
     return v_inputs
 
 

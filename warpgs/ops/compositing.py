@@ -12,7 +12,7 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import OffsetGradient, gradient_stride
-from warpgs.runtime.launch import PerShard, launch, num_shards
+from warpgs.runtime.launch import launch, num_shards
 from warpgs.runtime.tape import Gradients
 
 from .rows import Rows
@@ -110,6 +110,7 @@ def _launch(
     background: Tensor | None,
     traversal: Traversal,
     *arguments: Any,
+    per_shard: Tensor | None,
 ) -> None:
     """Launches a compositing kernel over all blocks of pixels of all images."""
     tiles, size, num_images = traversal.tiles, traversal.size, traversal.num_images
@@ -120,7 +121,8 @@ def _launch(
     inputs = (*lists, rows.packed, colors, stride, *size)
     kernel = make_kernel(rows.num_features, rows.with_depth, num_images, pixels, variant)
     work = TILE_SIZE * TILE_SIZE
-    launch(kernel, num_images * blocks * lanes, *inputs, *arguments, block_dim=BLOCK_DIM, work=work)
+    dim = num_images * blocks * lanes
+    launch(kernel, dim, *inputs, *arguments, per_shard=(per_shard,), block_dim=BLOCK_DIM, work=work)
 
 
 def composite_fwd(
@@ -151,8 +153,8 @@ def composite_fwd(
     N, shards = len(rows.packed), num_shards(image.device)
     contributed = new(N, dtype=torch.uint8).zero_() if statistics else None
     weights = new(shards, N).zero_() if statistics else None
-    outputs = (image, depth, alpha, *traversal[3:], contributed, None if weights is None else PerShard(weights))
-    _launch(make_composite_fwd, statistics, rows, background, traversal, *outputs)
+    outputs = (image, depth, alpha, *traversal[3:], contributed)
+    _launch(make_composite_fwd, statistics, rows, background, traversal, *outputs, per_shard=weights)
     images, alphas, depths = (
         () if t is None else tuple(layer.detach() for layer in t.view(num_images, height, width, *t.shape[1:]))
         for t in (image, alpha, depth)  # detached from each other, so that they may be modified in place
@@ -183,7 +185,7 @@ def composite_bwd(
         v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = None if v is None else v.view(-1)
     v_rows = rows.packed.new_zeros(num_shards(rows.packed.device), len(rows.packed), gradient_stride(rows.num_channels))
     inputs = (*traversal[2:], *v_arrays, images_with_gradient)
-    _launch(make_composite_bwd, offset_gradient, rows, background, traversal, *inputs, PerShard(v_rows))
+    _launch(make_composite_bwd, offset_gradient, rows, background, traversal, *inputs, per_shard=v_rows)
     return v_rows
 
 

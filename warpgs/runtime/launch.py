@@ -7,11 +7,11 @@ all cores.
 
 import contextlib
 import functools
+import math
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -34,39 +34,44 @@ LITTLE_WORK = 1 / 16
 _CORES = os.cpu_count() or 1
 
 
-@dataclass(frozen=True)
-class PerShard:
-    """A kernel argument of which each CPU shard gets its own slice, because Warp's atomics are not atomic on CPU."""
-
-    tensor: Tensor
-
-
 def num_shards(device: torch.device) -> int:
     """Number of cores that a CPU launch uses (``torch.get_num_threads()``); 1 on CUDA."""
     return 1 if device.type == "cuda" else max(1, min(torch.get_num_threads(), _CORES))
 
 
-def launch(kernel: wp.Kernel, dim: int, *arguments: Any, block_dim: int = 256, work: int | float = 1) -> None:
+def launch(
+    kernel: wp.Kernel,
+    dim: int,
+    *arguments: Any,
+    per_shard: Sequence[Tensor | None] = (),
+    block_dim: int = 256,
+    work: int | float = 1,
+) -> None:
     """Launches ``dim`` threads of a kernel on the device of its arguments, on torch's current stream.
 
     Args:
         kernel: Its first parameter is ``first``, the index of the first thread.
         dim: Number of threads.
-        arguments: Of the parameters after ``first``: tensors, numbers, or None for an empty array.
+        arguments: Of the parameters after ``first``: contiguous tensors, the first argument among them, numbers, or
+            None for an empty array. More axes than an array of the kernel has are leading axes, which are flattened.
+        per_shard: The last arguments: tensors [``num_shards``, …] of which each CPU shard gets its own slice, because
+            Warp's atomics are not atomic on CPU.
         block_dim: Threads per CUDA block.
         work: Work of one of its threads relative to a plain thread, to decide how many cores a CPU launch uses.
     """
     if dim == 0:
         return
-    device = next(a.device for a in arguments if isinstance(a, Tensor))
+    device = arguments[0].device
     with profiling.span(kernel.func.__name__, device):
         if device.type == "cuda":
-            command_for(kernel, device, block_dim)(dim, 0, arguments, current_stream(device))
+            command_for(kernel, device, block_dim)(dim, 0, (*arguments, *per_shard), current_stream(device))
         else:
-            launch_on_cpu(kernel, dim, arguments, work)
+            launch_on_cpu(kernel, dim, arguments, per_shard, work)
 
 
-def launch_on_cpu(kernel: wp.Kernel, dim: int, arguments: Sequence[Any], work: int | float) -> None:
+def launch_on_cpu(
+    kernel: wp.Kernel, dim: int, arguments: Sequence[Any], per_shard: Sequence[Tensor | None], work: int | float
+) -> None:
     """Launches a kernel on one core, or cut into shards on all of them."""
     device = torch.device("cpu")
     shards = num_shards(device) if dim * work >= MIN_SHARD else 1
@@ -74,8 +79,9 @@ def launch_on_cpu(kernel: wp.Kernel, dim: int, arguments: Sequence[Any], work: i
 
     def run_shard(shard: int) -> None:
         command = command_for(kernel, device, 1)
+        own = (*arguments, *(None if t is None else t[shard] for t in per_shard))
         for first in range(shard * chunk, dim, shards * chunk):
-            command(min(chunk, dim - first), first, arguments, None, shard)
+            command(min(chunk, dim - first), first, own, None)
 
     on_all_cores(run_shard, shards)
 
@@ -99,15 +105,14 @@ def _workers() -> ThreadPoolExecutor:
 
 def current_stream(device: torch.device) -> wp.Stream:
     """torch's current stream on a GPU as a Warp stream."""
-    key = device.index, torch.accelerator.current_stream(device.index).stream_id  # faster than a torch.cuda.Stream
-    stream = _streams.get(key)
+    handle = torch._C._cuda_getCurrentRawStream(device.index)  # faster than a torch.cuda.Stream
+    stream = _streams.get((device, handle))
     if stream is None:
-        handle = torch.cuda.current_stream(device).cuda_stream
-        stream = _streams[key] = wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
+        stream = _streams[device, handle] = wp.Stream(wp.device_from_torch(device), cuda_stream=handle)
     return stream
 
 
-_streams: dict[tuple[int, int], wp.Stream] = {}
+_streams: dict[tuple[torch.device, int], wp.Stream] = {}
 
 
 class Command:
@@ -129,52 +134,52 @@ class Command:
         self.dim = 1
         _bounds, self.first, *self.slots = self.launch.params
         self.arguments = kernel.adj.args[1:]
-        self.shapes: list[Any] = [None] * len(self.slots)
+        self.shapes: list[Any] = [None if hasattr(a.type, "ndim") else _NUMBER for a in self.arguments]
 
-    def __call__(
-        self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None, shard: int = 0
-    ) -> None:
+    def __call__(self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
         """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers or None (an empty array)."""
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
         self.first.value = first
-        shapes = self.shapes
-        for index, (slot, value) in enumerate(zip(self.slots, arguments, strict=True)):
-            if type(value) is PerShard:
-                value = value.tensor[shard]
-            if isinstance(value, Tensor):
-                slot.data = value.data_ptr()
-                shape = value.shape
-                if shape != shapes[index]:
-                    _describe(self.arguments[index], slot, value)
-                    shapes[index] = shape
-            elif value is not None:
+        for index, (slot, shape, value) in enumerate(zip(self.slots, self.shapes, arguments, strict=True)):
+            if shape is _NUMBER:
                 slot.value = value
-            elif shapes[index] is not None:
+            elif value is not None:
+                slot.data = value.data_ptr()
+                if value.shape != shape:
+                    _describe(self.arguments[index], slot, value)
+                    self.shapes[index] = value.shape
+            elif shape is not None:
                 slot.data = 0
                 slot.shape[0] = 0
-                shapes[index] = None
+                self.shapes[index] = None
         self.launch.launch(stream)
+
+
+_NUMBER = object()
+"""The shape of a kernel argument that is a number."""
 
 
 def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
     """Writes the shape and strides of a tensor to a kernel argument, after checking that they fit the kernel."""
     dtype, ndim = argument.type.dtype, argument.type.ndim
-    inner = getattr(dtype, "_shape_", ())
+    inner = tuple(getattr(dtype, "_shape_", ()))
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    if wp.dtype_to_torch(scalar) != tensor.dtype or tuple(tensor.shape[ndim:]) != tuple(inner):
+    flattened = tensor.ndim - ndim - len(inner)
+    if wp.dtype_to_torch(scalar) != tensor.dtype or flattened < 0 or tensor.shape[flattened + ndim :] != inner:
         raise TypeError(
             f"kernel argument {argument.label} is a {ndim}-d array of {dtype.__name__}, "
             f"got {tuple(tensor.shape)} {tensor.dtype}"
         )
     if not tensor.is_contiguous():
         raise TypeError(f"kernel argument {argument.label} must be contiguous")
+    sizes = math.prod(tensor.shape[: flattened + 1]), *tensor.shape[flattened + 1 : flattened + ndim]
+    stride = math.prod(inner) * tensor.element_size()
     slot.ndim = ndim
-    strides = tensor.stride()
-    for axis in range(ndim):
-        slot.shape[axis] = tensor.shape[axis]
-        slot.strides[axis] = strides[axis] * tensor.element_size()
+    for axis in reversed(range(ndim)):
+        slot.shape[axis], slot.strides[axis] = sizes[axis], stride
+        stride *= sizes[axis]
 
 
 _commands = threading.local()
