@@ -205,21 +205,25 @@ _warp_stream = threading.Lock()
 
 def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
-    device = wp.device_from_torch(keys.device)
-    pairs = [_int_array(t.data_ptr(), t.numel(), device.alias) for t in (keys, values)]
-    with profiling.span("sort_pairs", keys.device):
-        if keys.device.type == "cpu":
-            wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
+    device = keys.device
+    arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
+    with profiling.span("sort_pairs", device):
+        if device.type == "cpu":
+            _native.wp_radix_sort_pairs_int_host(*arguments)
             return
-        stream = current_stream(keys.device)
+        stream = current_stream(device)
         with _warp_stream:
-            previous = device.stream
-            device.set_stream(stream, sync=False)  # a capture forbids to wait for another stream
+            previous = stream.device.stream
+            stream.device.set_stream(stream, sync=False)  # a capture forbids to wait for another stream
             try:
                 with _announced_capture(stream):
-                    wp.utils.radix_sort_pairs(*pairs, count, 0, num_bits)
+                    _native.wp_radix_sort_pairs_int_device(*arguments)
             finally:
-                device.set_stream(previous, sync=False)
+                stream.device.set_stream(previous, sync=False)
+
+
+_native = wp.get_device("cpu").runtime.core
+"""Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which cost the host as much as the sort."""
 
 
 def _announced_capture(stream: wp.Stream) -> contextlib.AbstractContextManager[object]:
@@ -227,9 +231,3 @@ def _announced_capture(stream: wp.Stream) -> contextlib.AbstractContextManager[o
     if not torch.cuda.is_current_stream_capturing():
         return contextlib.nullcontext()
     return wp.ScopedCapture(stream=stream, external=True, force_module_load=False)
-
-
-@functools.lru_cache(maxsize=256)
-def _int_array(pointer: int, size: int, device: str) -> wp.array:
-    """A Warp array over memory of torch; cached, because torch's allocator reuses the same blocks."""
-    return wp.array(ptr=pointer, dtype=wp.int32, shape=(size,), device=device)
