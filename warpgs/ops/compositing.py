@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, int32
+from torch import Tensor
 
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
@@ -66,9 +66,9 @@ class Traversal(NamedTuple):
     Attributes:
         tiles: Lists of the Gaussians of each tile.
         size: (width, height) [px].
-        depth: [pixels of all images] rendered depth; None without.
-        transmittance: [pixels of all images] at the end of each pixel.
-        last: [pixels of all images] int32 number of Gaussians of the list until the last one that contributed.
+        depth: [pixels of all images, in any shape] rendered depth; None without.
+        transmittance: [the same] at the end of each pixel.
+        last: [the same] int32 number of Gaussians of the list until the last one that contributed.
         joint_state: [blocks] int32, see ``equals_joint``; None for a single image.
     """
 
@@ -115,10 +115,9 @@ def _launch(
     """Launches a compositing kernel over all blocks of pixels of all images."""
     tiles, size, num_images = traversal.tiles, traversal.size, traversal.num_images
     pixels, blocks, lanes = _layout(size, tiles)
-    colors = None if background is None else background.view(-1)
     stride = 0 if background is None or background.ndim == 1 else rows.num_features
     lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
-    inputs = (*lists, rows.packed, colors, stride, *size)
+    inputs = (*lists, rows.packed, background, stride, *size)
     kernel = make_kernel(rows.num_features, rows.with_depth, num_images, pixels, variant)
     work = TILE_SIZE * TILE_SIZE
     dim = num_images * blocks * lanes
@@ -145,22 +144,28 @@ def composite_fwd(
     num_pixels = num_images * height * width
     if num_pixels >= MAX_PIXELS:
         raise ValueError(f"{num_images} images of {width} x {height} pixels are too large to be rendered at once")
-    new = rows.packed.new_empty
-    image, alpha = new(num_pixels, rows.num_features), new(num_pixels)
-    depth = new(num_pixels) if rows.with_depth else None
-    joint_state = None if num_images == 1 else new(_layout(size, tiles)[1], dtype=int32).zero_()
-    traversal = Traversal(tiles, size, depth, new(num_pixels), new(num_pixels, dtype=int32), joint_state)
-    N, shards = len(rows.packed), num_shards(image.device)
+    new, new_int = rows.packed.new_empty, tiles.ranges.new_empty
+    shape = (height, width) if num_images == 1 else (num_images, height, width)
+    image, alpha = new(*shape, rows.num_features), new(shape)
+    depth = new(shape) if rows.with_depth else None
+    joint_state = None if num_images == 1 else new_int(_layout(size, tiles)[1]).zero_()
+    own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
+    traversal = Traversal(tiles, size, own_depth, new(shape), new_int(shape), joint_state)
+    N, shards = rows.packed.shape[0], num_shards(image.device)
     contributed = new(N, dtype=torch.uint8).zero_() if statistics else None
     weights = new(shards, N).zero_() if statistics else None
     outputs = (image, depth, alpha, *traversal[3:], contributed)
     _launch(make_composite_fwd, statistics, rows, background, traversal, *outputs, per_shard=weights)
-    images, alphas, depths = (
-        () if t is None else tuple(layer.detach() for layer in t.view(num_images, height, width, *t.shape[1:]))
-        for t in (image, alpha, depth)  # detached from each other, so that they may be modified in place
-    )
     found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
+    images, alphas, depths = (_layers(t, num_images) for t in (image, alpha, depth))
     return Composite(images, alphas, depths, found), traversal
+
+
+def _layers(tensor: Tensor | None, num_images: int) -> tuple[Tensor, ...]:
+    """The layer of each image, detached from each other, so that they may be modified in place."""
+    if tensor is None:
+        return ()
+    return (tensor,) if num_images == 1 else tuple(layer.detach() for layer in tensor)
 
 
 def composite_bwd(
@@ -182,8 +187,9 @@ def composite_bwd(
     images_with_gradient = sum({1 << (k % num_images) for k, v in enumerate(v_layers) if v is not None})
     v_arrays: list[Tensor | None] = [None] * (3 * NUM_BRANCH_IMAGES)  # images, alphas, depths
     for k, v in enumerate(v_layers):
-        v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = None if v is None else v.view(-1)
-    v_rows = rows.packed.new_zeros(num_shards(rows.packed.device), len(rows.packed), gradient_stride(rows.num_channels))
+        v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = v
+    packed = rows.packed
+    v_rows = packed.new_zeros(num_shards(packed.device), packed.shape[0], gradient_stride(rows.num_channels))
     inputs = (*traversal[2:], *v_arrays, images_with_gradient)
     _launch(make_composite_bwd, offset_gradient, rows, background, traversal, *inputs, per_shard=v_rows)
     return v_rows
