@@ -76,7 +76,7 @@ def project_fwd(
         screen_offsets: [N, 2] added to the means on screen, in halves of the image size.
     """
     means = geometry.means
-    N = len(means)
+    N = means.shape[0]
     splats = Projection(
         means2d=means.new_empty(N, 2),
         conics=means.new_empty(N, 3),
@@ -104,7 +104,7 @@ def project_bwd(
         v_splats: Gradients of means2d, conics, depths and opacities of its result; None for zeros.
         v_means_of_colors: [N, 3] gradient of the means through the colours, to be added; overwritten.
     """
-    N = len(geometry.means)
+    N = geometry.means.shape[0]
     v_geometry = Geometry(*(torch.empty_like(t) for t in geometry))
     if v_means_of_colors is not None:
         v_geometry = v_geometry._replace(means=v_means_of_colors)

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, int32
+from torch import Tensor
 
 from warpgs.kernels import rows as kernels
 from warpgs.kernels.rows import OffsetGradient
@@ -42,7 +42,7 @@ def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, 
     """Packs N splats with [N, num_features] features; sets the radii of those that are skipped to 0."""
     N, num_features = features.shape
     packed = features.new_empty(N, kernels.row_parts(num_features + int(with_depth)), 4)
-    order = DepthOrder(*(features.new_empty(2 * N, dtype=int32) for _ in range(2)))
+    order = DepthOrder(*(splats.radii.new_empty(2 * N) for _ in range(2)))
     launch(kernels.make_pack(num_features, with_depth), N, *splats, features, packed, *order)
     return Rows(packed, num_features, with_depth), order
 
@@ -77,7 +77,7 @@ def unpack(
         offset_gradient: As in ``composite_bwd``.
     """
     conics, opacities = splats
-    N = len(conics)
+    N = conics.shape[0]
     v_splats = PackGradients(
         means2d=conics.new_empty(N, 2),
         conics=torch.empty_like(conics),

@@ -50,7 +50,7 @@ def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: in
         [N, 3] RGB, not negative.
     """
     colors = torch.empty_like(means)
-    launch(kernels.sh_fwd, len(means), means, sh, viewmat, radii, num_bases(degree), colors)
+    launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, radii, num_bases(degree), colors)
     return colors
 
 
@@ -67,7 +67,7 @@ def sh_bwd(
     """
     means, sh, viewmat, _ = inputs
     v_means, v_sh = torch.empty_like(means), torch.empty_like(sh)
-    launch(kernels.sh_bwd, len(means), *inputs, num_bases(degree), colors, v_colors, v_means, v_sh)
+    launch(kernels.sh_bwd, means.shape[0], *inputs, num_bases(degree), colors, v_colors, v_means, v_sh)
     if not viewmat.requires_grad:
         return v_means, v_sh, None
     # The viewpoint is -Wᵀ translation of the viewing matrix [W, translation].

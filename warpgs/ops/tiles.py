@@ -43,7 +43,7 @@ class Tiles(NamedTuple):
     @property
     def half(self) -> int:
         """Begin of the second half of ``gaussian_from_isect``."""
-        return len(self.gaussian_from_isect) // 2
+        return self.gaussian_from_isect.shape[0] // 2
 
 
 class _Budget:
@@ -88,7 +88,7 @@ def _capacity(end_of_rank: Tensor, size: tuple[int, int], max_intersections: int
     Raises:
         RuntimeError: If that is unknown during a CUDA graph capture, which must not wait for the device.
     """
-    N, device = len(end_of_rank), end_of_rank.device
+    N, device = end_of_rank.shape[0], end_of_rank.device
     if max_intersections is not None:
         return max(max_intersections, N), end_of_rank.new_empty(1)
     if device.type == "cpu":
@@ -132,7 +132,7 @@ def bin_splats(
         RuntimeError: If the first frame of a size is captured in a CUDA graph without ``max_intersections``.
     """
     splats, grid = splat_rows.packed, num_tiles(*size)
-    N, total = len(splats), grid[0] * grid[1]
+    N, total = splats.shape[0], grid[0] * grid[1]
     if is_dynamic is not None and N >= kernels.MAX_WITH_BRANCHES:
         raise ValueError(f"with branches there must be fewer than {kernels.MAX_WITH_BRANCHES} Gaussians, got {N}")
     if N == 0 or total == 0:
@@ -151,12 +151,12 @@ def _bin(
 ) -> Tiles:
     """Bins splats that have been sorted and counted."""
     (_, end_of_rank, is_dynamic), (columns, rows) = ranks, num_tiles(*size)
-    N, total = len(splats), columns * rows
+    N, total, new_int = splats.shape[0], columns * rows, ranks[0].new_empty
     capacity, num_isects = _capacity(end_of_rank, size, max_intersections)
-    isects = splats.new_empty(2 * capacity, dtype=int32), splats.new_empty(2 * capacity, dtype=int32)  # tile, Gaussian
+    isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
     launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, columns, rows, capacity, *isects, num_isects)
     sort_pairs(*isects, capacity, total.bit_length())
-    ranges = splats.new_empty(total, 2, dtype=int32)
+    ranges = new_int(total, 2)
     launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
     tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
     if is_dynamic is not None:

@@ -23,20 +23,24 @@ def check_tensor(
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a torch tensor, got {type(value).__name__}")
-    wanted = "[" + ", ".join(str(s) for s in shape) + "]"
     if value.ndim != len(shape):
-        raise ValueError(f"{name} must have shape {wanted}, got {list(value.shape)}")
+        raise ValueError(f"{name} must have shape {_text(shape)}, got {list(value.shape)}")
     for want, got in zip(shape, value.shape, strict=True):
         if isinstance(want, str):
             known = sizes.setdefault(want, got)
             if known != got:
-                raise ValueError(f"{name} must have shape {wanted} with {want} = {known}, got {list(value.shape)}")
+                wanted = f"{_text(shape)} with {want} = {known}"
+                raise ValueError(f"{name} must have shape {wanted}, got {list(value.shape)}")
         elif want != got:
-            raise ValueError(f"{name} must have shape {wanted}, got {list(value.shape)}")
+            raise ValueError(f"{name} must have shape {_text(shape)}, got {list(value.shape)}")
     if value.dtype not in dtypes:
         raise ValueError(f"{name} must be {' or '.join(str(d) for d in dtypes)}, got {value.dtype}")
     if not value.is_contiguous():
         raise ValueError(f"{name} must be contiguous in memory; call .contiguous() on it")
+
+
+def _text(shape: tuple[int | str, ...]) -> str:
+    return "[" + ", ".join(str(size) for size in shape) + "]"
 
 
 def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:

@@ -62,5 +62,5 @@ def differentiable(op: Callable[..., Recorded], *tensors: Tensor | None) -> tupl
     if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors):
         return _Node.apply(op, *tensors)
     with torch.no_grad():
-        recorded = op(*(None if t is None else t.detach() for t in tensors))
+        recorded = op(*(t.detach() if t is not None and t.requires_grad else t for t in tensors))
     return recorded.outputs + recorded.constants
