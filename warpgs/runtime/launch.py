@@ -142,27 +142,37 @@ class Command:
             self.launch.set_dim(dim)
             self.dim = dim
         self.first.value = first
-        for index, (slot, shape, value) in enumerate(zip(self.slots, self.shapes, arguments, strict=True)):
+        is_known = len(arguments) == len(self.slots)
+        for slot, shape, value in zip(self.slots, self.shapes, arguments):  # noqa: B905 - strict takes a tenth longer
             if shape is _NUMBER:
                 slot.value = value
             elif value is not None:
                 slot.data = value.data_ptr()
-                if value.shape != shape:
-                    _describe(self.arguments[index], slot, value)
-                    self.shapes[index] = value.shape
+                is_known = is_known and value.shape == shape
             elif shape is not None:
-                slot.data = 0
-                slot.shape[0] = 0
-                self.shapes[index] = None
+                is_known = False
+        if not is_known:
+            self._describe(arguments)
         self.launch.launch(stream)
+
+    def _describe(self, arguments: Sequence[Any]) -> None:
+        """Writes the shapes of the tensors."""
+        for index, (slot, argument, value) in enumerate(zip(self.slots, self.arguments, arguments, strict=True)):
+            if self.shapes[index] is not _NUMBER:
+                _describe(argument, slot, value)
+                self.shapes[index] = None if value is None else value.shape
 
 
 _NUMBER = object()
 """The shape of a kernel argument that is a number."""
 
 
-def _describe(argument: Any, slot: Any, tensor: Tensor) -> None:
+def _describe(argument: Any, slot: Any, tensor: Tensor | None) -> None:
     """Writes the shape and strides of a tensor to a kernel argument, after checking that they fit the kernel."""
+    if tensor is None:
+        slot.data = 0
+        slot.shape[0] = 0
+        return
     dtype, ndim = argument.type.dtype, argument.type.ndim
     inner = tuple(getattr(dtype, "_shape_", ()))
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
