@@ -156,21 +156,12 @@ def _inputs(
 def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Rendering:
     """Gives names to the outputs of ``_forward``."""
     n = NUM_BRANCH_IMAGES if settings.branches else 1
-    images, alphas, outputs = outputs[:n], outputs[n : 2 * n], outputs[2 * n :]
-    depths: tuple[Tensor | None, ...] = (None,) * n
-    if settings.depth:
-        depths, outputs = outputs[:n], outputs[n:]
-    layers = [Layer(*parts) for parts in zip(images, alphas, depths, strict=True)]
-    radii, *optional = outputs
-    return Rendering(
-        joint=layers[0],
-        static=layers[1] if settings.branches else None,
-        dynamic=layers[2] if settings.branches else None,
-        radii=radii,
-        contributed=optional.pop(0) if settings.statistics else None,
-        weights=optional.pop(0) if settings.statistics else None,
-        num_intersections=optional.pop(0) if settings.max_intersections is not None else None,
-    )
+    first = (3 if settings.depth else 2) * n  # of the outputs that are not layers
+    layers = [Layer(outputs[k], outputs[n + k], outputs[2 * n + k] if settings.depth else None) for k in range(n)]
+    static, dynamic = layers[1:] if settings.branches else (None, None)
+    contributed, weights = outputs[first + 1 : first + 3] if settings.statistics else (None, None)
+    num_intersections = None if settings.max_intersections is None else outputs[-1]
+    return Rendering(layers[0], static, dynamic, outputs[first], contributed, weights, num_intersections)
 
 
 def _check_inputs(

@@ -45,12 +45,16 @@ def _text(shape: tuple[int | str, ...]) -> str:
 
 def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
     """Raises ``ValueError`` unless all tensors are on the same CPU or CUDA device."""
-    devices = [(name, t.device) for name, t in tensors.items() if t is not None]
-    first_name, first = devices[0]
-    if first.type not in ("cpu", "cuda"):
-        raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
-    for name, device in devices:
-        if device != first:
+    first_name, first = "", None
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        device = tensor.device
+        if first is None:
+            first_name, first = name, device
+            if first.type not in ("cpu", "cuda"):
+                raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
+        elif device != first:
             raise ValueError(f"all tensors must be on one device: {first_name} is on {first}, {name} on {device}")
 
 
