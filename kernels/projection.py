@@ -91,9 +91,20 @@ def store_camera_gradients(
         v_cameras[i, 12 + part] = v_intrinsics[part]
 
 
-@wp.kernel(enable_backward=False)
-def project_fwd(
-    first: int,
+@wp.struct
+class Splat:
+    """A Gaussian as a camera sees it; all values of a culled one are zero."""
+
+    mean: wp.vec2
+    conic: wp.vec3
+    depth: float
+    opacity: float
+    radius: wp.vec2i
+
+
+@wp.func
+def project(
+    i: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
@@ -105,24 +116,13 @@ def project_fwd(
     near: float,
     compensate: int,
     screen_offsets: wp.array[wp.vec2],
-    means2d: wp.array[wp.vec2],
-    conics: wp.array[wp.vec3],
-    depths: wp.array[float],
-    splat_opacities: wp.array[float],
-    radii: wp.array[wp.vec2i],
-):
-    """Writes one splat per thread; ``screen_offsets`` may be missing (an empty array)."""
-    i = first + wp.tid()
-    means2d[i] = wp.vec2(0.0)
-    conics[i] = wp.vec3(0.0)
-    depths[i] = 0.0
-    radii[i] = wp.vec2i(0, 0)
-    splat_opacities[i] = 0.0
-
+) -> Splat:
+    """The splat of Gaussian i; ``screen_offsets`` may be missing (an empty array)."""
+    splat = Splat()
     rotation = camera_rotation(viewmat)
     t = rotation * means[i] + camera_translation(viewmat)
     if not (t[2] > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
-        return
+        return splat
     fx = K[0, 0]
     fy = K[1, 1]
     cx = K[0, 2]
@@ -145,7 +145,7 @@ def project_fwd(
     if compensate != 0:
         opacity = opacity * wp.sqrt(det_sharp / det)
     if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0 and det > 0.0):
-        return
+        return splat
     reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
     radius_x = wp.ceil(reach * wp.sqrt(a))
     radius_y = wp.ceil(reach * wp.sqrt(c))
@@ -161,12 +161,43 @@ def project_fwd(
         and radius_x < MAX_EXTENT
         and radius_y < MAX_EXTENT
     ):
-        return
-    means2d[i] = mean2d
-    conics[i] = wp.vec3(c / det, -b / det, a / det)
-    depths[i] = t[2]
-    radii[i] = wp.vec2i(wp.max(int(radius_x), 1), wp.max(int(radius_y), 1))
-    splat_opacities[i] = opacity
+        return splat
+    splat.mean = mean2d
+    splat.conic = wp.vec3(c / det, -b / det, a / det)
+    splat.depth = t[2]
+    splat.opacity = opacity
+    splat.radius = wp.vec2i(wp.max(int(radius_x), 1), wp.max(int(radius_y), 1))
+    return splat
+
+
+@wp.kernel(enable_backward=False)
+def project_fwd(
+    first: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    viewmat: wp.array2d[float],
+    K: wp.array2d[float],
+    width: int,
+    height: int,
+    near: float,
+    compensate: int,
+    screen_offsets: wp.array[wp.vec2],
+    means2d: wp.array[wp.vec2],
+    conics: wp.array[wp.vec3],
+    depths: wp.array[float],
+    splat_opacities: wp.array[float],
+    radii: wp.array[wp.vec2i],
+):
+    """Writes one splat per thread."""
+    i = first + wp.tid()
+    splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
+    means2d[i] = splat.mean
+    conics[i] = splat.conic
+    depths[i] = splat.depth
+    splat_opacities[i] = splat.opacity
+    radii[i] = splat.radius
 
 
 @wp.kernel(enable_backward=False)

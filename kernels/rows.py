@@ -20,6 +20,7 @@ import warp as wp
 
 from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LOG2_E
 from .lanes import native
+from .projection import Splat, project
 
 GEOMETRY_PARTS = wp.constant(2)
 """vec4 values before the features."""
@@ -65,13 +66,62 @@ def gradient_stride(num_channels: int) -> int:
 
 
 @functools.cache
-def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the rows, one thread for each splat; depth is an optional last channel.
+def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
+    """Function that writes a row; depth is an optional last channel.
 
-    It also writes the input of the depth sort, a key and the splat's own index, and sets the radii of splats that are
-    skipped to zero.
+    It also writes the input of the depth sort, a key and the splat's own index, and returns whether the splat is not
+    skipped.
     """
     num_channels = num_features + int(with_depth)
+
+    @wp.func
+    def pack_splat(
+        i: int,
+        splat: Splat,
+        features: wp.array2d[float],
+        rows: wp.array2d[wp.vec4],
+        depth_keys: wp.array[int],
+        gaussian_from_rank: wp.array[int],
+    ) -> bool:
+        mean = splat.mean
+        conic = splat.conic
+        opacity = splat.opacity
+        radius = splat.radius
+        depth = splat.depth
+        # A sum is finite only if all of its terms are, and a comparison with NaN fails.
+        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
+        for part in range(wp.static((num_channels + 3) // 4)):
+            value = wp.vec4(0.0)
+            for k in range(4):
+                if part * 4 + k < wp.static(num_features):
+                    value[k] = features[i, part * 4 + k]
+                elif part * 4 + k < wp.static(num_channels):
+                    value[k] = depth
+            total += value[0] + value[1] + value[2] + value[3]
+            row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
+        visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
+        visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+        visible = visible and wp.isfinite(total)
+        key = CULLED_DEPTH
+        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
+        row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
+        if visible:
+            key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
+            row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
+            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+        row_store(rows, i, 0, row0)
+        row_store(rows, i, 1, row1)
+        depth_keys[i] = key
+        gaussian_from_rank[i] = i
+        return visible
+
+    return pack_splat
+
+
+@functools.cache
+def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that writes the rows, one thread for each splat, and sets the radii of those that are skipped to zero."""
+    pack_splat = make_pack_splat(num_features, with_depth)
 
     @wp.kernel(enable_backward=False, module="unique")
     def pack(
@@ -87,40 +137,55 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         gaussian_from_rank: wp.array[int],
     ):
         i = first + wp.tid()
-        mean = means2d[i]
-        conic = conics[i]
-        opacity = opacities[i]
-        radius = radii[i]
-        depth = depths[i]
-        # A sum is finite only if all of its terms are, and a comparison with NaN fails.
-        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
-        for part in range(wp.static((num_channels + 3) // 4)):
-            value = wp.vec4(0.0)
-            for k in range(4):
-                if part * 4 + k < wp.static(num_features):
-                    value[k] = features[i, part * 4 + k]
-                elif part * 4 + k < wp.static(num_channels):
-                    value[k] = depth
-            total += value[0] + value[1] + value[2] + value[3]
-            row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
-        visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
-        visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
-        key = CULLED_DEPTH
-        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
-        row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
-        if not (visible and wp.isfinite(total)):
-            if radius[0] != 0 or radius[1] != 0:
+        splat = Splat()
+        splat.mean = means2d[i]
+        splat.conic = conics[i]
+        splat.depth = depths[i]
+        splat.opacity = opacities[i]
+        splat.radius = radii[i]
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank):
+            if splat.radius[0] != 0 or splat.radius[1] != 0:
                 radii[i] = wp.vec2i(0, 0)
-        else:
-            key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
-            row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
-            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
-        row_store(rows, i, 0, row0)
-        row_store(rows, i, 1, row1)
-        depth_keys[i] = key
-        gaussian_from_rank[i] = i
 
     return pack
+
+
+@functools.cache
+def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that projects Gaussians and packs them at once, one thread for each."""
+    pack_splat = make_pack_splat(num_features, with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def project_and_pack(
+        first: int,
+        means: wp.array[wp.vec3],
+        quats: wp.array[wp.vec4],
+        scales: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        viewmat: wp.array2d[float],
+        K: wp.array2d[float],
+        width: int,
+        height: int,
+        near: float,
+        compensate: int,
+        screen_offsets: wp.array[wp.vec2],
+        features: wp.array2d[float],
+        conics: wp.array[wp.vec3],
+        splat_opacities: wp.array[float],
+        radii: wp.array[wp.vec2i],
+        rows: wp.array2d[wp.vec4],
+        depth_keys: wp.array[int],
+        gaussian_from_rank: wp.array[int],
+    ):
+        i = first + wp.tid()
+        splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
+        conics[i] = splat.conic
+        splat_opacities[i] = splat.opacity
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank):
+            splat.radius = wp.vec2i(0, 0)
+        radii[i] = splat.radius
+
+    return project_and_pack
 
 
 sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)

@@ -13,7 +13,7 @@ from .config import RenderSettings
 from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, composite_bwd, composite_fwd
 from .ops.projection import Geometry, View, project_bwd, project_fwd
-from .ops.rows import OffsetGradient, Rows, pack, unpack
+from .ops.rows import DepthOrder, OffsetGradient, Rows, pack, project_and_pack, unpack
 from .ops.sh import degree_of, sh_bwd, sh_fwd
 from .ops.tiles import bin_splats
 from .runtime.checks import check_same_device, check_tensor
@@ -186,28 +186,42 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     inputs, (size, settings, sh_degree) = _Inputs(*tensors), request
     back, tape = _Backward(request), Tape()
 
-    view = View(inputs.viewmat, inputs.K, *size)
-    splats = project_fwd(Geometry(*inputs[:4]), view, settings.near, settings.antialias, inputs.screen_offsets)
     tape.record_func(back.unproject, [])
-    features = inputs.appearance
     if sh_degree is not None:
-        features = sh_fwd(inputs.means, inputs.appearance, inputs.viewmat, splats.radii, sh_degree)
         tape.record_func(back.color, [])
-    rows, order = pack(splats, features, settings.depth)
+    splats, features, rows, order = _project(request, inputs)
     tape.record_func(back.unpack, [])
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
     composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, settings.statistics)
     tape.record_func(back.composite, [])
 
-    saved = _Saved(splats.conics, splats.opacities, splats.radii, features, rows.packed)
+    saved = _Saved(*splats, features, rows.packed)
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
         backward=partial(_backward, back, tape),
         saved=(*inputs, *saved, *composite.depths, *alphas),
-        constants=(splats.radii, *composite.statistics, *num_intersections),
+        constants=(saved.radii, *composite.statistics, *num_intersections),
     )
+
+
+def _project(request: _Request, inputs: _Inputs) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Rows, DepthOrder]:
+    """project → color → pack; without spherical harmonics, that is a single kernel.
+
+    Returns:
+        Conics, opacities and radii of the splats, their features, their rows and their order by depth.
+    """
+    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *request.size)
+    settings, features, offsets = request.settings, inputs.appearance, inputs.screen_offsets
+    near, antialias, with_depth = settings.near, settings.antialias, settings.depth
+    if request.sh_degree is None:
+        splats, rows, order = project_and_pack(geometry, features, view, near, antialias, with_depth, offsets)
+        return splats, features, rows, order
+    projection = project_fwd(geometry, view, near, antialias, offsets)
+    features = sh_fwd(inputs.means, features, inputs.viewmat, projection.radii, request.sh_degree)
+    rows, order = pack(projection, features, with_depth)
+    return (projection.conics, projection.opacities, projection.radii), features, rows, order
 
 
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:

@@ -8,8 +8,8 @@ from tests.reference import rows as reference
 from tests.scenes import GEOMETRY, HEIGHT, WIDTH, error, generator, make_camera, make_splats, relative_error
 from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.kernels.rows import NUM_MOMENTS, gradient_stride
-from warpgs.ops.projection import Geometry, Projection, View
-from warpgs.ops.rows import pack, unpack
+from warpgs.ops.projection import Geometry, Projection, View, project_fwd
+from warpgs.ops.rows import pack, project_and_pack, unpack
 
 NUM = 150
 SIZE = (WIDTH, HEIGHT)
@@ -68,6 +68,24 @@ def test_radii_of_splats_with_a_singular_conic_become_zero():
     culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
     assert culled[::3].all()
     assert torch.equal(culled, splats.radii[:, 0] == 0)
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
+    splats, camera = make_splats(NUM), make_camera()
+    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
+    view, features, offsets = (
+        View(camera.viewmat, camera.K, *SIZE),
+        random_features(),
+        0.1 * random_features(channels=2),
+    )
+    features[::7, 1] = torch.nan
+    projection = project_fwd(geometry, view, 0.01, True, offsets)
+    rows, order = pack(projection, features, with_depth)
+    both, own_rows, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
+    expected = (projection.conics, projection.opacities, projection.radii, rows.packed, *order)
+    for result, tensor in zip((*both, own_rows.packed, *own_order), expected, strict=True):
+        assert torch.equal(result.view(torch.int32)[:NUM], tensor.view(torch.int32)[:NUM])
 
 
 def random_gradient_rows(splats: Projection, pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int):

@@ -32,7 +32,7 @@ VISIBLE_DIFFERENCE = 1e-3
 """A pixel that differs by more than this in any channel counts as visibly different."""
 
 STAGES = {
-    "project": ("project_fwd", "sh_fwd", "pack"),
+    "project": ("project_and_pack", "project_fwd", "sh_fwd", "pack"),
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),

@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
 from warpgs.kernels.rows import OffsetGradient
 from warpgs.runtime.launch import launch
 
-from .projection import Projection
+from .projection import Geometry, Projection, View
 
 
 class Rows(NamedTuple):
@@ -45,6 +45,26 @@ def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, 
     order = DepthOrder(*(splats.radii.new_empty(2 * N) for _ in range(2)))
     launch(kernels.make_pack(num_features, with_depth), N, *splats, features, packed, *order)
     return Rows(packed, num_features, with_depth), order
+
+
+def project_and_pack(
+    geometry: Geometry,
+    features: Tensor,
+    view: View,
+    near: float,
+    antialias: bool,
+    with_depth: bool,
+    screen_offsets: Tensor | None = None,
+) -> tuple[tuple[Tensor, Tensor, Tensor], Rows, DepthOrder]:
+    """``pack(project_fwd(…), features, with_depth)`` in one kernel: conics, opacities and radii; rows; depth order."""
+    N, num_features = features.shape
+    new, radii = features.new_empty, features.new_empty(N, 2, dtype=int32)
+    splats = new(N, 3), new(N), radii
+    rows = Rows(new(N, kernels.row_parts(num_features + int(with_depth)), 4), num_features, with_depth)
+    order = DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N))
+    inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
+    launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, *splats, rows.packed, *order)
+    return splats, rows, order
 
 
 class PackGradients(NamedTuple):
