@@ -92,7 +92,7 @@ def is_small(size: tuple[int, int]) -> bool:
 
 def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, int]:
     """Columns and rows of the pixels of a lane, number of blocks of an image, lanes per block."""
-    num_tiles = len(tiles.ranges)
+    num_tiles = tiles.ranges.shape[0]
     if tiles.ranges.is_cuda:
         columns, rows = SMALL_IMAGE_CUDA_PIXELS if is_small(size) else CUDA_PIXELS
         block_size, lanes = (WARP_COLUMNS * columns, WARP_ROWS * rows), WARP_SIZE
@@ -183,11 +183,12 @@ def composite_bwd(
         v_layers: Gradients of ``Composite.layers``; None for zeros.
         offset_gradient: Which other gradient of the means on screen to sum as well.
     """
-    num_images = traversal.num_images
-    images_with_gradient = sum({1 << (k % num_images) for k, v in enumerate(v_layers) if v is not None})
+    num_images, images_with_gradient = traversal.num_images, 0  # a bit for each image
     v_arrays: list[Tensor | None] = [None] * (3 * NUM_BRANCH_IMAGES)  # images, alphas, depths
     for k, v in enumerate(v_layers):
-        v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = v
+        if v is not None:
+            v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = v
+            images_with_gradient |= 1 << (k % num_images)
     packed = rows.packed
     v_rows = packed.new_zeros(num_shards(packed.device), packed.shape[0], gradient_stride(rows.num_channels))
     inputs = (*traversal[2:], *v_arrays, images_with_gradient)
