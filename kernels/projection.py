@@ -200,9 +200,9 @@ def project_fwd(
     radii[i] = splat.radius
 
 
-@wp.kernel(enable_backward=False)
-def project_bwd(
-    first: int,
+@wp.func
+def unproject(
+    i: int,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
     scales: wp.array[wp.vec3],
@@ -214,10 +214,7 @@ def project_bwd(
     compensate: int,
     conics: wp.array[wp.vec3],
     radii: wp.array[wp.vec2i],
-    v_means2d: wp.array[wp.vec2],
-    v_conics: wp.array[wp.vec3],
-    v_depths: wp.array[float],
-    v_splat_opacities: wp.array[float],
+    v_splat: Splat,
     v_means: wp.array[wp.vec3],
     v_quats: wp.array[wp.vec4],
     v_scales: wp.array[wp.vec3],
@@ -225,11 +222,10 @@ def project_bwd(
     v_cameras: wp.array2d[float],
     v_means_of_colors: wp.array[wp.vec3],
 ):
-    """Gradients of one Gaussian per thread; missing gradients of splats (empty arrays) are zero.
+    """Writes the gradients of Gaussian i from those of its splat.
 
     ``v_means_of_colors`` is added to ``v_means``; both may be the same array, and it may be missing.
     """
-    i = first + wp.tid()
     if radii[i][0] <= 0:
         for part in range(v_cameras.shape[1]):
             v_cameras[i, part] = 0.0
@@ -256,9 +252,7 @@ def project_bwd(
     spread = to_image * shape
 
     conic = conics[i]
-    v_conic = wp.vec3(0.0)
-    if v_conics.shape[0] > 0:
-        v_conic = v_conics[i]
+    v_conic = v_splat.conic
     A = conic[0]
     B = conic[1]
     C = conic[2]
@@ -266,9 +260,7 @@ def project_bwd(
     v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
     v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
 
-    v_opacity = float(0.0)
-    if v_splat_opacities.shape[0] > 0:
-        v_opacity = v_splat_opacities[i]
+    v_opacity = float(v_splat.opacity)
     if compensate != 0:
         a_sharp = wp.dot(spread[0], spread[0])
         b = wp.dot(spread[0], spread[1])
@@ -304,9 +296,7 @@ def project_bwd(
 
     v_to_image = v_spread * wp.transpose(shape)
     v_jacobian = v_to_image * wp.transpose(rotation)
-    v_mean2d = wp.vec2(0.0)
-    if v_means2d.shape[0] > 0:
-        v_mean2d = v_means2d[i]
+    v_mean2d = v_splat.mean
     # The centre depends on the slope t_x / z itself, the Jacobian on the clamped slope, constant where it is clamped.
     v_u = fx * v_mean2d[0]
     v_v = fy * v_mean2d[1]
@@ -320,8 +310,7 @@ def project_bwd(
         + jacobian[1, 1] * v_jacobian[1, 1]
         + jacobian[1, 2] * v_jacobian[1, 2]
     )
-    if v_depths.shape[0] > 0:
-        v_z += v_depths[i]
+    v_z += v_splat.depth
     v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
     v_mean = wp.transpose(rotation) * v_t
     if v_means_of_colors.shape[0] > 0:
@@ -341,3 +330,63 @@ def project_bwd(
             v_cy += rz * v_jacobian[1, 2]
         v_rotation = wp.transpose(jacobian) * v_to_image
         store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))
+
+
+@wp.kernel(enable_backward=False)
+def project_bwd(
+    first: int,
+    means: wp.array[wp.vec3],
+    quats: wp.array[wp.vec4],
+    scales: wp.array[wp.vec3],
+    opacities: wp.array[float],
+    viewmat: wp.array2d[float],
+    K: wp.array2d[float],
+    width: int,
+    height: int,
+    compensate: int,
+    conics: wp.array[wp.vec3],
+    radii: wp.array[wp.vec2i],
+    v_means2d: wp.array[wp.vec2],
+    v_conics: wp.array[wp.vec3],
+    v_depths: wp.array[float],
+    v_splat_opacities: wp.array[float],
+    v_means: wp.array[wp.vec3],
+    v_quats: wp.array[wp.vec4],
+    v_scales: wp.array[wp.vec3],
+    v_opacities: wp.array[float],
+    v_cameras: wp.array2d[float],
+    v_means_of_colors: wp.array[wp.vec3],
+):
+    """Gradients of one Gaussian per thread; missing gradients of splats (empty arrays) are zero."""
+    i = first + wp.tid()
+    v_splat = Splat()
+    if radii[i][0] > 0:
+        if v_means2d.shape[0] > 0:
+            v_splat.mean = v_means2d[i]
+        if v_conics.shape[0] > 0:
+            v_splat.conic = v_conics[i]
+        if v_depths.shape[0] > 0:
+            v_splat.depth = v_depths[i]
+        if v_splat_opacities.shape[0] > 0:
+            v_splat.opacity = v_splat_opacities[i]
+    unproject(
+        i,
+        means,
+        quats,
+        scales,
+        opacities,
+        viewmat,
+        K,
+        width,
+        height,
+        compensate,
+        conics,
+        radii,
+        v_splat,
+        v_means,
+        v_quats,
+        v_scales,
+        v_opacities,
+        v_cameras,
+        v_means_of_colors,
+    )

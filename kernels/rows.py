@@ -20,7 +20,7 @@ import warp as wp
 
 from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LOG2_E
 from .lanes import native
-from .projection import Splat, project
+from .projection import Splat, project, unproject
 
 GEOMETRY_PARTS = wp.constant(2)
 """vec4 values before the features."""
@@ -192,14 +192,63 @@ sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)
 
 
 @functools.cache
-def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat.
+def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
+    """Function that turns a gradient row into the gradients of a splat, features and ``screen_offsets``.
 
     ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``v_screen_offsets``, which may be
     missing, is the gradient of the mean in halves of the image size: the plain one if ``offset_sign`` is 0, otherwise
     the sums of ``OffsetGradient`` times ``offset_sign``.
     """
     num_channels = num_features + int(with_depth)
+
+    @wp.func
+    def unpack_splat(
+        i: int,
+        conics: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        rows: wp.array2d[wp.vec4],
+        gradients: wp.array3d[float],
+        half_width: float,
+        half_height: float,
+        offset_sign: float,
+        v_features: wp.array2d[float],
+        v_screen_offsets: wp.array[wp.vec2],
+    ) -> Splat:
+        v_splat = Splat()
+        for k in range(wp.static(num_channels)):
+            total = float(0.0)
+            for shard in range(gradients.shape[0]):
+                total += gradients[shard, i, k]
+            if k < wp.static(num_features):
+                v_features[i, k] = total
+            else:
+                v_splat.depth = total
+        s = sums_vector()
+        for k in range(wp.static(NUM_MOMENTS + NUM_OFFSET_SUMS)):
+            total = float(0.0)
+            for shard in range(gradients.shape[0]):
+                total += gradients[shard, i, wp.static(num_channels) + k]
+            s[k] = total
+        v_offset = wp.vec2(0.0)
+        if rows[i, 1][1] != CULLED_LOG2_OPACITY:
+            conic = conics[i]
+            v_splat.mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
+            v_splat.conic = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
+            v_splat.opacity = s[0] / opacities[i]
+            v_offset = v_splat.mean
+            if offset_sign != 0.0:
+                v_offset = offset_sign * wp.vec2(s[6], s[7])
+        if v_screen_offsets.shape[0] > 0:
+            v_screen_offsets[i] = wp.vec2(v_offset[0] * half_width, v_offset[1] * half_height)
+        return v_splat
+
+    return unpack_splat
+
+
+@functools.cache
+def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat."""
+    unpack_splat = make_unpack_splat(num_features, with_depth)
 
     @wp.kernel(enable_backward=False, module="unique")
     def unpack(
@@ -219,35 +268,86 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
         v_screen_offsets: wp.array[wp.vec2],
     ):
         i = first + wp.tid()
-        for k in range(wp.static(num_channels)):
-            total = float(0.0)
-            for shard in range(gradients.shape[0]):
-                total += gradients[shard, i, k]
-            if k < wp.static(num_features):
-                v_features[i, k] = total
-            else:
-                v_depths[i] = total
-        s = sums_vector()
-        for k in range(wp.static(NUM_MOMENTS + NUM_OFFSET_SUMS)):
-            total = float(0.0)
-            for shard in range(gradients.shape[0]):
-                total += gradients[shard, i, wp.static(num_channels) + k]
-            s[k] = total
-        v_offset = wp.vec2(0.0)
-        if rows[i, 1][1] == CULLED_LOG2_OPACITY:
-            v_means2d[i] = wp.vec2(0.0)
-            v_conics[i] = wp.vec3(0.0)
-            v_opacities[i] = 0.0
-        else:
-            conic = conics[i]
-            v_mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
-            v_means2d[i] = v_mean
-            v_conics[i] = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
-            v_opacities[i] = s[0] / opacities[i]
-            v_offset = v_mean
-            if offset_sign != 0.0:
-                v_offset = offset_sign * wp.vec2(s[6], s[7])
-        if v_screen_offsets.shape[0] > 0:
-            v_screen_offsets[i] = wp.vec2(v_offset[0] * half_width, v_offset[1] * half_height)
+        v_splat = unpack_splat(
+            i, conics, opacities, rows, gradients, half_width, half_height, offset_sign, v_features, v_screen_offsets
+        )
+        v_means2d[i] = v_splat.mean
+        v_conics[i] = v_splat.conic
+        v_opacities[i] = v_splat.opacity
+        if wp.static(with_depth):
+            v_depths[i] = v_splat.depth
 
     return unpack
+
+
+@functools.cache
+def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that turns gradient rows into the gradients of the Gaussians at once, one thread for each."""
+    unpack_splat = make_unpack_splat(num_features, with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def unpack_and_unproject(
+        first: int,
+        means: wp.array[wp.vec3],
+        quats: wp.array[wp.vec4],
+        scales: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        viewmat: wp.array2d[float],
+        K: wp.array2d[float],
+        width: int,
+        height: int,
+        compensate: int,
+        conics: wp.array[wp.vec3],
+        splat_opacities: wp.array[float],
+        radii: wp.array[wp.vec2i],
+        rows: wp.array2d[wp.vec4],
+        gradients: wp.array3d[float],
+        offset_sign: float,
+        v_features: wp.array2d[float],
+        v_screen_offsets: wp.array[wp.vec2],
+        v_means: wp.array[wp.vec3],
+        v_quats: wp.array[wp.vec4],
+        v_scales: wp.array[wp.vec3],
+        v_opacities: wp.array[float],
+        v_cameras: wp.array2d[float],
+        no_colors: wp.array[wp.vec3],
+    ):
+        """``no_colors`` is an empty array: features that are given have no gradient of the means."""
+        i = first + wp.tid()
+        half_width = 0.5 * float(width)
+        half_height = 0.5 * float(height)
+        v_splat = unpack_splat(
+            i,
+            conics,
+            splat_opacities,
+            rows,
+            gradients,
+            half_width,
+            half_height,
+            offset_sign,
+            v_features,
+            v_screen_offsets,
+        )
+        unproject(
+            i,
+            means,
+            quats,
+            scales,
+            opacities,
+            viewmat,
+            K,
+            width,
+            height,
+            compensate,
+            conics,
+            radii,
+            v_splat,
+            v_means,
+            v_quats,
+            v_scales,
+            v_opacities,
+            v_cameras,
+            no_colors,
+        )
+
+    return unpack_and_unproject

@@ -13,7 +13,16 @@ from .config import RenderSettings
 from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, composite_bwd, composite_fwd
 from .ops.projection import Geometry, View, project_bwd, project_fwd
-from .ops.rows import DepthOrder, OffsetGradient, Rows, pack, project_and_pack, unpack
+from .ops.rows import (
+    DepthOrder,
+    OffsetGradient,
+    PackedSplats,
+    Rows,
+    pack,
+    project_and_pack,
+    unpack,
+    unpack_and_unproject,
+)
 from .ops.sh import degree_of, sh_bwd, sh_fwd
 from .ops.tiles import bin_splats
 from .runtime.checks import check_same_device, check_tensor
@@ -186,16 +195,15 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     inputs, (size, settings, sh_degree) = _Inputs(*tensors), request
     back, tape = _Backward(request), Tape()
 
-    tape.record_func(back.unproject, [])
-    if sh_degree is not None:
-        tape.record_func(back.color, [])
-    splats, features, rows, order = _project(request, inputs)
-    tape.record_func(back.unpack, [])
+    splats, features, order = _project(request, inputs)
+    for step in [back.unpack_and_unproject] if sh_degree is None else [back.unproject, back.color, back.unpack]:
+        tape.record_func(step, [])
+    rows = splats.rows
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
     composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, settings.statistics)
     tape.record_func(back.composite, [])
 
-    saved = _Saved(*splats, features, rows.packed)
+    saved = _Saved(*splats[:3], features, rows.packed)
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
@@ -206,22 +214,18 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     )
 
 
-def _project(request: _Request, inputs: _Inputs) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Rows, DepthOrder]:
-    """project → color → pack; without spherical harmonics, that is a single kernel.
-
-    Returns:
-        Conics, opacities and radii of the splats, their features, their rows and their order by depth.
-    """
+def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor, DepthOrder]:
+    """project → color → pack: splats, features, order by depth; without spherical harmonics it is a single kernel."""
     geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *request.size)
     settings, features, offsets = request.settings, inputs.appearance, inputs.screen_offsets
     near, antialias, with_depth = settings.near, settings.antialias, settings.depth
     if request.sh_degree is None:
-        splats, rows, order = project_and_pack(geometry, features, view, near, antialias, with_depth, offsets)
-        return splats, features, rows, order
+        splats, order = project_and_pack(geometry, features, view, near, antialias, with_depth, offsets)
+        return splats, features, order
     projection = project_fwd(geometry, view, near, antialias, offsets)
     features = sh_fwd(inputs.means, features, inputs.viewmat, projection.radii, request.sh_degree)
     rows, order = pack(projection, features, with_depth)
-    return (projection.conics, projection.opacities, projection.radii), features, rows, order
+    return PackedSplats(projection.conics, projection.opacities, projection.radii, rows), features, order
 
 
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
@@ -236,6 +240,8 @@ def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: G
 
 class _Backward:
     """The backward pass of one render: the tape calls the methods from ``composite`` to ``unproject``, in this order.
+
+    Without spherical harmonics, ``unpack_and_unproject`` takes the place of those after ``composite``.
 
     Attributes:
         request: Of the render.
@@ -288,6 +294,20 @@ class _Backward:
         self.v |= v_geometry._asdict()
         v_colors = self.v.get("viewmat")
         self.v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
+
+    def unpack_and_unproject(self) -> None:
+        inputs, saved, settings = self.inputs, self.saved, self.request.settings
+        v_geometry, (v_viewmat, v_K), v_features, v_offsets = unpack_and_unproject(
+            Geometry(*inputs[:4]),
+            View(inputs.viewmat, inputs.K, *self.request.size),
+            settings.antialias,
+            PackedSplats(saved.conics, saved.opacities, saved.radii, self._rows()),
+            self.v_rows,
+            _has_gradient(inputs.screen_offsets),
+            self._offset_gradient(),
+        )
+        self.v |= v_geometry._asdict()
+        self.v |= {"appearance": v_features, "viewmat": v_viewmat, "K": v_K, "screen_offsets": v_offsets}
 
     def gradients(self) -> Gradients:
         """The gradients of the inputs."""

@@ -8,8 +8,8 @@ from tests.reference import rows as reference
 from tests.scenes import GEOMETRY, HEIGHT, WIDTH, error, generator, make_camera, make_splats, relative_error
 from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.kernels.rows import NUM_MOMENTS, gradient_stride
-from warpgs.ops.projection import Geometry, Projection, View, project_fwd
-from warpgs.ops.rows import pack, project_and_pack, unpack
+from warpgs.ops.projection import Geometry, Projection, View, project_bwd, project_fwd
+from warpgs.ops.rows import pack, project_and_pack, unpack, unpack_and_unproject
 
 NUM = 150
 SIZE = (WIDTH, HEIGHT)
@@ -82,10 +82,26 @@ def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
     features[::7, 1] = torch.nan
     projection = project_fwd(geometry, view, 0.01, True, offsets)
     rows, order = pack(projection, features, with_depth)
-    both, own_rows, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
+    splats, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
     expected = (projection.conics, projection.opacities, projection.radii, rows.packed, *order)
-    for result, tensor in zip((*both, own_rows.packed, *own_order), expected, strict=True):
+    for result, tensor in zip((*splats[:3], splats.rows.packed, *own_order), expected, strict=True):
         assert torch.equal(result.view(torch.int32)[:NUM], tensor.view(torch.int32)[:NUM])
+
+
+@pytest.mark.parametrize("offset_gradient", [None, "absolute", "images"])
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_unpacking_and_unprojecting_at_once_gives_the_same_bits(with_depth, offset_gradient):
+    splats, camera = make_splats(NUM), make_camera()
+    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
+    view = View(camera.viewmat.requires_grad_(), camera.K, *SIZE)
+    packed, _ = project_and_pack(geometry, random_features(), view, 0.01, True, with_depth)
+    v_rows = torch.randn(2, NUM, gradient_stride(packed.rows.num_channels), generator=generator())
+    v_splats = unpack(packed[:2], packed.rows, v_rows, SIZE, True, offset_gradient)
+    v_geometry, *v_camera = project_bwd(geometry, view, True, (packed.conics, packed.radii), v_splats[:4])
+    result = unpack_and_unproject(geometry, view, True, packed, v_rows, True, offset_gradient)
+    expected = (*v_geometry, *v_camera, v_splats.features, v_splats.screen_offsets)
+    for value, tensor in zip((*result[0], *result[1], *result[2:]), expected, strict=True):
+        assert torch.equal(value, tensor)
 
 
 def random_gradient_rows(splats: Projection, pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int):

@@ -37,7 +37,7 @@ STAGES = {
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
     "composite_bwd": ("composite_bwd",),
-    "unproject": ("unpack", "sh_bwd", "project_bwd"),
+    "unproject": ("unpack_and_unproject", "unpack", "sh_bwd", "project_bwd"),
     "ssim": ("ssim_fwd", "ssim_bwd"),
 }
 """Kernels of each stage of a render."""

@@ -108,14 +108,24 @@ def project_bwd(
     v_geometry = Geometry(*(torch.empty_like(t) for t in geometry))
     if v_means_of_colors is not None:
         v_geometry = v_geometry._replace(means=v_means_of_colors)
-    with_camera = view.viewmat.requires_grad or view.K.requires_grad
-    v_cameras = geometry.means.new_empty(N, kernels.CAMERA_GRADIENTS if with_camera else 0)
+    v_cameras = new_camera_gradients(view, N)
     inputs = (*geometry, *view, int(antialias), *splats)
     launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras, v_means_of_colors)
-    if not with_camera:
-        return v_geometry, None, None
+    return v_geometry, *sum_camera_gradients(view, v_cameras)
+
+
+def new_camera_gradients(view: View, num_gaussians: int) -> Tensor:
+    """Memory for what each Gaussian contributes to the gradient of the camera; empty if the camera requires none."""
+    with_camera = view.viewmat.requires_grad or view.K.requires_grad
+    return view.viewmat.new_empty(num_gaussians, kernels.CAMERA_GRADIENTS if with_camera else 0)
+
+
+def sum_camera_gradients(view: View, v_cameras: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """Gradients of ``viewmat`` and ``K``; None if the camera requires none."""
+    if v_cameras.shape[1] == 0:
+        return None, None
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
     v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
-    return v_geometry, v_viewmat, v_K
+    return v_viewmat, v_K

@@ -9,7 +9,7 @@ from warpgs.kernels import rows as kernels
 from warpgs.kernels.rows import OffsetGradient
 from warpgs.runtime.launch import launch
 
-from .projection import Geometry, Projection, View
+from .projection import Geometry, Projection, View, new_camera_gradients, sum_camera_gradients
 
 
 class Rows(NamedTuple):
@@ -47,6 +47,15 @@ def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, 
     return Rows(packed, num_features, with_depth), order
 
 
+class PackedSplats(NamedTuple):
+    """Projected Gaussians: what compositing needs, and what the backward pass needs beside it (see ``Projection``)."""
+
+    conics: Tensor
+    opacities: Tensor
+    radii: Tensor
+    rows: Rows
+
+
 def project_and_pack(
     geometry: Geometry,
     features: Tensor,
@@ -55,16 +64,16 @@ def project_and_pack(
     antialias: bool,
     with_depth: bool,
     screen_offsets: Tensor | None = None,
-) -> tuple[tuple[Tensor, Tensor, Tensor], Rows, DepthOrder]:
-    """``pack(project_fwd(…), features, with_depth)`` in one kernel: conics, opacities and radii; rows; depth order."""
+) -> tuple[PackedSplats, DepthOrder]:
+    """``pack(project_fwd(…), features, with_depth)`` in one kernel."""
     N, num_features = features.shape
     new, radii = features.new_empty, features.new_empty(N, 2, dtype=int32)
-    splats = new(N, 3), new(N), radii
     rows = Rows(new(N, kernels.row_parts(num_features + int(with_depth)), 4), num_features, with_depth)
+    splats = PackedSplats(new(N, 3), new(N), radii, rows)
     order = DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N))
     inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
-    launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, *splats, rows.packed, *order)
-    return splats, rows, order
+    launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, *splats[:3], rows.packed, *order)
+    return splats, order
 
 
 class PackGradients(NamedTuple):
@@ -106,7 +115,40 @@ def unpack(
         features=conics.new_empty(N, rows.num_features),
         screen_offsets=conics.new_empty(N, 2) if with_offsets else None,
     )
-    sign = {None: 0.0, "absolute": 1.0, "images": -1.0}[offset_gradient]
-    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], sign)
+    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], _SIGNS[offset_gradient])
     launch(kernels.make_unpack(rows.num_features, rows.with_depth), N, *inputs, *v_splats)
     return v_splats
+
+
+_SIGNS: dict[OffsetGradient, float] = {None: 0.0, "absolute": 1.0, "images": -1.0}
+"""How kernels are told which gradient ``screen_offsets`` get."""
+
+
+def unpack_and_unproject(
+    geometry: Geometry,
+    view: View,
+    antialias: bool,
+    splats: PackedSplats,
+    v_rows: Tensor,
+    with_offsets: bool = False,
+    offset_gradient: OffsetGradient = None,
+) -> tuple[Geometry, tuple[Tensor | None, Tensor | None], Tensor, Tensor | None]:
+    """The backward pass of ``project_and_pack``, in one kernel.
+
+    Args:
+        geometry, view, antialias: As in the forward pass.
+        splats: Its first result.
+        v_rows, with_offsets, offset_gradient: As in ``unpack``.
+
+    Returns:
+        Gradients of the geometry; of ``viewmat`` and ``K``, if one of them requires a gradient; of the features; and of
+        ``screen_offsets``.
+    """
+    (*projection, rows), means = splats, geometry.means
+    N = means.shape[0]
+    v_features, v_offsets = means.new_empty(N, rows.num_features), means.new_empty(N, 2) if with_offsets else None
+    v_geometry, v_cameras = Geometry(*(torch.empty_like(t) for t in geometry)), new_camera_gradients(view, N)
+    inputs = (*geometry, *view, int(antialias), *projection, rows.packed, v_rows, _SIGNS[offset_gradient])
+    kernel = kernels.make_unpack_and_unproject(rows.num_features, rows.with_depth)
+    launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras, None)
+    return v_geometry, sum_camera_gradients(view, v_cameras), v_features, v_offsets
