@@ -105,13 +105,19 @@ def project_bwd(
         v_means_of_colors: [N, 3] gradient of the means through the colours, to be added; overwritten.
     """
     N = geometry.means.shape[0]
-    v_geometry = Geometry(*(torch.empty_like(t) for t in geometry))
+    v_geometry = new_geometry(geometry)
     if v_means_of_colors is not None:
         v_geometry = v_geometry._replace(means=v_means_of_colors)
     v_cameras = new_camera_gradients(view, N)
     inputs = (*geometry, *view, int(antialias), *splats)
     launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras, v_means_of_colors)
     return v_geometry, *sum_camera_gradients(view, v_cameras)
+
+
+def new_geometry(geometry: Geometry) -> Geometry:
+    """Memory of the same shapes; ``torch.empty_like`` takes the host longer."""
+    N, new = geometry.means.shape[0], geometry.means.new_empty
+    return Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))
 
 
 def new_camera_gradients(view: View, num_gaussians: int) -> Tensor:

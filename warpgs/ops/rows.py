@@ -2,14 +2,13 @@
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
 from warpgs.kernels.rows import OffsetGradient
 from warpgs.runtime.launch import launch
 
-from .projection import Geometry, Projection, View, new_camera_gradients, sum_camera_gradients
+from .projection import Geometry, Projection, View, new_camera_gradients, new_geometry, sum_camera_gradients
 
 
 class Rows(NamedTuple):
@@ -105,13 +104,13 @@ def unpack(
         with_offsets: Whether to return the gradient of ``screen_offsets``.
         offset_gradient: As in ``composite_bwd``.
     """
-    conics, opacities = splats
+    conics = splats[0]
     N = conics.shape[0]
     v_splats = PackGradients(
         means2d=conics.new_empty(N, 2),
-        conics=torch.empty_like(conics),
+        conics=conics.new_empty(N, 3),
         depths=conics.new_empty(N) if rows.with_depth else None,
-        opacities=torch.empty_like(opacities),
+        opacities=conics.new_empty(N),
         features=conics.new_empty(N, rows.num_features),
         screen_offsets=conics.new_empty(N, 2) if with_offsets else None,
     )
@@ -147,7 +146,7 @@ def unpack_and_unproject(
     (*projection, rows), means = splats, geometry.means
     N = means.shape[0]
     v_features, v_offsets = means.new_empty(N, rows.num_features), means.new_empty(N, 2) if with_offsets else None
-    v_geometry, v_cameras = Geometry(*(torch.empty_like(t) for t in geometry)), new_camera_gradients(view, N)
+    v_geometry, v_cameras = new_geometry(geometry), new_camera_gradients(view, N)
     inputs = (*geometry, *view, int(antialias), *projection, rows.packed, v_rows, _SIGNS[offset_gradient])
     kernel = kernels.make_unpack_and_unproject(rows.num_features, rows.with_depth)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras, None)
