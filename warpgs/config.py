@@ -123,7 +123,7 @@ class LossConfig:
     by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
     depth_margin: float = 0.0
     """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse
-    points are not penalized: the images know better. 0: every error is (paper)."""
+    points are not penalized, because the images determine the geometry better. 0: every error is (paper)."""
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     object_depth: bool = False

@@ -39,6 +39,7 @@ BEST = TrainConfig(
         depth=0.5,
         depth_dynamic=4.0,
         depth_tolerance=0.03,
+        depth_margin=3.0,
         depth_smooth=True,
         object_depth=True,
         mask_margin=0.008,
@@ -80,9 +81,7 @@ PATIENT = dataclasses.replace(
         max_static_points=8_000,
         dynamic_points=3_000,
     ),
-    loss=dataclasses.replace(
-        BEST.loss, ssim=0.0, depth=LossConfig.depth, depth_dynamic=LossConfig.depth_dynamic, depth_smooth=False
-    ),
+    loss=dataclasses.replace(BEST.loss, ssim=0.0),
     optim=OptimConfig(means=1.7e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8, reseed=0.05),
     schedule=Schedule(
