@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections import Counter
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,10 +13,12 @@ from tests.data import captures, layouts
 from tests.data.captures import edit_json
 from tests.prepare import boards
 from warpgs.cli import main
+from warpgs.data import images
 from warpgs.data.images import decode, read_depth
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.prepare import add, masks
 from warpgs.prepare.add import AddOptions, add_parts
+from warpgs.prepare.flow import Flows
 from warpgs.prepare.methods import Masker
 
 COUNT = 12
@@ -167,6 +171,39 @@ def test_depth_and_points_are_those_of_the_scene(root):
         assert known.mean() > 0.3
         ratio = depth[known] / truth[known]
         assert np.median(np.abs(ratio / np.median(ratio) - 1.0)) < 0.03
+
+
+def enlarge(root):
+    """Makes the capture's images 512 px wide, the size at which masks and depth are estimated."""
+    shutil.rmtree(root / "rgb/2x")
+    for path in (root / "rgb/1x").iterdir():
+        captures.write_png(path, cv2.resize(cv2.cvtColor(decode(path), cv2.COLOR_BGR2RGB), None, fx=2, fy=2))
+    for path in (root / "camera").iterdir():
+        fields = {"focal_length": 2 * boards.FOCAL, "principal_point": [256.0, 192.0], "image_size": [512, 384]}
+        edit_json(path, **fields)
+
+
+def test_masks_depth_and_points_share_decoded_images_and_optical_flow(root, monkeypatch):
+    enlarge(root)
+    (root / "points.npy").unlink()
+    compute, decoded, pairs, read = Flows.compute, images._decode, [], Counter()
+
+    def counted_flow(self, a, b, *start, **options):
+        indices = [next((k for k, plane in enumerate(self.planes) if plane is image), None) for image in (a, b)]
+        if None not in indices:  # not warped, see ``Revisits``
+            pairs.append(tuple(indices))
+        return compute(self, a, b, *start, **options)
+
+    def counted_file(path, *arguments):
+        read[Path(path).relative_to(root).parts[0]] += 1
+        return decoded(path, *arguments)
+
+    monkeypatch.setattr(Flows, "compute", counted_flow)
+    monkeypatch.setattr(images, "_decode", counted_file)
+    add_parts(root, AddOptions(["masks", "depth", "points"]))
+    assert len(pairs) == len(set(pairs)) > 50
+    assert read == {"rgb": COUNT, "resized_mask": COUNT}
+    assert len(list((root / "depth/1x").iterdir())) == COUNT
 
 
 @pytest.mark.parametrize("part", ["depth", "points"])

@@ -127,7 +127,7 @@ def test_expected_flow_is_exact_on_a_plane_at_the_median_depth():
 
 
 @pytest.mark.parametrize("estimate", ["masks", "depth"])
-def test_every_flow_is_computed_once_at_half_the_size(estimate, video, frames, monkeypatch):
+def test_every_flow_is_computed_once_at_half_the_size(estimate, video, monkeypatch):
     compute, pairs, shapes = Flows.compute, [], set()
 
     def counted(self, a, b, *start, **options):
@@ -140,13 +140,23 @@ def test_every_flow_is_computed_once_at_half_the_size(estimate, video, frames, m
         return compute(self, a, b, *start, **options)
 
     monkeypatch.setattr(Flows, "compute", counted)
+    frames = PosedFrames(video[0], boards.lens(), boards.poses(24), boards.points())
     find_dynamic(frames) if estimate == "masks" else static_depth(frames, video[1])
     assert len(pairs) == len(set(pairs)) > 100
     assert shapes == {(96, 128)}
 
 
+def test_depth_of_frames_that_masks_were_found_on_is_the_same_without_flow_of_its_own(monkeypatch):
+    images, dynamic = boards.record(10)
+    fresh, used = (PosedFrames(images, boards.lens(), boards.poses(10), boards.points()) for _ in range(2))
+    expected = static_depth(fresh, dynamic)
+    find_dynamic(used)
+    monkeypatch.delattr(Flows, "compute")
+    assert np.array_equal(static_depth(used, dynamic), expected, equal_nan=True)
+
+
 def test_errors_of_halved_frames_are_in_pixels_of_the_whole_ones(frames):
-    small = frames.halved()
+    small = frames.halved
     assert (small.lens.width, small.lens.height, small.focal) == (128, 96, frames.lens.focal[0])
     assert small.neighbours == frames.neighbours
     assert np.allclose(2.0 * small.expected_flow(2, 6), frames.expected_flow(2, 6)[::2, ::2], atol=0.5)

@@ -7,6 +7,7 @@ Frames of a capture may have lenses of their own. They are resampled to one pinh
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,13 +18,13 @@ from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
-from warpgs.data.images import decode, is_bright
-from warpgs.data.lens import Lens
+from warpgs.data.images import decode, is_bright, read_mask
+from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import LOADERS, load_capture, recognize
-from warpgs.data.loaders.nerfies import NerfiesLoader
+from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.files import first_file, read_json, write_json, write_png
+from warpgs.files import read_json, write_json, write_png
 from warpgs.progress import progress
 
 from .cameras import are_apart, camera_centers
@@ -79,7 +80,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
     unchanged = MaskPerturbation()
     capture = loader.load(root, factor=None, perturbation=unchanged, cache_frames=256, incomplete_masks=True)
-    job = _Job(root, layout, capture, read_units(root / "scene.json"), options, log)
+    job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
     for part in PARTS:
         if part in options.parts:
             getattr(job, f"add_{part}")()
@@ -94,31 +95,41 @@ def _check_options(options: AddOptions) -> None:
             raise ValueError(f"--{name} must be one of {', '.join(known)} to add it, got {value}")
 
 
+class _Depth(NamedTuple):
+    """Frames at working size, their static masks and inverse depth."""
+
+    frames: PosedFrames
+    static: list[Bool[np.ndarray, "H W"]]
+    planes: Sequence[np.ndarray]
+
+
 @dataclass(frozen=True)
 class _Job:
-    """One call of ``add_parts``; ``estimated`` holds frames and depth by the method's name."""
+    """One call of ``add_parts``; ``posed`` holds frames by their resize factor, ``estimated`` depth by the method."""
 
     root: Path
     layout: str
+    factor: int
     capture: Capture
     units: SceneUnits
     options: AddOptions
     log: Callable[[str], None] | None
-    estimated: dict[str, tuple[PosedFrames, Sequence[np.ndarray]]] = field(default_factory=dict)
+    posed: dict[float, PosedFrames] = field(default_factory=dict)
+    estimated: dict[str, _Depth] = field(default_factory=dict)
 
     def add_masks(self) -> None:
         """Writes masks of the frames that lack them, and masks.png."""
         names = self._names()
         # The loader reads one of the two folders: those in mask/ would be lost to it if new ones went to the other.
-        folder = "resized_mask" if (self.root / "resized_mask").is_dir() else "mask"
+        folder = self._mask_folder()
         files = {name: self._mask_files(folder, name) for name in names}
         missing = [name for name in names if not files[name]]
         incomplete = any(len(found) < len(self._factors()) for found in files.values())
-        if incomplete and (self.root / "mask").is_dir() and folder == "mask":
+        if incomplete and folder == self.root / "mask" and folder.is_dir():
             raise ValueError(
                 f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
             )
-        if folder == "resized_mask":
+        if folder == self.root / "resized_mask":
             self._complete_sizes(files)
         if not missing:
             self._say("masks: all frames have them")
@@ -160,14 +171,15 @@ class _Job:
         """The downscaling factors of the images, the largest images first."""
         return sorted(int(p.name[:-1]) for p in (self.root / "rgb").glob("*x") if p.name[:-1].isdecimal())
 
-    def _mask_files(self, folder: str, name: str) -> dict[int, Path]:
+    def _mask_folder(self) -> Path:
+        """The folder whose masks the loader reads; it may not exist."""
+        folder = self.root / "resized_mask"
+        return folder if folder.is_dir() else self.root / "mask"
+
+    def _mask_files(self, folder: Path, name: str) -> dict[int, Path]:
         """The mask files of a frame by their downscaling factors."""
-        endings, found = (".png.png", ".png"), {}
-        for factor in self._factors():
-            path = first_file(self.root / folder / f"{factor}x/{name}{ending}" for ending in endings)
-            if path is not None:
-                found[factor] = path
-        return found
+        found = {factor: find_mask(folder, factor, name) for factor in self._factors()}
+        return {factor: path for factor, path in found.items() if path is not None}
 
     def _complete_sizes(self, files: dict[str, dict[int, Path]]) -> None:
         """Writes masks of frames that have one in another size, from the largest of a frame's ``files``."""
@@ -191,11 +203,11 @@ class _Job:
             self._say("depth: that of the sensor stays")
             return
         names = self._names()
-        missing = [name for name in names if self.capture.frame(name).inverse_depth is None]
+        missing = [name for name in names if find_depth(self.root, self.factor, name) is None]
         if not missing:
             self._say("depth: all frames have it")
             return
-        frames, planes = self._planes(names)
+        frames, _, planes = self._depth(names)
         for name, plane in zip(names, planes, strict=True):
             if name in missing:
                 lens = self._lens(name)
@@ -213,10 +225,9 @@ class _Job:
             self._say(f"points: {len(self.capture.points)} are there")
             return
         names = self._names()
-        frames, planes = self._planes(names, "flow")
+        frames, static, planes = self._depth(names, "flow")
         fx, fy, (cx, cy) = *frames.lens.focal, frames.lens.center
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        static = self._static(names, frames.lens)
         chosen = evenly_spaced_indices(len(names), MAX_POINT_FRAMES)
         views = [DepthView(frames.images[k], planes[k], static[k], K, frames.poses[k]) for k in chosen]
         points, colors = points_of_views(views)
@@ -225,8 +236,8 @@ class _Job:
         writer.write_points(self.root, points / self.units.scale + self.units.center, colors)
         self._say(f"points: {len(points)}")
 
-    def _planes(self, names: list[str], depth: str | None = None) -> tuple[PosedFrames, Sequence[np.ndarray]]:
-        """Frames at working size and their inverse depth; the same for depth and points."""
+    def _depth(self, names: list[str], depth: str | None = None) -> _Depth:
+        """The depth of frames at working size; the same for depth and points."""
         name = depth or self.options.depth
         if name in self.estimated:
             return self.estimated[name]
@@ -236,8 +247,9 @@ class _Job:
         frames = self._posed(names, MAX_SIDE, max_factor=1.0)
         if name == "flow" and not are_apart(camera_centers(frames.poses)):
             raise ValueError(f"{self.root}: all cameras are at one place, where optical flow says nothing about depth")
-        dynamic = [~static for static in self._static(names, frames.lens)]
-        self.estimated[name] = frames, method.estimate(frames, dynamic, folder, self.log is None)
+        static = self._static(names, frames.lens)
+        planes = method.estimate(frames, [~mask for mask in static], folder, self.log is None)
+        self.estimated[name] = _Depth(frames, static, planes)
         return self.estimated[name]
 
     def _names(self) -> list[str]:
@@ -249,8 +261,15 @@ class _Job:
 
     def _posed(self, names: list[str], side: int, max_factor: float = np.inf) -> PosedFrames:
         """The frames as one pinhole camera sees them, with the longer side resized to ``side``."""
-        if len({self.capture.cameras[name].size for name in names}) > 1:
+        sizes = {self.capture.cameras[name].size for name in names}
+        if len(sizes) > 1:
             raise ValueError(f"{self.root} has images of several sizes, which cannot be compared")
+        factor = min(max_factor, side / max(sizes.pop()))
+        if factor not in self.posed:
+            self.posed[factor] = self._resized(names, side, max_factor)
+        return self.posed[factor]
+
+    def _resized(self, names: list[str], side: int, max_factor: float) -> PosedFrames:
         K = np.median([self.capture.cameras[name].K.double().numpy() for name in names], axis=0)
         common = _pinhole(K, self.capture.cameras[names[0]].size)
         images = []
@@ -276,17 +295,17 @@ class _Job:
 
     def _static(self, names: list[str], lens: Lens) -> list[Bool[np.ndarray, "H W"]]:
         """Static masks of the frames as the common camera sees them; all true where there is none."""
-        found = []
-        capture = load_capture(self.root)  # with the masks that were added
-        for name in names:
-            frame = capture.frame(name)
-            if frame.static_mask is None:
-                found.append(np.ones((lens.height, lens.width), bool))
-                continue
-            own = _pinhole(frame.camera.K.double().numpy(), frame.camera.size)
-            dynamic = (~frame.static_mask.numpy()).astype(np.float32)
-            found.append(_resampled(dynamic, own, lens, cv2.INTER_LINEAR) < 0.5)
-        return found
+        load_capture(self.root)  # refuses masks of some training frames only
+        return [self._static_mask(name, lens) for name in names]
+
+    def _static_mask(self, name: str, lens: Lens) -> Bool[np.ndarray, "H W"]:
+        path = find_mask(self._mask_folder(), self.factor, name)
+        if path is None:
+            return np.ones((lens.height, lens.width), bool)
+        camera, distorted = read_camera(self.root / f"camera/{name}.json", self.units, self.factor, 0.0)
+        dynamic = ~undistort(read_mask(path, camera.size), distorted)
+        own = _pinhole(camera.K.double().numpy(), camera.size)
+        return _resampled(dynamic.astype(np.float32), own, lens, cv2.INTER_LINEAR) < 0.5
 
     def _lens(self, name: str) -> Lens:
         """The lens of a frame's full-size file."""

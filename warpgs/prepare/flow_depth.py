@@ -39,12 +39,14 @@ def static_depth(
         quiet: Whether to show no progress.
     """
     height, width = frames.images[0].shape[:2]
-    frames, indices = frames.halved(), range(len(frames.images))  # flow tells no more at full size
+    frames, indices = frames.halved, range(len(frames.images))  # flow tells no more at full size
     flows, size = Flows(brighten(frames.images), frames.expected_flow), (frames.lens.width, frames.lens.height)
 
     def local(frame: int) -> LocalGeometry:
-        found = triangulate(frames.observations(frame, flows), frames.focal)
-        flows.release(frame)
+        found = frames.triangulated.pop(frame, None)
+        if found is None:
+            found = triangulate(frames.observations(frame, flows), frames.focal)
+            flows.release(frame)
         covered = np.where(dynamic[frame], 255, 0).astype(np.uint8)
         moves = cv2.resize(covered, size, interpolation=cv2.INTER_AREA) > 0  # a part of a pixel is enough
         with np.errstate(invalid="ignore"):

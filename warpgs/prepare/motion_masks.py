@@ -158,7 +158,7 @@ def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarra
         quiet: Whether to show no progress.
     """
     images, indices = brighten(frames.images), range(len(frames.images))
-    small = frames.halved()  # flow tells no more at full size
+    small = frames.halved  # flow tells no more at full size
     flows = Flows(brighten(small.images), small.expected_flow)
     labs = [cv2.cvtColor(image, cv2.COLOR_RGB2LAB) for image in images]
     found = map_frames(_Finder(flows, labs, Revisits(small, flows)).find, indices, "motion", quiet)

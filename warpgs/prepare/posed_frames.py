@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from warpgs.data.lens import Lens
 from .cameras import Cameras, are_apart, camera_centers
 from .flow import Flows
 from .images import read_images, resize_to_side
-from .triangulation import MIN_RELATIVE_DEPTH, Observation
+from .triangulation import MIN_RELATIVE_DEPTH, LocalGeometry, Observation
 
 PARALLAX = (4.0, 8.0, 16.0)
 """Parallax that the neighbours in each temporal direction should have [px of an image 512 wide]."""
@@ -37,6 +38,8 @@ class PosedFrames:
         focal: Focal length in the pixels that errors are counted in.
         rays: [H, W, 2] x, y on the plane z = 1 of every pixel's centre.
         neighbours: Up to six frames near each frame, see ``_neighbours``.
+        triangulated: What the search for motion has triangulated from neighbours, by frame. Depth takes it from here,
+            so that the optical flow of frames that are given to both is computed once.
     """
 
     def __init__(
@@ -64,7 +67,9 @@ class PosedFrames:
         self._columns = np.arange(0.5, lens.width, dtype=np.float32)
         self._rows = np.arange(0.5, lens.height, dtype=np.float32)[:, None]
         self.neighbours = [self._neighbours(frame) for frame in range(len(poses))]
+        self.triangulated: dict[int, LocalGeometry] = {}
 
+    @cached_property
     def halved(self) -> "PosedFrames":
         """The frames at half the size, whose errors are still counted in pixels of this one."""
         height, width = self.images[0].shape[:2]

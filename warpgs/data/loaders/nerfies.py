@@ -185,15 +185,13 @@ def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -
     masks = next((p for p in (root / "resized_mask", root / "mask") if p.is_dir()), None)
     if masks is not None and not (masks / size).is_dir() and not incomplete_masks:
         raise ValueError(f"{masks / size} is missing: images are read from {rgb / size}, masks must have the same size")
-    # Depth is resized to the image, so the full size serves every factor.
-    depths = [root / "depth" / s for s in (size, "1x")]
     files = {}
     for name in [*split.train, *split.val]:
         image = first_file(rgb / size / f"{name}{ending}" for ending in (".png", ".jpg"))
         if image is None:
             raise ValueError(f"{rgb / size / name}.png is missing: dataset.json lists the frame")
-        mask = None if masks is None else first_file(masks / size / f"{name}{e}" for e in (".png.png", ".png"))
-        depth = first_file(folder / f"{name}{ending}" for folder in depths for ending in (".npy", ".png"))
+        mask = None if masks is None else find_mask(masks, factor, name)
+        depth = find_depth(root, factor, name)
         covisible = first_file([root / "covisible" / size / "val" / f"{name}.png"])
         files[name] = _FrameFiles(image, mask, depth, covisible)
     for name in split.train:
@@ -203,6 +201,18 @@ def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -
                 f"warpgs prepare {root} --add masks makes those that are missing"
             )
     return files
+
+
+def find_mask(folder: Path, factor: int, name: str) -> Path | None:
+    """The mask of a frame at a downscaling factor in ``folder``, resized_mask or mask; None if it has none."""
+    return first_file(folder / f"{factor}x/{name}{ending}" for ending in (".png.png", ".png"))
+
+
+def find_depth(root: Path, factor: int, name: str) -> Path | None:
+    """The depth of a frame for images at a downscaling factor; None if it has none."""
+    # Depth is resized to the image, so the full size serves every factor.
+    folders = [root / f"depth/{size}x" for size in (factor, 1)]
+    return first_file(folder / f"{name}{ending}" for folder in folders for ending in (".npy", ".png"))
 
 
 @dataclass(frozen=True)
