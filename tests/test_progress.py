@@ -41,7 +41,7 @@ def shown_in_steps(monkeypatch, **options) -> str:
         return everything_on(screen)
 
 
-def test_the_last_step_is_shown_with_its_share(monkeypatch):
+def test_the_last_step_is_shown_with_its_fraction(monkeypatch):
     sent = shown_in_steps(monkeypatch)
     assert "planing" in sent
     assert "50%" in sent

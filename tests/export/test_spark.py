@@ -1,4 +1,4 @@
-"""Spark (three.js) draws exported files as warpgs does; skipped without Chromium and Spark.
+"""Spark (three.js) renders exported files as warpgs does; skipped without Chromium and Spark.
 
 ``npm install --global @sparkjsdev/spark three``. Version 2.2 reads SPZ up to version 3.
 """
@@ -103,8 +103,8 @@ def browser(tmp_path_factory):
         yield browser
 
 
-def drawn(browser, address, **options):
-    """The image [H, W, 3] in [0, 1] that Spark draws, and the number of Gaussians that it read."""
+def rendered(browser, address, **options):
+    """The image [H, W, 3] in [0, 1] that Spark renders, and the number of Gaussians that it read."""
     options |= {"width": SIZE[0], "height": SIZE[1], "focal": float(scenes.camera(*SIZE).K[0, 0])}
     browser.open(f"{address}#{quote(json.dumps(options))}")
     browser.until("'count' in window || 'problem' in window")
@@ -115,12 +115,12 @@ def drawn(browser, address, **options):
 @pytest.mark.parametrize(
     ("name", "degree", "antialias"), [("a.ply", 0, True), ("a.ply", 1, False), *((name, 3, False) for name in FILES)]
 )
-def test_spark_draws_the_scene(browser, site, name, degree, antialias):
+def test_spark_renders_the_scene(browser, site, name, degree, antialias):
     (folder, address), (write, y_up) = site, FILES[name]
     cloud = scenes.cloud(300, degree).replaced(antialias=antialias)
     file = f"degree-{degree}-{name}"  # its own: the browser caches by name and second
     write(folder / file, orientation.rotated(cloud, orientation.upright(UP, y_up)))
-    image, count = drawn(browser, address, file=file, yUp=y_up, spark=BLUR[antialias])
+    image, count = rendered(browser, address, file=file, yUp=y_up, spark=BLUR[antialias])
     truth = scenes.image(cloud, scenes.camera(*SIZE)).numpy()
     assert count == 300
     assert truth.std() > 0.1

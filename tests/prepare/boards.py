@@ -124,7 +124,7 @@ def through_fisheye(num_frames: int, fisheye: Lens) -> list[np.ndarray]:
 
 
 def pan(num_frames: int) -> list[np.ndarray]:
-    """[H, W, 3] images of a camera that only turns, over a picture."""
+    """[H, W, 3] images of a camera that only turns, over an image."""
     wide = texture(3, (150, 140, 120), 900, (40, 120))
     K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1.0]])
     crop = np.array([[1, 0, -(900 - SIZE[0]) / 2], [0, 1, -(900 - SIZE[1]) / 2], [0, 0, 1.0]])

@@ -106,15 +106,15 @@ def test_flow_that_starts_where_the_cameras_say_is_right_over_wide_steps(video, 
     agreeing = {}
     for expected in (None, frames.expected_flow):
         flows = Flows(brighten(frames.images), expected)
-        shares = []
+        fractions = []
         for a, b in ((2, 10), (8, 16), (14, 22)):
             rotation, translation = frames.relative(a, b)
             points = frames.rotated_rays(rotation) * truth[a] + translation[:, None, None]
             column, row = frames.lens.image(points[0] / points[2], points[1] / points[2])
             x, y, _ = flows.track(a, b)
             inside = (column > 0) & (column < 256) & (row > 0) & (row < 192) & ~video[1][a]
-            shares.append((np.hypot(x + 0.5 - column, y + 0.5 - row) < 1.0)[inside].mean())
-        agreeing[expected is None] = np.mean(shares)
+            fractions.append((np.hypot(x + 0.5 - column, y + 0.5 - row) < 1.0)[inside].mean())
+        agreeing[expected is None] = np.mean(fractions)
     assert agreeing[False] > 0.6
     assert agreeing[False] > agreeing[True] + 0.1
 

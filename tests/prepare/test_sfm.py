@@ -126,7 +126,7 @@ def test_frames_that_see_too_few_points_lose_their_camera():
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
-    """A camera that pans over a picture."""
+    """A camera that pans over an image."""
     return boards.write_folder(tmp_path_factory.mktemp("pan"), boards.pan(12))
 
 

@@ -369,7 +369,7 @@ def test_without_corrections_or_checkpoint_the_cameras_are_those_of_the_capture(
 
 def test_frames_that_were_not_trained_on_keep_their_cameras(data, tmp_path, capture):
     run, trainer = run_with_poses(data, tmp_path / "run")
-    tiny.edit_metadata(run.newest_checkpoint(), lambda facts: facts.update(views=["gone", *facts["views"][1:]]))
+    tiny.edit_metadata(run.newest_checkpoint(), lambda fields: fields.update(views=["gone", *fields["views"][1:]]))
     corrected = run.open_corrected_capture(quiet=True)
     first, second = capture.train[:2]
     assert torch.equal(corrected.cameras[first].viewmat, capture.cameras[first].viewmat)

@@ -178,7 +178,7 @@ def test_a_run_is_not_shortened():
         extended(tiny.CONFIG, 31)
 
 
-def test_a_held_out_frame_that_cannot_be_read_ends_the_pictures_and_not_the_training():
+def test_a_held_out_frame_that_cannot_be_read_ends_the_held_out_images_and_not_the_training():
     def read(name):
         raise ValueError(f"{name}.png is damaged")
 

@@ -191,7 +191,7 @@ def confirmed(
     counts, labels = zip(*(cv2.connectedComponents(mask.astype(np.uint8)) for mask in masks), strict=True)
     starts = np.cumsum([0, *counts])
     sizes = np.concatenate([np.bincount(a.ravel(), minlength=n) for a, n in zip(labels, counts, strict=True)])
-    share = np.concatenate(
+    num_certain = np.concatenate(
         [np.bincount(a.ravel(), c.ravel(), n) for a, c, n in zip(labels, certain, counts, strict=True)]
     )
     links = []
@@ -203,7 +203,7 @@ def confirmed(
     i, j = np.concatenate([np.zeros((2, 0), np.int64), *links], 1)
     graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), (starts[-1], starts[-1]))
     count, objects = connected_components(graph, directed=False)
-    kept = np.bincount(objects, share, count) > MIN_CERTAIN * np.bincount(objects, sizes, count)
+    kept = np.bincount(objects, num_certain, count) > MIN_CERTAIN * np.bincount(objects, sizes, count)
     kept = kept[objects]
     return [mask & kept[start + a] for mask, start, a in zip(masks, starts, labels, strict=False)]
 

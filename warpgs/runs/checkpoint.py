@@ -27,7 +27,8 @@ MAX_BYTES = 16 << 30
 """Maximum size of a checkpoint [bytes]; 20 million Gaussians with Adam's moments."""
 
 HEADER_KEYS = ("format", "version", "facts", "sha256")
-"""Keys of the file's metadata. Checkpoints of version 0.2 and earlier have no ``sha256``."""
+"""Keys of the file's metadata; "facts" has the fields of ``Metadata``. Checkpoints of version 0.2 and
+earlier have no ``sha256``."""
 
 
 class DamagedCheckpointError(ValueError):
@@ -110,8 +111,8 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     values = {FILE_KEYS.get(name, name): value for name, value in asdict(metadata).items()}
-    facts = json.dumps(values)
-    header = {"format": "warpgs", "version": str(VERSION), "facts": facts, "sha256": _hash(plain, facts)}
+    fields = json.dumps(values)
+    header = {"format": "warpgs", "version": str(VERSION), "facts": fields, "sha256": _hash(plain, fields)}
     with atomic_path(path) as partial:
         partial.touch()
         mode = partial.stat().st_mode
@@ -124,9 +125,9 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
             os.fsync(file.fileno())
 
 
-def _hash(tensors: Mapping[str, Tensor], facts: str) -> str:
+def _hash(tensors: Mapping[str, Tensor], fields: str) -> str:
     """SHA-256 of the names, types, shapes and bytes of tensors on the CPU, and of the plain values."""
-    digest = hashlib.sha256(facts.encode())
+    digest = hashlib.sha256(fields.encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"\0{name} {tensor.dtype} {list(tensor.shape)}\0".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)

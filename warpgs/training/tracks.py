@@ -176,7 +176,7 @@ class _Fit:
         row, column = unknowns[:, :, None], unknowns[:, None, :]
         of_lower = (row >= column).reshape(len(regions), -1)[0]  # all regions have the same pattern
         self.blocks = blocks.reshape(len(regions), -1)[:, of_lower]
-        self.places = ((row - column) * self.size + column).reshape(len(regions), -1)[:, of_lower]
+        self.band_indices = ((row - column) * self.size + column).reshape(len(regions), -1)[:, of_lower]
         self.targets, self.unknowns = targets.reshape(len(regions), -1), unknowns
         self.penalty = _difference_penalty(basis.shape[1])
 
@@ -195,7 +195,7 @@ class _Fit:
         band = smoothness * self.penalty
         band[0] += 1e-9  # where no ray is
         blocks, targets = weights[:, None] * self.blocks, weights[:, None] * self.targets
-        band += np.bincount(self.places.ravel(), blocks.ravel(), band.size).reshape(band.shape)
+        band += np.bincount(self.band_indices.ravel(), blocks.ravel(), band.size).reshape(band.shape)
         right = np.bincount(self.unknowns.ravel(), targets.ravel(), self.size)
         return solveh_banded(band, right, lower=True).reshape(-1, 3)
 

@@ -156,8 +156,8 @@ def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.
             if with_images:
                 write_png(folder / f"{name}.png", image)
     height, width = image.shape[:2]
-    places = [*([folder] if with_images else []), *([file] if video else [])]
-    return f"{len(names)} images of {width} × {height} in {' and '.join(map(str, places))}"
+    written = [*([folder] if with_images else []), *([file] if video else [])]
+    return f"{len(names)} images of {width} × {height} in {' and '.join(map(str, written))}"
 
 
 def _add(video: writer.Video, image: np.ndarray) -> None:
