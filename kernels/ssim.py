@@ -35,7 +35,7 @@ STRIP = 16
 """Pixels of one column per thread on CUDA; the lines above and below a strip are filtered once more."""
 
 SMALL_IMAGE_STRIP = 4
-"""As ``STRIP``, for small images on CUDA, which would otherwise have too few threads to keep a GPU busy."""
+"""``STRIP`` of small images on CUDA, which would otherwise have too few threads to keep a GPU busy."""
 
 C1 = wp.constant(0.01**2)
 C2 = wp.constant(0.03**2)

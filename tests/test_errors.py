@@ -124,7 +124,7 @@ def test_importing_errors_imports_no_torch():
     ],
 )
 def test_output_that_nobody_reads_is_no_error(arguments, unbuffered):
-    """As of ``warpgs --help | head``."""
+    """This is what ``warpgs --help | head`` does."""
     reader, writer = os.pipe()
     os.close(reader)
     command, environment = [sys.executable, "-m", "warpgs", *arguments], {**os.environ, "PYTHONUNBUFFERED": unbuffered}

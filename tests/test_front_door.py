@@ -104,7 +104,7 @@ def test_train_is_a_command_and_a_script():
     ],
 )
 def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_and_130(command, tmp_path):
-    """As numpy and torch do, whose imports turn it into other errors."""
+    """The imports of numpy and torch turn it into other errors."""
     swallow = (
         "import os\nimport signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nexcept BaseException:\n    pass\n"
     )

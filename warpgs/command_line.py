@@ -32,7 +32,7 @@ METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH
 
 
 def _choices(match: re.Match[str]) -> str:
-    """The same message for tyro's and argparse's, which quotes the choices in some versions of Python."""
+    """One message for those of tyro and of argparse, which quotes the choices in some versions of Python."""
     choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
     return f"{match['option']} must be one of {', '.join(choices)}, got {match['given']}"
 

@@ -12,11 +12,11 @@ import sys
 from typing import Any
 
 PR_SET_PDEATHSIG = 1
-"""From <linux/prctl.h>: the signal that a process gets when its parent dies."""
+"""Option of Linux's prctl: the signal that a process gets when its parent dies."""
 
 
 M_ARENA_MAX = -8
-"""From <malloc.h> of glibc: the option that limits its number of pools of memory."""
+"""Option of glibc's mallopt: the maximum number of its pools of memory."""
 
 
 def lower_priority(niceness: int) -> None:

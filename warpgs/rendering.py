@@ -94,7 +94,7 @@ class _Inputs(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """Those tensors of the forward pass that the backward pass reads besides its inputs."""
+    """The tensors of the forward pass that the backward pass reads besides its inputs."""
 
     conics: Tensor
     opacities: Tensor

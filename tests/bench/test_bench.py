@@ -107,7 +107,7 @@ def test_the_output_has_names_and_no_keys(capsys):
 
 
 def test_graphs_are_measured_beside_plain_calls(monkeypatch):
-    """On CPU, where calls are not recorded but repeated."""
+    """The test runs on the CPU, where calls are not recorded but repeated."""
     monkeypatch.setattr(torch.cuda, "make_graphed_callables", lambda render, _parameters: render)
     monkeypatch.setattr(measure, "capture", lambda step: step)
     workload = tiny_workload()

@@ -22,7 +22,7 @@ PER_VISIT = 20
 """Inputs of the other campaigns per visit, which takes longer."""
 
 PAUSE = 1.0
-"""From one visit to the next, in visits that are to last some time [s]."""
+"""Time from one visit to the next, in visits that are to last some time [s]."""
 
 MIN_VISITS = 100
 """Fewer are too few for memory to settle."""

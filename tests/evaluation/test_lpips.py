@@ -28,7 +28,7 @@ def _nothing_in_the_environment(monkeypatch):
 
 
 def network(net):
-    """Of random weights."""
+    """LPIPS with random weights."""
     distance = lpips.Lpips(net)
     for parameter in distance.features.parameters():
         nn.init.normal_(parameter, std=0.05)
@@ -120,7 +120,7 @@ def test_one_layer_by_hand():
 
 @pytest.mark.parametrize(("net", "count"), [("squeeze", 722_496), ("alex", 2_469_696), ("vgg", 14_714_688)])
 def test_a_network_has_as_many_parameters_as_published(net, count):
-    """Of the features of torchvision's SqueezeNet 1.1, AlexNet and VGG-16."""
+    """The networks are the features of torchvision's SqueezeNet 1.1, AlexNet and VGG-16."""
     assert sum(p.numel() for p in lpips.Lpips(net).features.parameters()) == count
 
 

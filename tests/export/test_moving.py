@@ -32,7 +32,7 @@ def expected(clouds, time):
 
 
 def psnr(cloud, truth):
-    """Of images after half a turn around x, for which the cameras of the tests are made."""
+    """PSNR of images after half a turn around x, for which the cameras of the tests are made."""
     images = [scenes.image(rotated(c, upright(AXES["-y"], y_up=True))) for c in (cloud, truth)]
     assert images[1].std() > 0.05
     return scenes.psnr(*images)

@@ -285,7 +285,7 @@ def test_a_frame_without_a_camera_is_noted_and_omitted(tmp_path):
 
 
 def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch):
-    """Those of frames twice as large."""
+    """The file has the intrinsics of frames twice as large."""
 
     def recover(folder, names, work, settings, quiet):
         assert settings.known == Lens(*boards.SIZE, (230.0, 230.0), (130.0, 96.0))

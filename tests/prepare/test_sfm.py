@@ -263,7 +263,7 @@ def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
 
 
 def test_the_focal_length_that_pairs_agree_on_is_the_true_one(tmp_path):
-    """Of cameras at random places with random directions: those of ``wide_database`` look at one point."""
+    """The cameras have random positions and directions, because those of ``wide_database`` look at one point."""
     wide_database(tmp_path / "features.db")
     opened, random = pycolmap.Database.open(tmp_path / "features.db"), np.random.default_rng(0)
     calibration = np.linalg.inv([[240.0, 0.0, 240.0], [0.0, 240.0, 135.0], [0.0, 0.0, 1.0]])

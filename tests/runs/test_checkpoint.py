@@ -349,7 +349,7 @@ def test_every_flipped_bit_is_refused_or_changes_nothing(tmp_path):
 
 
 def test_checkpoints_without_a_hash_are_read(path):
-    """As version 0.2 wrote them."""
+    """Version 0.2 wrote them."""
     tiny.edit_metadata(path, lambda values: None)
     with safe_open(path, framework="pt") as file:
         assert "sha256" not in file.metadata()

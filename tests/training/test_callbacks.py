@@ -63,7 +63,7 @@ def watched(data, tmp_path_factory):
 
 @pytest.fixture
 def config(data, tmp_path, monkeypatch):
-    """Of a run that is not evaluated at its end."""
+    """The config of a run that is not evaluated at its end."""
     monkeypatch.setattr(trainer, "CHECK_EVERY", CHECK_EVERY)
     monkeypatch.setattr(script, "evaluate_run", lambda *_, **__: "")
     return dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")

@@ -270,7 +270,7 @@ def test_a_reset_clears_the_moments_of_opacities_only():
 
 @pytest.mark.parametrize(("min_pixels", "most"), [(0, 120), (8, 120), (46, 100), (60, 76), (500, 70)])
 def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(tmp_path, min_pixels, most):
-    """Of 32×24 pixels in 6 views; training starts with 70 Gaussians, and the config allows 120."""
+    """The capture has 6 views of 32×24 pixels; training starts with 70 Gaussians, and the config allows 120."""
     densify_config = dataclasses.replace(tiny.CONFIG.densify, min_pixels=min_pixels, gradient=0.0, weakest=0.0)
     schedule = dataclasses.replace(tiny.SCHEDULE, densify_until=10, prune_every=100, reset_every=100)
     config = dataclasses.replace(tiny.CONFIG, densify=densify_config, schedule=schedule)

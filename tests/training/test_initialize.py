@@ -55,7 +55,7 @@ def make_capture(points, colors=None, inverse_depth=None, num_frames=3):
 
 
 def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None, fits=None):
-    """Those of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
+    """The dynamic Gaussians of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
     views = Views(capture, torch.device("cpu"), 1 << 30)
     fits = initialize.fits_motion(config, capture, views, alignments) if fits is None else fits
     protocol, deformation = Protocol(config, True, fits_motion=fits), deformation or torch.nn.Identity()

@@ -15,7 +15,7 @@ NUM_VIEWS, NUM_POINTS = 21, 40
 EXTENT = 2.0
 TIMES = torch.linspace(0, 1, NUM_VIEWS)
 COLORS = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
-"""Of the two objects."""
+"""Colours of the two objects."""
 MODEL = ModelConfig(position_bands=4, time_bands=4, depth=3, width=64, skip=2, half=False)
 
 

@@ -100,7 +100,7 @@ def trained(data, folder, graphs=None):
 
 
 def test_work_recorded_in_the_first_iteration_of_a_phase_serves_all_others_bit_for_bit(data, tmp_path):
-    """As a CUDA graph does; so a step reads nothing of its plan but the phase, and everything else from tensors."""
+    """A CUDA graph does that; so a step reads nothing of its plan but the phase, and everything else from tensors."""
     eager, recorded = trained(data, tmp_path / "eager"), trained(data, tmp_path / "recorded", RecordedWork)
     assert tiny.differences(eager, recorded) == []
 

@@ -151,7 +151,7 @@ def test_the_image_shows_the_scene_through_the_camera(page, session):
 
 
 def test_with_cuda_graphs_joint_images_at_full_resolution_are_replayed(page, session, monkeypatch):
-    """As on a GPU, except that a graph is a function that is called again."""
+    """A graph is a function here, which is called again; the rest is as on a GPU."""
     before = seen(page, session)
     trained = session._shown.request.scene
     monkeypatch.setattr(graphs, "capture", lambda work: work)

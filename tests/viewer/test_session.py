@@ -328,7 +328,7 @@ def test_a_preview_ends_with_the_browser(editor, monkeypatch):
 
 
 def test_a_video_is_rendered_by_the_command(editor, monkeypatch):
-    """In a process of its own; what the process prints is shown."""
+    """The command runs in a process of its own, and what it prints is shown."""
     commands, signals = [], []
 
     class Child:

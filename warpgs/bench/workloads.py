@@ -42,13 +42,13 @@ class Workload:
         return torch.autograd.grad(self.render(), self.parameters, self.v_images)
 
     def forward_backward_on_one_thread(self) -> tuple[Tensor, ...]:
-        """The same without autograd's thread for the device, which has to wake up and starts with cold caches."""
+        """Both passes without autograd's thread for the device, which has to wake up and starts with cold caches."""
         with torch.autograd.set_multithreading_enabled(False):
             return self.forward_backward()
 
 
 def graphed(workload: Workload) -> Workload:
-    """The same as two CUDA graphs, of the forward and the backward pass, from ``torch.cuda.make_graphed_callables``."""
+    """The workload as two CUDA graphs, one of each pass, from ``torch.cuda.make_graphed_callables``."""
     render: Any = torch.cuda.make_graphed_callables(workload.render, workload.parameters)
     return dataclasses.replace(workload, render=partial(render, *workload.parameters))
 

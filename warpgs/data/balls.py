@@ -33,7 +33,7 @@ ANGLE = 0.6911112070083618
 """Horizontal field of view of D-NeRF [rad]."""
 
 RADIUS = 0.1
-"""Of the balls [world units]."""
+"""Radius of each ball [world units]."""
 
 COLORS: list[tuple[Color, Color]] = [
     ((0.90, 0.20, 0.15), (0.95, 0.45, 0.20)),

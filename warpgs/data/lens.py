@@ -61,7 +61,7 @@ class Lens:
     fisheye: tuple[float, float, float, float] | None = None
 
     def checked(self) -> "Lens":
-        """The same lens.
+        """This lens, if it can be used.
 
         Raises:
             ValueError: If a number is not finite, a focal length is below ``MIN_FOCAL``, the size is out of range, or

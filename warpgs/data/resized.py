@@ -34,7 +34,7 @@ def read_resized_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "
 def read_resized_over_white(
     path: Path, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 4"]:
-    """As ``read_resized_image``, but composited over white if the file has alpha.
+    """8-bit RGB image, resized as by ``read_resized_image``, but composited over white if the file has alpha.
 
     Then there is a fourth channel: 0 where a pixel is entirely transparent, and 255 elsewhere.
     """

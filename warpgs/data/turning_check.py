@@ -21,7 +21,7 @@ MAX_RATIO = 0.8
 """Distance of the best match over that of the second (Lowe 2004)."""
 
 MAX_EPIPOLAR_ERROR = 2.0
-"""Of the matches that count [px]."""
+"""Maximum distance of a match from its epipolar line, above which it does not count [px]."""
 
 
 def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:

@@ -36,7 +36,7 @@ REST = (-2.0, 2.0)
 """Bounds of colours and of coefficients of degree 1 and higher, far beyond what a screen shows."""
 
 YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
-"""From red, green and blue to luma and two chroma, which neighbours share more of."""
+"""Converts red, green and blue to luma and two chroma, which neighbours share more of."""
 
 CHROMA = (1.0, 2.0, 2.0)
 """Factors of the steps of luma and chroma."""

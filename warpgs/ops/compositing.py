@@ -25,7 +25,7 @@ CUDA_PIXELS = (1, 2)
 """Columns and rows of the pixels that a lane composites on CUDA (alternatives: docs/design/lane-groups.md)."""
 
 SMALL_IMAGE_CUDA_PIXELS = (1, 1)
-"""As ``CUDA_PIXELS``, for small images, which would otherwise have too few lanes to keep a GPU busy."""
+"""``CUDA_PIXELS`` of small images, which would otherwise have too few lanes to keep a GPU busy."""
 
 MAX_SMALL_IMAGE_PIXELS = 1 << 18
 """Images of at most this number of pixels are small."""

@@ -26,7 +26,7 @@ def can_filter(image: Tensor) -> bool:
 def ssim_fwd(
     image: Tensor, target: Tensor, mask: Tensor | None, weights: tuple[float, float, float], with_partials: bool
 ) -> tuple[Tensor, Tensor]:
-    """As that of ops/ssim.py."""
+    """The forward pass; arguments and results are those of ``ssim.ssim_fwd``."""
     with span("ssim_fwd", CPU):
         base, l1, similarity_weight = weights
         x, y = _masked(image, mask), _masked(target, mask)
@@ -61,7 +61,7 @@ def ssim_bwd(
     partials: Tensor,
     v_sum: Tensor,
 ) -> Tensor:
-    """As that of ops/ssim.py."""
+    """The backward pass; arguments and result are those of ``ssim.ssim_bwd``."""
     with span("ssim_bwd", CPU):
         _, l1, similarity_weight = weights
         x, y = _masked(image, mask), _masked(target, mask)

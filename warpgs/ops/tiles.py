@@ -67,7 +67,7 @@ class _Budget:
 
 
 class _Budgets(threading.local):
-    """Those of this thread, by device and size of the image."""
+    """The budgets of this thread, by device and size of the image."""
 
     def __init__(self) -> None:
         self.by_size: dict[tuple[torch.device, tuple[int, int]], _Budget] = {}

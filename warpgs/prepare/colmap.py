@@ -67,7 +67,7 @@ TOLERANCE = 1e-6
 iterations: 86 frames of 512×384 took 2.2 s instead of 0.5 s, with the same reprojection error and camera centres."""
 
 MAX_ERROR, MIN_TRIANGULATION_ANGLE = 4.0, 1.5
-"""Of the points that are kept while cameras are refined, as in incremental mapping [px, degrees]."""
+"""Limits for the points that are kept while cameras are refined [px, degrees]; incremental mapping has the same."""
 
 Report = Callable[[str, int, int], None]
 

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 Pair = tuple[int, int]
 
 PATCH_STRIDE, NUM_REFINEMENTS = 4, 2
-"""Of DIS; with 3 px and 5 rounds, as in its medium preset, flow takes twice as long and masks are as good."""
+"""Distance of DIS's patches [px], and its rounds of variational refinement. With 3 px and 5 rounds, those of its medium
+preset, flow takes twice as long and masks are as good."""
 
 TOLERANCE, RELATIVE_TOLERANCE = 0.25, 0.05
 """Distance by which flow there and back may miss a visible pixel [px], and relative to its displacement."""

@@ -51,5 +51,5 @@ def sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
 
 
 def grey_sharpness(grey: UInt8[np.ndarray, "H W"]) -> float:
-    """The same of grey levels, whose longer side has at most ``SHARPNESS_SIDE`` pixels."""
+    """Variance of the Laplacian of grey levels, whose longer side has at most ``SHARPNESS_SIDE`` pixels."""
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())

@@ -41,7 +41,7 @@ SCALE = 1.0
 """Distance at which the weight of a match is half [px]."""
 
 MAX_STEPS, MIN_DECREASE = 60, 1e-7
-"""Of the Levenberg-Marquardt iterations: number of steps, and relative decrease of the loss that ends them."""
+"""Maximum number of Levenberg-Marquardt steps, and the relative decrease of the loss below which they end."""
 
 STEP = 1e-6
 """Step of numerical derivatives."""

@@ -31,7 +31,7 @@ CAPTURE_BYTES = 16
 """Disk space per pixel of a frame that a preparation needs: the image twice, its mask, depth, and features [bytes]."""
 
 FEATURE_BYTES, MASK_BYTES, IMAGE_BYTES, DEPTH_BYTES = 5, 1, 5, 2
-"""The same for single steps."""
+"""Disk space per pixel of a frame that single steps need [bytes]."""
 
 STILL_FOCAL = 1.0
 """Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""

@@ -105,7 +105,7 @@ def capture(step: Callable[[], tuple[Tensor, ...]]) -> Replay:
 def record(
     work: Callable[[], tuple[Tensor, ...]], stream: torch.cuda.Stream | None = None, pool: Any | None = None
 ) -> Replay:
-    """As ``capture``, for work that must not be repeated for warming up: it must have run ``WARM_UPS`` times before.
+    """Captures work that must not be repeated for warming up: it must have run ``WARM_UPS`` times before.
 
     Args:
         work: Runs on the current CUDA device without reading anything back from it.

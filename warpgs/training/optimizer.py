@@ -24,7 +24,7 @@ from . import ranks
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15
-"""As in 3DGS: Gaussians that are hardly visible have tiny gradients, which should count all the same."""
+"""Adam's ε, that of 3DGS: Gaussians that are hardly visible have tiny gradients, which should count all the same."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Names of Adam's moments in the state of a parameter."""

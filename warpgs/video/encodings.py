@@ -18,7 +18,7 @@ WEBP_QUALITY = 90
 """Quality of WebP in [0, 100]."""
 
 Convert = Callable[[Any], Iterator[Any]]
-"""From an RGBA frame, or None after the last one, to the frames that the encoder can take by then."""
+"""Converts an RGBA frame, or None after the last one, to the frames that the encoder can take by then."""
 
 
 @dataclass(frozen=True)
