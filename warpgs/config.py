@@ -56,7 +56,8 @@ class ModelConfig:
     raw_input: bool = True
     """Whether the networks get position and time beside their encodings, as in Deformable-3DGS; not in paper Eq. 6."""
     min_period: float = 0.0
-    """Minimum period of these frequencies [training frames]; higher ones overfit and are dropped. 0: none (paper)."""
+    """Minimum period of the frequencies in the encoding of time [training frames]; higher frequencies overfit and are
+    dropped. 0: all are kept (paper)."""
     depth: Annotated[int, Bounds(min=1, max=64)] = 8
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
@@ -72,7 +73,8 @@ class ModelConfig:
     paths: Annotated[int, Bounds(min=1, max=4096)] = 1
     """Number of splines of the deformation model "splines"; training sets it to the number of objects."""
     path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
-    """Number of control points of each of them; training sets it by the number of frames."""
+    """Number of control points of each spline of the deformation model "splines"; training sets it by the number of
+    frames."""
     sh_degree: int = 1
     """Maximum degree of spherical harmonics."""
     appearance_degree: int = 0
@@ -127,7 +129,7 @@ class LossConfig:
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     object_depth: bool = False
-    """Whether moving objects of unknown depth get one by their size (docs/design/object-depth.md)."""
+    """Whether dynamic objects of unknown depth get one by their size (docs/design/object-depth.md)."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""
@@ -187,7 +189,8 @@ class DensifyConfig:
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
-    """At prunings during densification: new dynamic Gaussians start where so many dynamic pixels are lost; 0: never."""
+    """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start there
+    at the next pruning during densification. 0: never."""
     weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
@@ -226,8 +229,8 @@ class Schedule:
     joint_from: int | None = None
     """Iteration of stage I from which the joint image is compared; in stage II alone if None (paper)."""
     warmup: int = 1_000
-    """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. Adam's
-    first steps, all of one sign, would turn ReLU units off for good, and carry the Gaussians of an object off."""
+    """Iterations over which a network's learning rate rises once it is in use, whatever the length of the run. With the
+    full rate, Adam's first steps would leave ReLU units inactive forever and move the Gaussians of an object away."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
@@ -263,7 +266,8 @@ class TrainConfig:
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
     vrig_factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
-    """The same for HyperNeRF's captures of two cameras (vrig) alone; Deformable-3DGS reads them at 4."""
+    """Downscaling factor of the images of HyperNeRF's captures of two cameras (vrig), if ``factor`` is omitted;
+    Deformable-3DGS reads them at 4."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None

@@ -22,7 +22,7 @@ def turns() -> Rotation:
 
 
 def matches(outliers: float = 0.0, travel: float = 0.0, count: int = 60):
-    """Matches of frames at most four apart, of which some are on a moving object."""
+    """Matches of frames at most four apart, of which some are on a dynamic object."""
     random, found, rotations = np.random.default_rng(0), {}, turns()
     for a in range(len(NAMES)):
         for b in range(a + 1, min(a + 5, len(NAMES))):

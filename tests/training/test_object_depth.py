@@ -295,5 +295,5 @@ def test_a_capture_with_depth_pretrains(tmp_path):
 def test_training_says_that_size_gives_depth(tmp_path):
     lines: list[str] = []
     _describe(Trainer(CONFIG, capture_of(MASKS), tmp_path), lines.append)
-    assert f"depth of moving objects is taken from their size in {NUM} of {NUM} views" in lines
+    assert f"depth of dynamic objects is taken from their size in {NUM} of {NUM} views" in lines
     assert not any("training without depth" in line for line in lines)

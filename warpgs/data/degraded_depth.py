@@ -9,7 +9,7 @@ DRIFT, FLICKER = 0.08, 0.02
 """Relative errors that change slowly over time, and from frame to frame (standard deviation)."""
 
 SHIFT = 0.10
-"""Error of each moving object as a whole, as a fraction of the range of inverse depth (maximum)."""
+"""Error of each dynamic object as a whole, as a fraction of the range of inverse depth (maximum)."""
 
 DRIFT_FRAMES = 40
 """Frames over which one field of slow errors becomes the next."""

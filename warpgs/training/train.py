@@ -167,7 +167,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
         reason = "" if num_aligned or trainer.num_with_objects else NO_DEPTH
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
-        log(f"depth of moving objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
+        log(f"depth of dynamic objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
 
 
 def _advise(config: TrainConfig, trainer: Trainer, log: Log) -> None:
