@@ -139,13 +139,13 @@ def running_from(out, iteration):
 
 
 @contextlib.contextmanager
-def sweeping(cluster, folder):
+def sweeping(cluster, folder, *options):
     """The command in a process of its own; yields it once two running cells have written checkpoints."""
     from tests import tiny
 
     (folder / "tiny.toml").write_text(TOML)
     command = [sys.executable, "-m", "warpgs", "sweep", "tiny.toml", "--data", f"tiny={tiny.write(folder / 'capture')}"]
-    command += ["--out", "out", "--address", cluster.address, "--cpus", "1"]
+    command += ["--out", "out", "--address", cluster.address, "--cpus", "1", *options]
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         while process.poll() is None and len(running_from(folder / "out", 20)) < 2:
@@ -192,7 +192,8 @@ def test_ctrl_c_saves_the_running_cells_and_the_next_start_goes_on(cluster, tmp_
 
 
 def test_a_cluster_that_is_gone_leaves_one_line_and_the_tables(cluster, tmp_path):
-    with sweeping(cluster, tmp_path) as process:
+    # Trainings go on without the head until the sweep notices that it is gone; these are too long to finish by then.
+    with sweeping(cluster, tmp_path, "--iterations", "1000000") as process:
         kill(cluster.head_node)
         output, _ = process.communicate(timeout=200)
     assert process.returncode == 2, output
