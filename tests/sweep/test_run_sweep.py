@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -135,6 +136,38 @@ def test_a_sweep_that_stops_says_so_prints_what_is_there_and_goes_on(sweep, caps
     assert sweep() == (0, ["as-plain-seed0", "as-full-seed1", "as-plain-seed1"])
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, to which every write fails")
+@pytest.mark.parametrize("file", ["table.md", "cells.csv", "report.html"])
+def test_a_full_disk_stops_no_training_and_the_table_is_printed(sweep, tmp_path, capsys, monkeypatch, file):
+    def on_a_full_disk(write):
+        def attempt(out, *others):
+            (out / f"{file}.partial").unlink(missing_ok=True)
+            (out / f"{file}.partial").symlink_to("/dev/full")
+            write(out, *others)
+
+        return attempt
+
+    for name in ("write_tables", "write_report"):
+        monkeypatch.setattr(module, name, on_a_full_disk(getattr(module, name)))
+    code, trained = sweep()
+    assert (code, len(trained)) == (2, 4)
+    printed = capsys.readouterr()
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed.out
+    assert printed.err == f"warpgs: {tmp_path}/out/{file} could not be written: No space left on device\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, to which every write fails")
+def test_tables_of_a_finished_sweep_are_printed_on_a_full_disk(sweep, tmp_path, capsys):
+    sweep()
+    capsys.readouterr()
+    for name in ("sweep.json", "table.md"):
+        (tmp_path / f"out/{name}.partial").symlink_to("/dev/full")
+    assert sweep("--tables-only") == (2, [])
+    printed = capsys.readouterr()
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed.out
+    assert printed.err == f"warpgs: {tmp_path}/out/table.md could not be written: No space left on device\n"
+
+
 def test_results_of_other_options_are_never_mixed_in(sweep, capsys):
     sweep()
     code, trained = sweep("--iterations", "64")
@@ -179,8 +212,6 @@ def test_wrong_options_are_one_line(sweep, capsys, arguments, message):
 
 
 def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, tmp_path):
-    from pathlib import Path
-
     from warpgs.runs.config_file import write_config
 
     config = dataclasses.replace(read_config(finished_run), data=Path("builtin:room"))

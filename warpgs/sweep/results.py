@@ -32,21 +32,24 @@ def notes_of(board: Board) -> list[str]:
     return notes + [f"{', '.join(names)}: {error}" for error, names in reasons.items()]
 
 
-def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> str:
-    """Writes every file but the report; returns the tables as Markdown, without the commands.
+def tables_text(spec: SweepSpec, board: Board, peers: Peers) -> str:
+    """The tables as Markdown, without the commands."""
+    return markdown(spec.title, tables_of(board, spec, peers), notes_of(board))
+
+
+def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None:
+    """Writes every file but the report.
 
     Raises:
         OSError: If a file cannot be written.
     """
-    tables, notes = tables_of(board, spec, peers), notes_of(board)
-    text = markdown(spec.title, tables, notes)
-    commands = "\n".join(cell.command for cell in board.cells)
+    tables, commands = tables_of(board, spec, peers), "\n".join(cell.command for cell in board.cells)
+    text = tables_text(spec, board, peers)
     write_text(out / "table.md", f"{text}\n## Commands\n\n```sh\n{commands}\n```\n")
     write_text(out / "table.tex", latex(spec.title, tables))
     write_text(out / "table.csv", means_csv(tables))
     lines = [(cell, board.states[cell.name], board.metrics.get(cell.name)) for cell in board.cells]
     write_text(out / "cells.csv", cells_csv(lines))
-    return text
 
 
 def write_report(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from .cells import Cell, find_scenes, is_started, plan_cells
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
-from .results import write_report, write_tables
+from .results import tables_text, write_report, write_tables
 from .scheduler import Event, run_jobs
 from .shared_gpu import shared_gpus
 from .spec import MAX_SEEDS, SweepSpec, read_spec
@@ -33,7 +33,7 @@ Log = Callable[[str], None]
 
 
 def run_sweep(options: Sweep, log: Log) -> int:
-    """Trains what is missing, then writes and prints the tables; returns the exit code.
+    """Trains what is missing, then prints and writes the tables; returns the exit code.
 
     Args:
         options: Options of the command.
@@ -42,7 +42,7 @@ def run_sweep(options: Sweep, log: Log) -> int:
     Raises:
         ValueError: If options, the sweep's file or the plan are wrong, or the folder holds another sweep's results.
         ImportError: If Ray is not installed.
-        OSError: If the tables cannot be written.
+        OSError: If a file cannot be written; tables that cannot be written have been printed.
         KeyboardInterrupt: After Ctrl-C; the tables of what is finished are written.
     """
     spec = _spec(options)
@@ -90,7 +90,9 @@ def _check_index(out: Path, cells: list[Cell]) -> None:
             raise ValueError(
                 f"{cell.folder} was trained with other options ({known.get(cell.name)}): choose another --out"
             )
-    write_json(path, {**known, **{cell.name: cell.command for cell in cells}})
+    commands = {**known, **{cell.name: cell.command for cell in cells}}
+    if commands != known:  # else the tables can be printed where the disk is full
+        write_json(path, commands)
 
 
 def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> int:
@@ -105,7 +107,8 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
         stopped = True
     if code or stopped:
         board.stop()
-    log(write_tables(board.out, spec, board, peers))
+    log(tables_text(spec, board, peers))  # before they are written: the disk may be full
+    write_tables(board.out, spec, board, peers)
     write_report(board.out, spec, board, peers)
     log(f"table.md, table.tex, table.csv, cells.csv and report.html are in {board.out}")
     if stopped:
@@ -128,7 +131,8 @@ def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log
 
     def on_event(event: Event) -> None:
         board.tell(event)
-        write_tables(board.out, spec, board, peers)  # Ray may end this program
+        with suppress(OSError):  # a full disk, which is reported at the end, and stops no training that still runs
+            write_tables(board.out, spec, board, peers)  # Ray may end this program
 
     with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
         pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
