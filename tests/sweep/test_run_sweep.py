@@ -121,6 +121,11 @@ def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, capsys):
             2,
             "warpgs sweep: the Ray cluster at host:6379 is gone;",
         ),
+        (
+            OSError("studio cannot be kept in /cache: No space left on device"),
+            2,
+            "sweep: studio cannot be kept in /cache",
+        ),
     ],
 )
 def test_a_sweep_that_stops_says_so_prints_what_is_there_and_goes_on(sweep, capsys, error, code, message):

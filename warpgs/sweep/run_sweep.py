@@ -100,7 +100,7 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
     try:
         if not options.tables_only:
             _train(options, spec, board, peers, log)
-    except ConnectionError as error:
+    except OSError as error:  # the cluster is gone, or there is no space for a built-in capture
         log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
         code = FAILED
     except KeyboardInterrupt:
