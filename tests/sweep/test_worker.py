@@ -1,16 +1,21 @@
 """A cell on its node: a child process, its log, and what is reported."""
 
 import os
+import resource
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from warpgs.sweep import worker
 from warpgs.sweep.worker import Job, run_job
+
+HOST = socket.gethostname()
 
 
 def job(folder, *arguments):
@@ -33,7 +38,7 @@ def test_a_broken_capture_is_one_line(tmp_path):
     made = job(tmp_path, "--preset", "quick", "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "cell"))
     error = run_job(made)
     assert error is not None
-    assert error.startswith(f"warpgs train: {tmp_path}/nowhere does not exist")
+    assert error.startswith(f"{HOST}: warpgs train: {tmp_path}/nowhere does not exist")
     assert "\n" not in error
     assert not (tmp_path / "running/cell").exists()
     assert not (tmp_path / "cell").exists()
@@ -52,14 +57,29 @@ def test_a_new_cell_gets_its_arguments_and_one_that_has_begun_is_resumed(tmp_pat
 
 def test_a_cell_that_is_killed_says_by_what(tmp_path, monkeypatch):
     replace_child(monkeypatch, "import os; os.kill(os.getpid(), 9)")
-    assert run_job(job(tmp_path)) == "the training was killed by signal 9"
+    assert run_job(job(tmp_path)) == f"{HOST}: the training was killed by signal 9"
 
 
-def test_a_disk_that_is_full_names_the_host_and_the_file(tmp_path):
-    (tmp_path / "running").write_text("a file where a folder is needed")
-    error = run_job(job(tmp_path))
-    assert error is not None
-    assert "running/cell could not be written" in error
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, to which every write fails")
+@pytest.mark.parametrize("file", ["logs/cell.log", "running/cell.partial"])
+def test_a_disk_that_is_full_names_the_host_and_the_file(tmp_path, monkeypatch, file):
+    replace_child(monkeypatch, "")
+    (tmp_path / file).parent.mkdir()
+    (tmp_path / file).symlink_to("/dev/full")
+    path = tmp_path / file.removesuffix(".partial")
+    assert run_job(job(tmp_path)) == f"{HOST}: {path} could not be written: No space left on device"
+
+
+def test_a_disk_too_full_for_the_reason_of_a_failure_names_the_host_and_the_log(tmp_path, monkeypatch):
+    """A limit of the size of files stands for the disk."""
+    replace_child(monkeypatch, f"print('progress', flush=True); print({1 << 20} * 'x')")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, hard))
+    try:
+        error = run_job(job(tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert error == f"{HOST}: {tmp_path}/logs/cell.log could not be written: File too large"
 
 
 def test_an_interrupt_is_passed_on_and_waited_for(tmp_path, monkeypatch):

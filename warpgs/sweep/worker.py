@@ -48,7 +48,7 @@ def run_job(job: Job) -> str | None:
     """Trains and evaluates a cell, from its newest checkpoint if there is one.
 
     Returns:
-        None on success, else one line that says why it failed.
+        None on success, else one line that names the host and says why it failed.
 
     Raises:
         KeyboardInterrupt: If it was stopped; a checkpoint was saved.
@@ -56,22 +56,22 @@ def run_job(job: Job) -> str | None:
     running = Path(job.running)
     try:
         write_text(running, socket.gethostname())
-        return _train(job)
+        reason = _train(job)
     except OSError as error:  # a full disk, or a file system that is not mounted on this node
-        return f"{socket.gethostname()}: {one_line(error)}"
+        reason = one_line(error)
     finally:
         with suppress(OSError):
             running.unlink(missing_ok=True)
+    return None if reason is None else f"{socket.gethostname()}: {reason}"
 
 
 def _train(job: Job) -> str | None:
     resumed = (Path(job.folder) / "config.json").is_file()
     arguments = ["--resume", job.folder] if resumed else list(job.arguments)
     arguments += ["--device", job.device]
-    Path(job.log).parent.mkdir(parents=True, exist_ok=True)
-    with open(job.log, "a", encoding="utf-8") as log:
-        log.write(f"{socket.gethostname()}: warpgs train {' '.join(arguments)}\n")
-        log.flush()
+    log_path = Path(job.log)
+    _append(log_path, f"warpgs train {' '.join(arguments)}")
+    with open(log_path, "ab") as log:
         command = [sys.executable, "-m", "warpgs.sweep.child", str(os.getpid()), *arguments]
         # A session of its own: Ctrl-C in the terminal reaches the sweep, which stops its cells itself.
         child = subprocess.Popen(
@@ -80,7 +80,25 @@ def _train(job: Job) -> str | None:
         code = _wait(child)
     if code == 0:
         return None
-    return _last_line(Path(job.log)) if code > 0 else f"the training was killed by signal {-code}"
+    if code < 0:
+        return f"the training was killed by signal {-code}"
+    reason = _last_line(log_path)
+    _append(log_path, f"ended with exit code {code}")  # fails if the disk was too full for the reason
+    return reason
+
+
+def _append(log: Path, line: str) -> None:
+    """Appends a line to a log, after the name of the host.
+
+    Raises:
+        OSError: If it cannot be written; the message names the log.
+    """
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with open(log, "a", encoding="utf-8") as file:
+            file.write(f"{socket.gethostname()}: {line}\n")
+    except OSError as error:
+        raise OSError(f"{log} could not be written: {error.strerror}") from error
 
 
 def _wait(child: subprocess.Popen[bytes]) -> int:
