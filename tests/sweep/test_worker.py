@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import tiny
 from warpgs.sweep import worker
 from warpgs.sweep.worker import Job, run_job
 
@@ -34,11 +35,24 @@ def replace_child(monkeypatch, program):
     monkeypatch.setattr(worker.subprocess, "Popen", start)
 
 
-def test_a_broken_capture_is_one_line(tmp_path):
-    made = job(tmp_path, "--preset", "quick", "--data", str(tmp_path / "nowhere"), "--out", str(tmp_path / "cell"))
-    error = run_job(made)
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[:100])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda capture: capture.rename(capture.with_name("elsewhere")), " does not exist"),
+        (lambda capture: (capture / "dataset.json").write_text("{"), "/dataset.json is not valid JSON: "),
+        (lambda capture: cut_off(capture / "rgb/1x/left_000003.png"), "/rgb/1x/left_000003.png is truncated: "),
+    ],
+)
+def test_a_broken_capture_is_one_line(tmp_path, damage, message):
+    capture = tiny.write(tmp_path)
+    damage(capture)
+    error = run_job(job(tmp_path, "--preset", "quick", "--data", str(capture), "--out", str(tmp_path / "cell")))
     assert error is not None
-    assert error.startswith(f"{HOST}: warpgs train: {tmp_path}/nowhere does not exist")
+    assert error.startswith(f"{HOST}: warpgs train: {capture}{message}")
     assert "\n" not in error
     assert not (tmp_path / "running/cell").exists()
     assert not (tmp_path / "cell").exists()
