@@ -194,6 +194,34 @@ def test_tables_only_and_dry_run_train_nothing(sweep, tmp_path, capsys):
     assert "0 of 4 trainings finished" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("undistorted", "note"),
+    [
+        ("0123", "Frames of as were undistorted, and so resampled, before they were compared."),
+        ("02", "Frames of as (2 of 4 trainings) were undistorted"),
+    ],
+)
+def test_a_note_says_which_frames_were_resampled(sweep, tmp_path, capsys, undistorted, note):
+    def finish(job):
+        sweep.finish(job)
+        path = tmp_path / "out" / job.name / "metrics.json"
+        index = ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"].index(job.name)
+        frames = "undistorted" if str(index) in undistorted else "as taken"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "frames": frames}))
+
+    assert sweep(by=finish)[0] == 0
+    printed = capsys.readouterr().out
+    assert note in printed
+    assert "warpgs eval RUN --as-taken" in printed
+    for name in ("table.md", "report.html"):
+        assert note in (tmp_path / "out" / name).read_text()
+
+
+def test_frames_compared_as_they_were_taken_need_no_note(sweep, capsys):
+    sweep()
+    assert "undistorted" not in capsys.readouterr().out
+
+
 def test_numbers_of_others_stand_beside(sweep, tmp_path, capsys):
     (tmp_path / "peers.json").write_text(json.dumps({"D3DGS": {"as": {"psnr": 25.8}}}))
     assert sweep("--compare", str(tmp_path / "peers.json"))[0] == 0

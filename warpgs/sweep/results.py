@@ -1,5 +1,6 @@
 """The files with a sweep's results: table.md, table.tex, table.csv, cells.csv and report.html."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,15 +22,33 @@ def tables_of(board: Board, spec: SweepSpec, peers: Peers) -> list[Table]:
 
 
 def notes_of(board: Board) -> list[str]:
-    """Paragraphs below the tables: how much has finished, how long it took, and what failed and why."""
+    """Paragraphs below the tables: how much has finished, what was compared, and what failed and why."""
     seconds = [metrics.get("train_seconds") for metrics in board.metrics.values()]
     hours = sum(value for value in seconds if isinstance(value, int | float)) / 3600.0
     notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {hours:.2f} hours of training in total."]
+    if resampled := _resampled(board):
+        notes.append(
+            f"Frames of {', '.join(resampled)} were undistorted, and so resampled, before they were compared. "
+            "To compare them as taken: warpgs eval RUN --as-taken for each run, then the same sweep with --tables-only."
+        )
     reasons: dict[str, list[str]] = {}
     for name, error in board.errors.items():
         if board.states[name] != "finished":
             reasons.setdefault(error, []).append(name)
     return notes + [f"{', '.join(names)}: {error}" for error, names in reasons.items()]
+
+
+def _resampled(board: Board) -> list[str]:
+    """The captures whose frames were compared undistorted; with the number of trainings if not in all of them."""
+    finished = [
+        (cell.scene, board.metrics[cell.name].get("frames")) for cell in board.cells if cell.name in board.metrics
+    ]
+    totals = Counter(scene for scene, _ in finished)
+    counts = Counter(scene for scene, frames in finished if frames == "undistorted")
+    return [
+        scene if count == totals[scene] else f"{scene} ({count} of {totals[scene]} trainings)"
+        for scene, count in counts.items()
+    ]
 
 
 def tables_text(spec: SweepSpec, board: Board, peers: Peers) -> str:
