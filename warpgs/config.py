@@ -189,8 +189,8 @@ class DensifyConfig:
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
-    """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start there
-    at the next pruning during densification. 0: never."""
+    """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start at
+    the next pruning during densification. 0: never."""
     weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
