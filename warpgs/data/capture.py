@@ -131,6 +131,11 @@ class Capture:
         self._moved: frozenset[str] = frozenset()
         self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
 
+    @property
+    def uses_estimated_masks(self) -> bool:
+        """Whether what is taken as dynamic is an estimate of ``warpgs prepare``."""
+        return self.estimated_masks and self.assumption == "masks"
+
     def assuming(self, assumption: Assumption) -> "Capture":
         """The same capture with static masks as in the files ("masks"), all true ("static") or all false ("dynamic").
 

@@ -31,11 +31,10 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
     if bands < config.model.time_bands:
         log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    uses_estimates = capture.estimated_masks and config.assume == "masks"
     if loss.branches_in_stage2 == "given-masks":
-        if uses_estimates:
+        if seen.uses_estimated_masks:
             log("the masks are estimates: stage II compares the joint image alone")
-        loss = dataclasses.replace(loss, branches_in_stage2="no" if uses_estimates else "yes")
+        loss = dataclasses.replace(loss, branches_in_stage2="no" if seen.uses_estimated_masks else "yes")
     return dataclasses.replace(config, loss=loss)
 
 

@@ -44,7 +44,7 @@ def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str
         log: Receives what is tried and what follows.
         quiet: Whether to show no progress.
     """
-    is_wanted = config.try_masks and config.assume == "masks" and capture.estimated_masks
+    is_wanted = config.try_masks and capture.assuming(config.assume).uses_estimated_masks
     if not is_wanted or len(capture.train) < MIN_FRAMES:
         return config
     log("the masks are estimates: two short trainings, with the masks and without, tell whether they help")
