@@ -1,4 +1,4 @@
-"""Moving objects are followed from frame to frame, and their size gives their depth."""
+"""Dynamic objects are followed from frame to frame, and their size gives their depth."""
 
 import dataclasses
 import math

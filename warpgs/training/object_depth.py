@@ -1,4 +1,4 @@
-"""Depth of moving objects from their size.
+"""Depth of dynamic objects from their size.
 
 One camera does not determine how far away something is that moves: twice as large, twice as far away and twice as fast
 looks the same. But the distance of an object that keeps its size is inversely proportional to the size at which it is

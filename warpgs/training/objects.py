@@ -1,4 +1,4 @@
-"""Moving objects as connected regions of the masks, followed from frame to frame."""
+"""Dynamic objects as connected regions of the masks, followed from frame to frame."""
 
 import math
 from collections.abc import Sequence
