@@ -295,8 +295,8 @@ class TrainConfig:
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
     try_masks: bool = False
-    """Try out masks that `prepare` made in two short trainings, with them and without, and take everything as dynamic
-    if held-out frames are better without."""
+    """Try out masks that `prepare` made in two short trainings, with them and without, before runs that are longer, and
+    take everything as dynamic if held-out frames are better without."""
     background: Literal["capture", "black", "white"] = "capture"
     """Colour behind all Gaussians; that of the capture is white if D-NeRF's images have alpha, else black."""
     static_geometry: bool = False

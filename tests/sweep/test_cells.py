@@ -67,6 +67,12 @@ def test_every_option_survives_the_way_through_the_command_line(tmp_path):
     assert parse(arguments(config)) == config
 
 
+@pytest.mark.parametrize("options", [{}, {"try_masks": True}])
+def test_cells_follow_the_masks_unless_the_sweep_says_otherwise(options, tmp_path):
+    [cell] = plan(spec(options=options), out=tmp_path)
+    assert cell.config.try_masks == bool(options)
+
+
 def test_two_cells_with_one_name_are_refused(tmp_path):
     two = spec(Variant("c", "", {}), Variant("b-c", "", {}))
     with pytest.raises(ValueError, match="two cells have the name a-b-c-seed0: variant b-c on a, and variant c on a-b"):

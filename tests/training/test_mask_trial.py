@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import signal
+import tempfile
 
 import cv2
 import numpy as np
@@ -25,6 +27,7 @@ def short(monkeypatch):
     """A trial that takes a second."""
     schedule = dataclasses.replace(tiny.SCHEDULE, stage1=LENGTH - 6, stage2=0)
     monkeypatch.setattr(mask_trial, "TRIAL", dataclasses.replace(tiny.CONFIG, schedule=schedule))
+    monkeypatch.setattr(mask_trial, "MIN_RELATIVE_LENGTH", 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +96,36 @@ def test_given_masks_and_few_frames_are_not_tried(folder, qualities):
         assert with_trusted_masks(CONFIG, other, print, quiet=True) == CONFIG
 
 
+def test_runs_that_are_hardly_longer_are_not_tried(folder, qualities, monkeypatch):
+    qualities["dynamic"] = 40.0
+    monkeypatch.setattr(mask_trial, "MIN_RELATIVE_LENGTH", tiny.LENGTH / LENGTH + 0.01)
+    assert decide(folder) == ("masks", [])
+
+
+def test_a_trial_that_fails_leaves_the_masks_in_use(folder, monkeypatch):
+    def fail(config, capture, assume, quiet):
+        raise ValueError("the loss is not finite")
+
+    monkeypatch.setattr(mask_trial, "held_out_psnr", fail)
+    assume, lines = decide(folder)
+    assert assume == "masks"
+    assert lines[-1] == "the masks are used, because they could not be tried out: the loss is not finite"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_trial_and_leaves_nothing_behind(folder, monkeypatch, tmp_path, number):
+    class Interrupted(mask_trial.Trainer):
+        def train(self, logger, interrupt):
+            signal.raise_signal(number)
+            return super().train(logger, interrupt)
+
+    monkeypatch.setattr(mask_trial, "Trainer", Interrupted)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(KeyboardInterrupt, match="the run has not begun"):
+        decide(folder)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_trial_sees_small_images(folder, monkeypatch):
     sizes = set()
 
@@ -116,12 +149,13 @@ def test_held_out_frames_are_not_trained_on(folder, monkeypatch):
 
     monkeypatch.setattr(mask_trial, "Trainer", Watched)
     capture = load_capture(folder)
-    assert np.isfinite(held_out_psnr(dataclasses.replace(CONFIG, iterations=5_000), capture, "dynamic"))
+    assert np.isfinite(held_out_psnr(dataclasses.replace(CONFIG, iterations=5_000, exposure=True), capture, "dynamic"))
     [(config, train, val, run)] = trained
     assert val == (capture.train[4], capture.train[12])
     assert sorted((*train, *val)) == sorted(capture.train)
     assert (config.schedule.num_iterations, config.iterations, config.assume) == (LENGTH, None, "dynamic")
     assert not config.app  # a switch of the run
+    assert not config.exposure  # held-out frames are compared as they are
     assert not run.exists()
 
 

@@ -54,7 +54,7 @@ def _check_format(options: Export) -> None:
 def _check_out(options: Export) -> None:
     """Refuses a file as ``--out`` that is not of the format, or that is one for several."""
     out = options.out
-    formats = [name for name, writer in WRITERS.items() if out and out.suffix and out.suffix == writer.suffix]
+    formats = [name for name, writer in WRITERS.items() if out and out.suffix and out.suffix.lower() == writer.suffix]
     if out is None or not formats or out.is_dir():
         return
     if options.format not in formats:

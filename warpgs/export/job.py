@@ -40,7 +40,7 @@ class Job:
     def file(self, name: str) -> Path:
         """Where a file of this name is written: ``--out`` if that ends as it does, else in the output folder."""
         out = self.folder
-        return out if out.suffix == Path(name).suffix and not out.is_dir() else out / name
+        return out if out.suffix.lower() == Path(name).suffix and not out.is_dir() else out / name
 
     @property
     def capture(self) -> Capture | None:

@@ -8,17 +8,22 @@ from pathlib import Path
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Assumption, Capture
 from warpgs.data.resized import reduced_capture
+from warpgs.errors import one_line
 from warpgs.presets import PRESETS
 
 from . import ranks
 from .callbacks import Progress, render_and_compare
 from .fitting import fitted
+from .interrupt import Interrupt
 from .logger import TrainingLogger
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]
-"""Preset of the trial. At this length and size the order of results is that of the preset best; shorter trials mislead,
-because one deformed set of Gaussians learns more slowly than two (docs/design/real-captures.md)."""
+"""Preset of the trial. Shorter trials mislead, because one deformed set of Gaussians learns more slowly than two
+(docs/design/missing-masks.md)."""
+
+MIN_RELATIVE_LENGTH = 2.0
+"""Minimum number of iterations of the run, relative to one of the two trainings."""
 
 MAX_SIDE = 256
 """Maximum side of the trial's images [px]."""
@@ -45,11 +50,18 @@ def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str
         quiet: Whether to show no progress.
     """
     is_wanted = config.try_masks and capture.assuming(config.assume).uses_estimated_masks
-    if not is_wanted or len(capture.train) < MIN_FRAMES:
+    is_long = config.schedule.num_iterations >= MIN_RELATIVE_LENGTH * TRIAL.schedule.num_iterations
+    if not is_wanted or not is_long or len(capture.train) < MIN_FRAMES:
         return config
     log("the masks are estimates: two short trainings, with the masks and without, tell whether they help")
     small = reduced_capture(capture, MAX_SIDE)
-    following, ignoring = (held_out_psnr(config, small, assume, quiet) for assume in ("masks", "dynamic"))
+    try:
+        following, ignoring = (held_out_psnr(config, small, assume, quiet) for assume in ("masks", "dynamic"))
+    except (ValueError, OSError) as error:
+        if ranks.num_ranks() > 1:
+            raise  # the others would wait for this one
+        log(f"the masks are used, because they could not be tried out: {one_line(error)}")
+        return config
     found = f"frames held out of them have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
     if not ranks.text_of_first("worse" if ignoring > following + MIN_GAIN else ""):
         log(f"{found}: the masks are used")
@@ -66,9 +78,15 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
         capture: Its capture.
         assume: What is taken as dynamic.
         quiet: Whether to show no progress.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C or SIGTERM.
+        ValueError: If the loss is repeatedly not finite.
+        OSError: If a temporary file cannot be written.
     """
     parts = {name: getattr(TRIAL, name) for name in ("model", "loss", "optim", "densify", "schedule")}
-    config = dataclasses.replace(config, **parts, iterations=None, assume=assume)
+    # Held-out frames keep their exposure, so those that train must do so, too.
+    config = dataclasses.replace(config, **parts, iterations=None, exposure=False, assume=assume)
     held_out = capture.train[HELD_OUT // 2 :: HELD_OUT]
     capture = capture.split([name for name in capture.train if name not in held_out], held_out)
     values: list[float] = []
@@ -79,12 +97,14 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
             frames = map(progress.capture.frame, held_out)
             values.extend(render_and_compare(progress.scene, frame)[1] for frame in frames)
 
-    with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder:
+    with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
         trainer = Trainer(fitted(config, capture, _ignore), capture, Path(folder))
         trainer.callbacks = [compare]
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet) as logger:
-            trainer.train(logger)
+            finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()
+    if not finished:
+        raise KeyboardInterrupt("stopped while the masks were tried out; the run has not begun")
     return sum(values) / len(values)
 
 
