@@ -150,7 +150,9 @@ def test_depth_of_frames_that_masks_were_found_on_is_the_same_without_flow_of_it
     images, dynamic = boards.record(10)
     fresh, used = (PosedFrames(images, boards.lens(), boards.poses(10), boards.points()) for _ in range(2))
     expected = static_depth(fresh, dynamic)
+    used.halved.triangulated = {}
     find_dynamic(used)
+    assert fresh.halved.triangulated is None
     monkeypatch.delattr(Flows, "compute")
     assert np.array_equal(static_depth(used, dynamic), expected, equal_nan=True)
 

@@ -146,6 +146,8 @@ class _Job:
         assert method is not None
         folder = find_weights(method.network, self.options.weights) if method.network is not None else None
         frames = self._posed(names, WORKING_SIDE)
+        if {"depth", "points"} & set(self.options.parts):
+            frames.halved.triangulated = {}
         masks = method.find(frames, folder, self.log is None)
         self._keep_layout({} if set(missing).isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
         for name, mask in zip(names, masks, strict=True):

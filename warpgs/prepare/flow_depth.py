@@ -43,7 +43,7 @@ def static_depth(
     flows, size = Flows(brighten(frames.images), frames.expected_flow), (frames.lens.width, frames.lens.height)
 
     def local(frame: int) -> LocalGeometry:
-        found = frames.triangulated.pop(frame, None)
+        found = (frames.triangulated or {}).pop(frame, None)
         if found is None:
             found = triangulate(frames.observations(frame, flows), frames.focal)
             flows.release(frame)

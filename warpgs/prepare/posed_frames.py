@@ -39,7 +39,7 @@ class PosedFrames:
         rays: [H, W, 2] x, y on the plane z = 1 of every pixel's centre.
         neighbours: Up to six frames near each frame, see ``_neighbours``.
         triangulated: What the search for motion has triangulated from neighbours, by frame. Depth takes it from here,
-            so that the optical flow of frames that are given to both is computed once.
+            so that the optical flow of frames that are given to both is computed once. None: it is not kept.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class PosedFrames:
         self._columns = np.arange(0.5, lens.width, dtype=np.float32)
         self._rows = np.arange(0.5, lens.height, dtype=np.float32)[:, None]
         self.neighbours = [self._neighbours(frame) for frame in range(len(poses))]
-        self.triangulated: dict[int, LocalGeometry] = {}
+        self.triangulated: dict[int, LocalGeometry] | None = None
 
     @cached_property
     def halved(self) -> "PosedFrames":

@@ -108,7 +108,9 @@ class Revisits:
     def evidence(self, frame: int) -> Evidence:
         """The evidence of the neighbours and the far frames on a frame."""
         near = self._frames.observations(frame, self._flows)
-        local = self._frames.triangulated[frame] = triangulate(near, self._frames.focal)
+        local = triangulate(near, self._frames.focal)
+        if self._frames.triangulated is not None:
+            self._frames.triangulated[frame] = local
         rho = fill_unknown(local.inverse_depth)
         chosen = [self.far_frames(frame, float(np.median(rho)), gap) for gap in MIN_GAPS]
         revisits = {other: self._revisit(frame, other, rho) for other in sorted(set().union(*chosen))}
