@@ -53,16 +53,21 @@ def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str
     is_long = config.schedule.num_iterations >= MIN_RELATIVE_LENGTH * TRIAL.schedule.num_iterations
     if not is_wanted or not is_long or len(capture.train) < MIN_FRAMES:
         return config
-    log("the masks are estimates: two short trainings, with the masks and without, tell whether they help")
-    small = reduced_capture(capture, MAX_SIDE)
+    length, small = TRIAL.schedule.num_iterations, reduced_capture(capture, MAX_SIDE)
+    log(f"the masks are estimates: two trainings of {length} iterations try them out (--no-try-masks omits them)")
     try:
-        following, ignoring = (held_out_psnr(config, small, assume, quiet) for assume in ("masks", "dynamic"))
+        log("trial with the masks:")
+        following = held_out_psnr(config, small, "masks", quiet)
+        log("trial without the masks:")
+        ignoring = held_out_psnr(config, small, "dynamic", quiet)
     except (ValueError, OSError) as error:
         if ranks.num_ranks() > 1:
             raise  # the others would wait for this one
         log(f"the masks are used, because they could not be tried out: {one_line(error)}")
         return config
-    found = f"frames held out of them have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
+    found = (
+        f"training frames held out of the trial have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
+    )
     if not ranks.text_of_first("worse" if ignoring > following + MIN_GAIN else ""):
         log(f"{found}: the masks are used")
         return config

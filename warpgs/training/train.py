@@ -98,7 +98,6 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         log = log if is_first else None
         trainer = make_trainer(config, log)
         _describe(trainer, log or _ignore)
-        _advise(config, trainer, log or _ignore)
         is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
         _train(trainer, is_changed, callbacks, quiet=log is None)
     if is_first:
@@ -170,14 +169,6 @@ def _describe(trainer: Trainer, log: Log) -> None:
         log(f"depth of dynamic objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
 
 
-def _advise(config: TrainConfig, trainer: Trainer, log: Log) -> None:
-    """Logs what speaks for other options: a preset that is slow on the CPU, a run that is finished already."""
-    if config.resume is None and trainer.config.device == "cpu" and config.preset in ("best", "paper"):
-        log(CPU_ADVICE.format(config.preset))
-    if config.resume is not None and trainer.iteration == trainer.protocol.num_iterations:
-        log(FINISHED.format(trainer.iteration))
-
-
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
     """Logs how far the training cameras were moved."""
     turned, shifted = poses.angles().rad2deg(), 100.0 * poses.shifts()
@@ -201,27 +192,36 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     """
     quiet, log = log is None, log or _ignore
     if config.resume is not None:
-        saved = extended(read_config(config.resume), config.iterations)
-        if config.data is not None:
-            saved = dataclasses.replace(saved, data=config.data)
-        if config.lpips is not None:
-            saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
-        run = Run(config.resume, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
-        locate(run.config.lpips, run.config.lpips_net)
-        capture = check_capture(run.open_capture(quiet), run.config, log)
-        _compare_ranks(run.config, capture)
-        trainer = Trainer(run.config, capture, run.folder)
-        trainer.restore_newest(log)
-        return trainer
+        return _continued(config, config.resume, log, quiet)
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
     _compare_ranks(config, capture)
-    config = fitted(with_trusted_masks(config, capture, log, quiet), capture, log)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
+    if config.device == "cpu" and config.preset in ("best", "paper"):
+        log(CPU_ADVICE.format(config.preset))
+    config = fitted(with_trusted_masks(config, capture, log, quiet), capture, log)
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
     if ranks.is_first():
         Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
+    return trainer
+
+
+def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trainer:
+    """The trainer of a run, restored from its newest checkpoint."""
+    saved = extended(read_config(folder), config.iterations)
+    if config.data is not None:
+        saved = dataclasses.replace(saved, data=config.data)
+    if config.lpips is not None:
+        saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
+    run = Run(folder, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
+    locate(run.config.lpips, run.config.lpips_net)
+    capture = check_capture(run.open_capture(quiet), run.config, log)
+    _compare_ranks(run.config, capture)
+    trainer = Trainer(run.config, capture, run.folder)
+    trainer.restore_newest(log)
+    if trainer.iteration == trainer.protocol.num_iterations:
+        log(FINISHED.format(trainer.iteration))
     return trainer
 
 
