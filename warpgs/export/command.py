@@ -44,6 +44,10 @@ class Export:
     quiet: bool = False
     """Hide progress bars."""
 
+    def is_out_file(self, suffix: str) -> bool:
+        """Whether ``out`` is a file that ends with this suffix, not a folder."""
+        return self.out is not None and self.out.suffix.lower() == suffix != "" and not self.out.is_dir()
+
     def run(self) -> None:
         """Exports and prints a summary; raises as ``export_run``."""
         with ending_at_once():

@@ -53,9 +53,8 @@ def _check_format(options: Export) -> None:
 
 def _check_out(options: Export) -> None:
     """Refuses a file as ``--out`` that is not of the format, or that is one for several."""
-    out = options.out
-    formats = [name for name, writer in WRITERS.items() if out and out.suffix and out.suffix.lower() == writer.suffix]
-    if out is None or not formats or out.is_dir():
+    out, formats = options.out, [name for name, writer in WRITERS.items() if options.is_out_file(writer.suffix)]
+    if not formats:
         return
     if options.format not in formats:
         raise ValueError(f"--out {out} is a file of --format {' and '.join(formats)}, not of {options.format}")

@@ -39,8 +39,7 @@ class Job:
 
     def file(self, name: str) -> Path:
         """Where a file of this name is written: ``--out`` if that ends as it does, else in the output folder."""
-        out = self.folder
-        return out if out.suffix.lower() == Path(name).suffix and not out.is_dir() else out / name
+        return self.folder if self.options.is_out_file(Path(name).suffix) else self.folder / name
 
     @property
     def capture(self) -> Capture | None:
