@@ -184,6 +184,22 @@ def test_a_folder_may_be_called_like_a_file(run, tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["dynamic.ply", "static.ply"]
 
 
+def test_a_new_folder_may_have_a_dot_in_its_name(run, tmp_path):
+    export(run, tmp_path, out=tmp_path / "run.2")
+    assert (tmp_path / "run.2" / "scene.ply").is_file()
+
+
+@pytest.mark.parametrize("file", ["a.usd", "a.gltf", "a.htm"])
+def test_a_new_file_of_no_format_is_refused_with_the_suffixes_of_all(run, tmp_path, file):
+    message = rf"end with \{Path(file).suffix}, only \.ply, \.sog, \.spz, \.glb, \.usdc, \.4dgs, \.html; a folder"
+    with pytest.raises(ValueError, match=message):
+        export(run, tmp_path, out=tmp_path / file)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / file).mkdir()
+    export(run, tmp_path, out=tmp_path / file)
+    assert (tmp_path / file / "scene.ply").is_file()
+
+
 # Formats ------------------------------------------------------------------------------------------------------------
 
 

@@ -52,9 +52,18 @@ def _check_format(options: Export) -> None:
 
 
 def _check_out(options: Export) -> None:
-    """Refuses a file as ``--out`` that is not of the format, or that is one for several."""
+    """Refuses a file as ``--out`` that is not of the format, or that is one for several.
+
+    A new path that ends with a dot and letters, such as scene.gltf, is taken as a file; run.2 is a folder.
+    """
     out, formats = options.out, [name for name, writer in WRITERS.items() if options.is_out_file(writer.suffix)]
     if not formats:
+        if out is not None and out.suffix[1:].isalpha() and not out.is_dir():
+            known = ", ".join(dict.fromkeys(writer.suffix for writer in WRITERS.values() if writer.suffix))
+            raise ValueError(
+                f"--out {out}: no format has files that end with {out.suffix}, only {known}; a folder of this name has "
+                "to exist before"
+            )
         return
     if options.format not in formats:
         raise ValueError(f"--out {out} is a file of --format {' and '.join(formats)}, not of {options.format}")
