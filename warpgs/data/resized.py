@@ -98,7 +98,12 @@ def inverse_of(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[
     inverse = np.full(depth.shape, np.nan, np.float32)
     inverse[known] = 1.0 / depth[known]
     inverse[~np.isfinite(inverse)] = np.nan
-    return cv2.resize(inverse, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    return resize_inverse(inverse, size)
+
+
+def resize_inverse(inverse_depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+    """The inverse depth in another size, without interpolation, which would invent surfaces along edges."""
+    return cv2.resize(inverse_depth, size, interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 def resize(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
@@ -133,7 +138,7 @@ def _reduced_frame(frame: Frame, camera: Camera) -> Frame:
 
     depth = frame.inverse_depth
     if depth is not None:
-        depth = torch.from_numpy(cv2.resize(depth.numpy(), camera.size, interpolation=cv2.INTER_NEAREST_EXACT))
+        depth = torch.from_numpy(resize_inverse(depth.numpy(), camera.size))
     image = torch.from_numpy(resize(frame.image.numpy(), camera.size))
     return Frame(frame.name, camera, image, whole(frame.static_mask), depth, whole(frame.covisible), whole(frame.empty))
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import MASKS_REMEDY, Capture, Frame
+from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
 
 
@@ -144,7 +145,7 @@ class Views:
         inverse = ((1.0 / depths - offset) / scale).numpy()
 
         def change(depth: Tensor, static_mask: Tensor) -> Tensor:
-            found = cv2.resize(inverse, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+            found = resize_inverse(inverse, (depth.shape[1], depth.shape[0]))
             return torch.where(depth.isnan() & ~static_mask, torch.from_numpy(found), depth)
 
         self._change_depth(index, change)
