@@ -19,6 +19,10 @@ WIDE = 120
 """Minimum width of a terminal that shows the bar and all numbers; others show the most important ones in full."""
 
 
+def ignore(text: str) -> None:
+    """A log that discards its lines."""
+
+
 class Status(NamedTuple):
     """Progress of a run at one of the regular checks.
 

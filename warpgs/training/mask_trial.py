@@ -15,7 +15,7 @@ from . import ranks
 from .callbacks import Progress, render_and_compare
 from .fitting import fitted
 from .interrupt import Interrupt
-from .logger import TrainingLogger
+from .logger import TrainingLogger, ignore
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]
@@ -103,7 +103,7 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
             values.extend(render_and_compare(progress.scene, frame)[1] for frame in frames)
 
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
-        trainer = Trainer(fitted(config, capture, _ignore), capture, Path(folder))
+        trainer = Trainer(fitted(config, capture, ignore), capture, Path(folder))
         trainer.callbacks = [compare]
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet) as logger:
             finished = trainer.train(logger, interrupt)
@@ -111,7 +111,3 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
     if not finished:
         raise KeyboardInterrupt("stopped while the masks were tried out; the run has not begun")
     return sum(values) / len(values)
-
-
-def _ignore(text: str) -> None:
-    """A log that discards its lines."""

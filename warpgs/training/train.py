@@ -21,7 +21,7 @@ from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
 from .fitting import fitted
 from .interrupt import Interrupt
-from .logger import TrainingLogger
+from .logger import TrainingLogger, ignore
 from .mask_trial import with_trusted_masks
 from .schedule import extended
 from .trainer import Trainer
@@ -97,7 +97,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         is_first = ranks.is_first()
         log = log if is_first else None
         trainer = make_trainer(config, log)
-        _describe(trainer, log or _ignore)
+        _describe(trainer, log or ignore)
         is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
         _train(trainer, is_changed, callbacks, quiet=log is None)
     if is_first:
@@ -107,7 +107,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
 
 def _evaluate(trainer: Trainer, log: Log | None) -> None:
     """Evaluates what was trained and logs the results; a KeyboardInterrupt says how to evaluate later."""
-    quiet, log = log is None, log or _ignore
+    quiet, log = log is None, log or ignore
     if trainer.views.poses is not None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
@@ -190,7 +190,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
         ValueError: If the run, its capture or an option cannot be used.
         OSError: If the run folder cannot be written.
     """
-    quiet, log = log is None, log or _ignore
+    quiet, log = log is None, log or ignore
     if config.resume is not None:
         return _continued(config, config.resume, log, quiet)
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
@@ -257,7 +257,3 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     if errors:
         raise UnfitCaptureError(errors)
     return capture
-
-
-def _ignore(text: str) -> None:
-    """A log that discards its lines."""
