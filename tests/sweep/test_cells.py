@@ -6,7 +6,7 @@ import json
 import pytest
 
 from tests.data import layouts
-from warpgs.config import TrainConfig
+from warpgs.config import LossConfig, TrainConfig
 from warpgs.presets import PRESETS
 from warpgs.sweep.cells import arguments, find_scenes, finished_metrics, plan_cells
 from warpgs.sweep.spec import SweepSpec, Variant, read_spec
@@ -48,6 +48,15 @@ def test_the_command_of_a_cell_trains_its_config(name, tmp_path):
 def test_every_line_about_best_trains_something_else(tmp_path):
     configs = [dataclasses.replace(cell.config, out=None, seed=0) for cell in plan(read_spec("best"), out=tmp_path)]
     assert all(config not in configs[:k] for k, config in enumerate(configs))
+
+
+def test_every_term_of_the_loss_that_best_changes_has_a_line_and_so_has_the_fit_of_motion(tmp_path):
+    configs = [cell.config for cell in plan(read_spec("best"), out=tmp_path)]
+    best, usual = PRESETS["best"].loss, LossConfig()
+    for field in dataclasses.fields(best):
+        if getattr(best, field.name) != getattr(usual, field.name):
+            assert any(getattr(c.loss, field.name) != getattr(best, field.name) for c in configs), field.name
+    assert any(config.schedule.fit_motion == 0 for config in configs)
 
 
 def test_every_option_survives_the_way_through_the_command_line(tmp_path):
