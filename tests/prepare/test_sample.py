@@ -51,6 +51,20 @@ def test_what_cannot_be_written_is_refused_before_anything_is_traced(name, size,
     assert not any(tmp_path.iterdir())
 
 
+def test_the_command_says_what_it_does_before_it_does_it_unless_it_is_quiet(tmp_path, monkeypatch, capsys):
+    printed = []
+    frame = sample._frame
+    monkeypatch.setattr(sample, "SampleSize", lambda: TINY)
+    monkeypatch.setattr(sample, "_frame", lambda *a: printed.append(capsys.readouterr().out) or frame(*a))
+    path = tmp_path / "sample.mp4"
+    assert main(["sample", str(path)]) == 0
+    assert printed[0] == f"tracing 10 frames of 96×64 for {path}\n"
+    assert "next run" in capsys.readouterr().out
+    printed.clear()
+    assert main(["sample", str(tmp_path / "quiet.mp4"), "--quiet"]) == 0
+    assert "".join(printed) + capsys.readouterr().out == ""
+
+
 def test_the_command_says_what_to_run_next(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sample, "SampleSize", lambda: TINY)
     path = tmp_path / "sample.mp4"

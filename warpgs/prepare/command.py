@@ -110,9 +110,10 @@ class Sample:
     def run(self) -> None:
         with ending_at_once():
             from .sample import write_sample  # imports torch and Warp
-        write_sample(self.video, quiet=self.quiet)
-        if not self.quiet:
-            print(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")
+        log = None if self.quiet else partial(print, flush=True)
+        write_sample(self.video, log=log)
+        if log is not None:
+            log(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")
 
 
 @contextmanager

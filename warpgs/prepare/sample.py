@@ -6,6 +6,7 @@ shakes a little, so nothing repeats exactly.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,13 +48,13 @@ class SampleSize:
     num_samples: int = 4
 
 
-def write_sample(path: Path, size: SampleSize | None = None, quiet: bool = True) -> None:
+def write_sample(path: Path, size: SampleSize | None = None, log: Callable[[str], None] | None = None) -> None:
     """Writes the video.
 
     Args:
         path: File to write, with a suffix of ``ENCODINGS``; .mp4 loses least.
         size: Its size; the default size if None.
-        quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
+        log: Receives a line about what is traced, before a progress bar; None for no output at all.
 
     Raises:
         ValueError: If the suffix is unknown, the file exists (it may be a video of the user's own), or the size is too
@@ -67,9 +68,11 @@ def write_sample(path: Path, size: SampleSize | None = None, quiet: bool = True)
         raise ValueError(f"{path} exists: give another name, or delete it first")
     if min(size.width, size.height) < MIN_SIDE or size.num_frames < MIN_FRAMES or size.num_samples < 1:
         raise ValueError(f"the sample needs {MIN_FRAMES} frames of {MIN_SIDE}×{MIN_SIDE} pixels at least, got {size}")
+    if log is not None:
+        log(f"tracing {size.num_frames} frames of {size.width}×{size.height} for {path}")
     clutter = _clutter()
     with Video(path, RATE) as video:
-        for k in progress(range(size.num_frames), "sample", quiet):
+        for k in progress(range(size.num_frames), "tracing", log is None):
             video.add(_frame(clutter, k / (size.num_frames - 1), size))
 
 
