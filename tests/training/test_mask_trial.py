@@ -11,10 +11,13 @@ import pytest
 
 from tests import tiny, two_ranks
 from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
+from warpgs.evaluation import evaluate_run
 from warpgs.training import mask_trial
 from warpgs.training.mask_trial import held_out_psnr, with_trusted_masks
+from warpgs.training.train import train
 
 LENGTH = 60
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -52,7 +55,7 @@ def qualities(monkeypatch):
 
 def decide(folder, config=CONFIG):
     lines: list[str] = []
-    return with_trusted_masks(config, load_capture(folder), lines.append, quiet=True).assume, lines
+    return with_trusted_masks(config, load_capture(folder), lines.append, quiet=True)[0].assume, lines
 
 
 def test_both_trainings_are_made_and_the_better_one_is_followed(folder, monkeypatch):
@@ -93,7 +96,7 @@ def test_given_masks_and_few_frames_are_not_tried(folder, qualities):
     few, given = capture.split(capture.train[:15], ()), load_capture(folder)
     given.estimated_masks = False
     for other in (few, given):
-        assert with_trusted_masks(CONFIG, other, print, quiet=True) == CONFIG
+        assert with_trusted_masks(CONFIG, other, print, quiet=True) == (CONFIG, {})
 
 
 def test_runs_that_are_hardly_longer_are_not_tried(folder, qualities, monkeypatch):
@@ -157,6 +160,25 @@ def test_held_out_frames_are_not_trained_on(folder, monkeypatch):
     assert not config.app  # a switch of the run
     assert not config.exposure  # held-out frames are compared as they are
     assert not run.exists()
+
+
+def test_metrics_have_the_results_of_the_trial_also_after_the_run_was_resumed(folder, qualities, monkeypatch, tmp_path):
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+    out, expected = tmp_path / "run", {"mask_trial_psnr_with": 30.0, "mask_trial_psnr_without": 30.2}
+    qualities["dynamic"] = 30.2
+    for config in (dataclasses.replace(CONFIG, data=folder, out=out), TrainConfig(resume=out)):
+        train(config)
+        metrics = json.loads((out / "metrics.json").read_text())
+        assert metrics.pop("mask_trial_seconds") > 0
+        assert {name: value for name, value in metrics.items() if name.startswith("mask_trial")} == expected
+        (out / "metrics.json").unlink()
+
+
+def test_metrics_without_a_trial_do_not_mention_it(folder, qualities, monkeypatch, tmp_path):
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+    train(dataclasses.replace(CONFIG, data=folder, out=tmp_path / "run", try_masks=False))
+    assert "mask_trial" not in (tmp_path / "run" / "metrics.json").read_text()
+    assert not (tmp_path / "run" / "mask_trial.json").exists()
 
 
 def test_all_ranks_follow_the_decision_of_the_first(folder, tmp_path):

@@ -11,10 +11,10 @@ from warpgs import visualize
 from warpgs.config import NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.files import write_json, write_png
+from warpgs.files import read_json, write_json, write_png
 from warpgs.progress import progress
 from warpgs.rendering import Rendering
-from warpgs.runs.run import Device, Run
+from warpgs.runs.run import MASK_TRIAL, Device, Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.writer import Video
 
@@ -64,7 +64,8 @@ def evaluate_run(
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
-    write_json(folder / "metrics.json", {**values, "commit": commit()})
+    trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
+    write_json(folder / "metrics.json", {**values, **trial, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)

@@ -44,6 +44,9 @@ TITLES = {
     "peak_bytes": "peak memory",
     "num_static": "static Gaussians",
     "num_dynamic": "dynamic Gaussians",
+    "mask_trial_psnr_with": "trial with the masks, PSNR [dB]",
+    "mask_trial_psnr_without": "trial without the masks, PSNR [dB]",
+    "mask_trial_seconds": "trial of the masks [h:m:s]",
 }
 """Titles of metrics; others keep their names in metrics.json."""
 
@@ -81,7 +84,7 @@ def formatted(name: str, value: Any) -> str:
         return "yes" if value else "no"
     if not isinstance(value, int | float):
         return str(value)
-    if name == "train_seconds":
+    if name in ("train_seconds", "mask_trial_seconds"):
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
     if name == "peak_bytes":

@@ -1,4 +1,4 @@
-"""Run folders: config.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
+"""Run folders: config.json, mask_trial.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -22,6 +22,9 @@ from .trained import TrainedScene
 
 LOCK = ".lock"
 """File in a run folder that the process which trains there keeps locked."""
+
+MASK_TRIAL = "mask_trial.json"
+"""File in a run folder: what the trial of the masks found, for metrics.json. It exists only after a trial."""
 
 Device = Literal["cuda", "cpu"]
 

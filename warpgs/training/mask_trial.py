@@ -2,6 +2,7 @@
 
 import dataclasses
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,8 +39,12 @@ MIN_GAIN = 0.5
 """By how much held-out frames must be better without the masks, because without them nothing is static [dB]."""
 
 
-def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str], None], quiet: bool) -> TrainConfig:
+def with_trusted_masks(
+    config: TrainConfig, capture: Capture, log: Callable[[str], None], quiet: bool
+) -> tuple[TrainConfig, dict[str, float]]:
     """The config, which takes everything as dynamic if estimated masks turn out to be worse than none.
+
+    Also returns what the trial found, for metrics.json: its time [s] and both PSNR [dB]; empty if there was none.
 
     All ranks of torchrun must call it; rank 0 decides.
 
@@ -49,10 +54,9 @@ def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str
         log: Receives what is tried and what follows.
         quiet: Whether to show no progress.
     """
-    is_wanted = config.try_masks and capture.assuming(config.assume).uses_estimated_masks
-    is_long = config.schedule.num_iterations >= MIN_RELATIVE_LENGTH * TRIAL.schedule.num_iterations
-    if not is_wanted or not is_long or len(capture.train) < MIN_FRAMES:
-        return config
+    if not _is_wanted(config, capture):
+        return config, {}
+    start = time.perf_counter()
     length, small = TRIAL.schedule.num_iterations, reduced_capture(capture, MAX_SIDE)
     log(f"the masks are estimates: two trainings of {length} iterations try them out (--no-try-masks omits them)")
     try:
@@ -64,15 +68,24 @@ def with_trusted_masks(config: TrainConfig, capture: Capture, log: Callable[[str
         if ranks.num_ranks() > 1:
             raise  # the others would wait for this one
         log(f"the masks are used, because they could not be tried out: {one_line(error)}")
-        return config
+        return config, {}
+    trial = {"mask_trial_psnr_with": following, "mask_trial_psnr_without": ignoring}
+    trial["mask_trial_seconds"] = time.perf_counter() - start
     found = (
         f"training frames held out of the trial have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
     )
     if not ranks.text_of_first("worse" if ignoring > following + MIN_GAIN else ""):
         log(f"{found}: the masks are used")
-        return config
+        return config, trial
     log(f"{found}: the masks are not used, everything is dynamic (--no-try-masks uses them all the same)")
-    return dataclasses.replace(config, assume="dynamic")
+    return dataclasses.replace(config, assume="dynamic"), trial
+
+
+def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
+    """Whether there are estimated masks to try out, and the run is much longer than the trial."""
+    is_long = config.schedule.num_iterations >= MIN_RELATIVE_LENGTH * TRIAL.schedule.num_iterations
+    is_asked = config.try_masks and capture.assuming(config.assume).uses_estimated_masks
+    return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 
 def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, quiet: bool = True) -> float:

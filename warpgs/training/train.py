@@ -12,10 +12,11 @@ from warpgs.data.check import Finding, quick_findings
 from warpgs.data.loaders import recognize
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
+from warpgs.files import write_json
 from warpgs.model.poses import PoseCorrections
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
-from warpgs.runs.run import Device, Run, choose_device, new_folder, open_capture
+from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, new_folder, open_capture
 
 from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
@@ -200,10 +201,13 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
     if config.device == "cpu" and config.preset in ("best", "paper"):
         log(CPU_ADVICE.format(config.preset))
-    config = fitted(with_trusted_masks(config, capture, log, quiet), capture, log)
+    config, trial = with_trusted_masks(config, capture, log, quiet)
+    config = fitted(config, capture, log)
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
     if ranks.is_first():
         Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
+        if trial:
+            write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
 
 
