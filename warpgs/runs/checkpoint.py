@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -226,6 +226,35 @@ def set_aside(path: Path) -> Path:
         OSError: If it cannot be renamed.
     """
     return path.replace(path.with_name(path.name + ".damaged"))
+
+
+def restore_newest(run: Path, restore: Callable[[Path], None], log: Callable[[str], None]) -> Path | None:
+    """Restores the newest checkpoint of a run folder that is not damaged; returns it, or None if there are none.
+
+    Damaged ones that are newer are renamed, with a warning.
+
+    Args:
+        run: Run folder.
+        restore: Restores a checkpoint; raises DamagedCheckpointError if it is damaged.
+        log: Receives the warnings.
+
+    Raises:
+        DamagedCheckpointError: If all are damaged.
+    """
+    damaged: list[DamagedCheckpointError] = []
+    for path in reversed(list_checkpoints(run)):
+        try:
+            restore(path)
+        except DamagedCheckpointError as error:
+            damaged.append(error)
+            continue
+        for reason in damaged:
+            aside = set_aside(reason.path)
+            log(f"warning: {reason}; it is now {aside.name}, and training continues from {path}")
+        return path
+    if damaged:
+        raise damaged[0]
+    return None
 
 
 def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:

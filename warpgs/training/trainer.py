@@ -377,24 +377,7 @@ class Trainer:
         Raises:
             ValueError: If all are damaged, or the newest that is not is of another config or capture.
         """
-        path = self._restore_newest(log) if ranks.is_first() else None
+        path = checkpoint.restore_newest(self.run, self.restore, log) if ranks.is_first() else None
         name = ranks.text_of_first("" if path is None else path.name)
         if name and not ranks.is_first():
             self.restore(self.run / checkpoint.FOLDER / name)
-
-    def _restore_newest(self, log: Callable[[str], None]) -> Path | None:
-        """Restores the newest checkpoint that is not damaged; returns it."""
-        damaged: list[checkpoint.DamagedCheckpointError] = []
-        for path in reversed(checkpoint.list_checkpoints(self.run)):
-            try:
-                self.restore(path)
-            except checkpoint.DamagedCheckpointError as error:
-                damaged.append(error)
-                continue
-            for reason in damaged:
-                aside = checkpoint.set_aside(reason.path)
-                log(f"warning: {reason}; it is now {aside.name}, and training continues from {path}")
-            return path
-        if damaged:
-            raise damaged[0]
-        return None
