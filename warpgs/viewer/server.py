@@ -10,7 +10,8 @@ import viser
 
 from .browser_camera import set_camera, start_camera
 from .origin import refuse_foreign_pages
-from .session import PageState, Session
+from .page_state import PageState
+from .session import Session
 from .source import Source
 from .training_cameras import TrainingCameras
 

@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import viser
@@ -17,9 +17,10 @@ from warpgs.posix import release_free_memory
 
 from . import comparison
 from .adaptive_resolution import AdaptiveResolution
-from .browser_camera import BrowserCamera, set_camera, through_training_camera
+from .browser_camera import set_camera, through_training_camera
 from .clock import Clock
 from .frustums import BLUE, add_frustum
+from .page_state import PageState
 from .panel import FORWARD, PAUSE, PLAY, Panel, escape, set_value
 from .path_editor import PathEditor
 from .pose import Pose, camera_of, pose_of
@@ -56,26 +57,6 @@ KEYFRAME_SCALE = 0.1
 
 STEPS = 60
 """Steps of the time of a scene without training cameras."""
-
-
-class PageState(NamedTuple):
-    """What a browser shows, which survives a reload of its page.
-
-    Attributes:
-        camera: Its camera.
-        orientation: Quaternion of the camera, with its roll.
-        controls: Values of the controls of the panel, by name.
-        training_view: Number of the training camera that the slider selects, from 1.
-    """
-
-    camera: BrowserCamera
-    orientation: np.ndarray
-    controls: dict[str, Any]
-    training_view: int | None
-
-
-KEPT = ("time", "speed", "layer", "residual", "width")
-"""Controls whose values survive a reload."""
 
 
 class Shown(NamedTuple):
@@ -144,10 +125,7 @@ class Session:
 
     def view(self) -> PageState:
         """What the browser shows."""
-        camera, panel = self._client.camera, self.panel
-        seen = BrowserCamera(camera.position, camera.look_at, camera.up_direction, float(camera.fov))
-        controls = {name: getattr(panel, name).value for name in KEPT}
-        return PageState(seen, camera.wxyz, controls, None if self._training is None else panel.view.value)
+        return PageState.of(self._client.camera, self.panel, self._training is not None)
 
     def _restore(self, view: PageState) -> None:
         for name, value in view.controls.items():
