@@ -98,6 +98,19 @@ def test_a_run_that_is_being_trained_cannot_be_resumed(finished, refused):
         pass  # unlocked
 
 
+def test_a_run_is_trained_without_the_compiler_of_torch(data, tmp_path):
+    """It takes seconds to import."""
+    code = (
+        "import sys\n"
+        "from warpgs import cli\n"
+        "cli.train(sys.argv[1:], 'train.py')\n"
+        "print('compiler:', 'torch._dynamo' in sys.modules)"
+    )
+    options = ["--data", str(data), "--iterations", "12", "--optim.poses", "1e-4", "--out", str(tmp_path / "run")]
+    run = subprocess.run([sys.executable, "-c", code, *QUICK, *options], capture_output=True, text=True, check=True)
+    assert run.stdout.endswith("compiler: False\n")
+
+
 def test_a_run_writes_its_metrics(finished):
     metrics = json.loads((finished[1] / "metrics.json").read_text())
     wanted = (

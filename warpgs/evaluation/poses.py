@@ -11,6 +11,7 @@ from warpgs.config import RenderSettings
 from warpgs.data.capture import Frame
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.splats import Splats
+from warpgs.ops.adam import Adam
 from warpgs.rendering import render
 from warpgs.runs.trained import TrainedScene
 
@@ -65,8 +66,8 @@ def aligned_camera(
     """
     poses = PoseCorrections(1, unit).to(camera.viewmat.device)
     index = torch.zeros(1, dtype=torch.int64, device=camera.viewmat.device)
-    optimizer = torch.optim.Adam(poses.parameters(), lr=RATES[0])
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, (RATES[1] / RATES[0]) ** (1.0 / ITERATIONS))
+    rate = torch.tensor(RATES[0], device=camera.viewmat.device)
+    optimizer = Adam([{"params": list(poses.parameters()), "lr": rate}])
     settings = RenderSettings(antialias=antialias)
     for _ in range(ITERATIONS):
         image = render(splats, poses.moved(camera, index), settings=settings).joint.image
@@ -74,6 +75,6 @@ def aligned_camera(
         errors = (image - truth).abs()
         (errors if region is None else errors[region]).mean().backward()
         optimizer.step()
-        schedule.step()
+        rate *= (RATES[1] / RATES[0]) ** (1.0 / ITERATIONS)
     with torch.no_grad():
         return poses.moved(camera, index)

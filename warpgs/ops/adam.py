@@ -1,6 +1,7 @@
 """Adam on the device: on CUDA in one kernel (kernels/adam.py), on CPU in torch's."""
 
 import math
+from collections import defaultdict
 from typing import Any
 
 import torch
@@ -10,11 +11,17 @@ from warpgs.kernels import adam as kernels
 from warpgs.runtime.launch import launch
 
 
-class Adam(torch.optim.Optimizer):
+class Adam:
     """Adam as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, with one launch for each parameter.
 
     Torch's CUDA kernel gives each block 65,536 numbers, so that the parameters of the Gaussians occupy only a few
     blocks. All state that changes between steps is on the device, so that a step can be part of a CUDA graph.
+
+    It is no ``torch.optim.Optimizer``, whose constructor imports torch's compiler: two seconds, for nothing used here.
+
+    Attributes:
+        param_groups: The groups.
+        state: By parameter, once it had a gradient: ``step``, ``exp_avg`` and ``exp_avg_sq``, as in torch.
 
     Args:
         groups: Parameter groups with ``params`` and ``lr``, a tensor of one element that every step reads.
@@ -22,12 +29,15 @@ class Adam(torch.optim.Optimizer):
         epsilon: Added to the square root of the second moment.
     """
 
-    def __init__(self, groups: list[dict[str, Any]], betas: tuple[float, float], epsilon: float) -> None:
-        super().__init__(groups, {"betas": betas, "eps": epsilon})
+    def __init__(
+        self, groups: list[dict[str, Any]], betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-8
+    ) -> None:
+        self.param_groups = [{**group, "betas": betas, "eps": epsilon} for group in groups]
+        self.state: defaultdict[torch.Tensor, dict[str, Any]] = defaultdict(dict)
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Updates every parameter that has a gradient; ``closure`` is not used."""
+    def step(self) -> None:
+        """Updates every parameter that has a gradient."""
         trained = [(group, p) for group in self.param_groups for p in group["params"] if p.grad is not None]
         if not trained:
             return
@@ -80,3 +90,9 @@ class Adam(torch.optim.Optimizer):
                 eps=group["eps"],
                 maximize=False,
             )
+
+    def zero_grad(self) -> None:
+        """Removes the gradients of all parameters."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None

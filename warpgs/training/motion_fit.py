@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from warpgs.ops.adam import Adam
+
 from .dynamic_points import PIXELS_PER_CHUNK, DynamicPoints, to_canonical
 from .point_cloud import subsample
 
@@ -75,7 +77,8 @@ def fit_motion(
     if not parameters:
         return found
     points = _PointsByView(found, times, extent, parameters[0].device, generator)
-    optimizer = torch.optim.Adam(parameters, LEARNING_RATE)
+    rate = torch.tensor(LEARNING_RATE, device=parameters[0].device)
+    optimizer = Adam([{"params": parameters, "lr": rate}])
     for step in range(num_steps):
         _take_step(fitted, points, points.choose_view(step / (GROWTH * num_steps), generator), optimizer)
         if is_stopped():
@@ -85,7 +88,7 @@ def fit_motion(
 
 
 @torch.enable_grad()
-def _take_step(deformation: nn.Module, points: "_PointsByView", view: int, optimizer: torch.optim.Adam) -> None:
+def _take_step(deformation: nn.Module, points: "_PointsByView", view: int, optimizer: Adam) -> None:
     """Fits the deformation a little better to the points of a view."""
     _distance(points.deformed(deformation, view), points.seen[view]).backward()
     optimizer.step()
