@@ -56,13 +56,13 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(0)
     image = skimage.io.imread(options.image) if options.image else skimage.data.astronaut()
-    image = (image if image.ndim == 3 else skimage.color.gray2rgb(image))[..., :3]
+    image = skimage.util.img_as_float(image if image.ndim == 3 else skimage.color.gray2rgb(image))[..., :3]
     height = max(1, round(image.shape[0] * options.width / image.shape[1]))
     target = torch.from_numpy(skimage.transform.resize(image, (height, options.width), anti_aliasing=True)).float()
     target = target.to("cuda" if torch.cuda.is_available() else "cpu")
     for name, image in zip(("before", "after"), fit(target, options.gaussians, options.steps), strict=True):
         write_png(options.out / f"{name}.png", to_bytes(image))
-        print(f"{name}: {-10 * (image - target).square().mean().log10():.2f} dB PSNR")
+        print(f"{name}: {-10 * (image.clamp(0, 1) - target).square().mean().log10():.2f} dB PSNR")
 
 
 if __name__ == "__main__":

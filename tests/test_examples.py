@@ -48,9 +48,10 @@ def test_fit_image_improves_the_psnr_by_more_than_12_decibels_in_60_steps(run, t
         assert cv2.imread(str(tmp_path / name)).shape == (48, 48, 3)
 
 
-def test_fit_image_reads_greyscale_images(run, tmp_path):
+@pytest.mark.parametrize("is_bilevel", [0, 1])
+def test_fit_image_reads_images_without_colours(run, tmp_path, is_bilevel):
     grey = cv2.imread(str(EXAMPLES.parent / "docs" / "images" / "page.jpg"), cv2.IMREAD_GRAYSCALE)
-    cv2.imwrite(str(tmp_path / "grey.png"), grey[:90, :180])
+    cv2.imwrite(str(tmp_path / "grey.png"), grey[:90, :180], [cv2.IMWRITE_PNG_BILEVEL, is_bilevel])
     run("fit_image", tmp_path / "grey.png", "--width", 32, "--gaussians", 20, "--steps", 1, "--out", tmp_path)
     assert cv2.imread(str(tmp_path / "after.png")).shape == (16, 32, 3)
 

@@ -59,13 +59,13 @@ def evaluate_run(
     run = Run.open(folder, device)
     # First, because opening a capture can take a minute.
     network = find(lpips[0] or run.config.lpips, lpips[1] or run.config.lpips_net)
+    trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
     evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
-    trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
-    write_json(folder / "metrics.json", {**values, **trial, "commit": commit()})
+    write_json(folder / "metrics.json", {**trial, **values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)

@@ -54,15 +54,15 @@ def _check_format(options: Export) -> None:
 def _check_out(options: Export) -> None:
     """Refuses a file as ``--out`` that is not of the format, or that is one for several.
 
-    A new path that ends with a dot and letters, such as scene.gltf, is taken as a file; run.2 is a folder.
+    A new path with a suffix that begins with a letter, such as scene.gltf, is taken as a file; run.2 is a folder.
     """
     out, formats = options.out, [name for name, writer in WRITERS.items() if options.is_out_file(writer.suffix)]
     if not formats:
-        if out is not None and out.suffix[1:].isalpha() and not out.is_dir():
+        if out is not None and out.suffix[1:2].isalpha() and not out.is_dir():
             known = ", ".join(dict.fromkeys(writer.suffix for writer in WRITERS.values() if writer.suffix))
             raise ValueError(
-                f"--out {out}: no format has files that end with {out.suffix}, only {known}; a folder of this name has "
-                "to exist before"
+                f"--out {out}: no format has files that end with {out.suffix}, only {known}; to export into "
+                "a folder of this name, create it first"
             )
         return
     if options.format not in formats:
