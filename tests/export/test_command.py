@@ -191,7 +191,7 @@ def test_a_new_folder_may_have_a_dot_in_its_name(run, tmp_path):
 
 @pytest.mark.parametrize("file", ["a.usd", "a.gltf", "a.htm", "a.mp4"])
 def test_a_new_file_of_no_format_is_refused_with_the_suffixes_of_all(run, tmp_path, file):
-    message = rf"end with \{Path(file).suffix}, only \.ply, \.sog, \.spz, \.glb, \.usdc, \.4dgs, \.html; a folder"
+    message = rf"end with \{Path(file).suffix}, only \.ply, \.sog, \.spz, \.glb, \.usdc, \.4dgs, \.html; to export"
     with pytest.raises(ValueError, match=message):
         export(run, tmp_path, out=tmp_path / file)
     assert list(tmp_path.iterdir()) == []
