@@ -111,8 +111,8 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
     """
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     values = {FILE_KEYS.get(name, name): value for name, value in asdict(metadata).items()}
-    fields = json.dumps(values)
-    header = {"format": "warpgs", "version": str(VERSION), "facts": fields, "sha256": _hash(plain, fields)}
+    text = json.dumps(values)
+    header = {"format": "warpgs", "version": str(VERSION), "facts": text, "sha256": _hash(plain, text)}
     with atomic_path(path) as partial:
         partial.touch()
         mode = partial.stat().st_mode
@@ -125,9 +125,9 @@ def save(path: Path, tensors: dict[str, Tensor], metadata: Metadata) -> None:
             os.fsync(file.fileno())
 
 
-def _hash(tensors: Mapping[str, Tensor], fields: str) -> str:
-    """SHA-256 of the names, types, shapes and bytes of tensors on the CPU, and of the plain values."""
-    digest = hashlib.sha256(fields.encode())
+def _hash(tensors: Mapping[str, Tensor], text: str) -> str:
+    """SHA-256 of the names, types, shapes and bytes of tensors on the CPU, and of the plain values as JSON."""
+    digest = hashlib.sha256(text.encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"\0{name} {tensor.dtype} {list(tensor.shape)}\0".encode())
         digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
