@@ -20,7 +20,7 @@ class Adam:
     It is no ``torch.optim.Optimizer``, whose constructor imports torch's compiler: two seconds, for nothing used here.
 
     Attributes:
-        param_groups: The groups.
+        param_groups, betas, epsilon: The arguments.
         state: By parameter, once it had a gradient: ``step``, ``exp_avg`` and ``exp_avg_sq``, as in torch.
 
     Args:
@@ -32,7 +32,7 @@ class Adam:
     def __init__(
         self, groups: list[dict[str, Any]], betas: tuple[float, float] = (0.9, 0.999), epsilon: float = 1e-8
     ) -> None:
-        self.param_groups = [{**group, "betas": betas, "eps": epsilon} for group in groups]
+        self.param_groups, self.betas, self.epsilon = groups, betas, epsilon
         self.state: defaultdict[torch.Tensor, dict[str, Any]] = defaultdict(dict)
 
     @torch.no_grad()
@@ -54,9 +54,9 @@ class Adam:
 
     def _launch(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
         torch._foreach_add_([self.state[parameter]["step"] for _, parameter in trained], 1.0)
+        betas = [value for beta in self.betas for value in (beta, 1.0 - beta, math.log(beta))]
         for group, parameter in trained:
             state = self.state[parameter]
-            betas = [value for beta in group["betas"] for value in (beta, 1.0 - beta, math.log(beta))]
             launch(
                 kernels.adam_step,
                 parameter.numel(),
@@ -64,7 +64,7 @@ class Adam:
                 group["lr"].view(1),
                 state["step"].view(1),
                 *betas,
-                group["eps"],
+                self.epsilon,
                 parameter.view(-1),
                 state["exp_avg"].view(-1),
                 state["exp_avg_sq"].view(-1),
@@ -83,11 +83,11 @@ class Adam:
                 [state["step"]],
                 fused=True,
                 amsgrad=False,
-                beta1=group["betas"][0],
-                beta2=group["betas"][1],
+                beta1=self.betas[0],
+                beta2=self.betas[1],
                 lr=group["lr"],
                 weight_decay=0.0,
-                eps=group["eps"],
+                eps=self.epsilon,
                 maximize=False,
             )
 
