@@ -225,7 +225,7 @@ class Schedule:
     """Iteration from which dynamic Gaussians are deformed; 0 where the deformation was fitted to points."""
     appearance_from: int | None = 0
     """Iteration from which the appearance network changes static Gaussians; in stage II alone if None (paper, section
-    Training Protocol). By then moving shadows have become Gaussians at wrong depths (docs/results.md)."""
+    Training Protocol). By then moving shadows have become Gaussians at wrong depths (docs/method.md)."""
     joint_from: int | None = None
     """Iteration of stage I from which the joint image is compared; in stage II alone if None (paper)."""
     warmup: int = 1_000

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -299,9 +300,17 @@ def test_a_preset_for_a_gpu_says_so_on_the_cpu(config, preset, is_slow, monkeypa
     assert any(f"the preset {preset} is for a GPU" in line for line in lines) == is_slow
 
 
-def test_without_depth_training_says_so_and_needs_no_pretraining(config):
+def test_training_says_that_depth_is_switched_off(config):
     lines = []
     warpgs.train(dataclasses.replace(config, depth=False), log=lines.append)
+    assert "depth is switched off: training without depth, and without the pretraining that needs it" in lines
+    assert not any("aligned" in line for line in lines)
+
+
+def test_without_depth_training_says_so_and_needs_no_pretraining(config, tmp_path):
+    shutil.copytree(config.data, tmp_path / "flat", ignore=shutil.ignore_patterns("depth"))
+    lines = []
+    warpgs.train(dataclasses.replace(config, data=tmp_path / "flat"), log=lines.append)
     assert any("in 0 of 6 views: training without depth" in line for line in lines)
 
 

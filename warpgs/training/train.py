@@ -36,7 +36,7 @@ CPU_ADVICE = (
 
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
 
-NO_DEPTH = ": training without depth, and without the pretraining that needs it"
+NO_DEPTH = "training without depth, and without the pretraining that needs it"
 
 
 class UnfitCaptureError(ValueError):
@@ -163,8 +163,10 @@ def _describe(trainer: Trainer, log: Log) -> None:
         log(f"depth is off by {error:.1%} at the sparse points, its weight is {trust:.2f} (medians)")
     if refused:
         log(f"depth of {refused} of {num_views} views is hardly better than a constant and is not used")
-    if num_aligned < num_views - refused:
-        reason = "" if num_aligned or trainer.num_with_objects else NO_DEPTH
+    if not config.depth:
+        log(f"depth is switched off: {NO_DEPTH}")
+    elif num_aligned < num_views - refused:
+        reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
         log(f"depth of dynamic objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
