@@ -1,9 +1,11 @@
 """A deformation that is fitted to dynamic points before training."""
 
+import dataclasses
+
 import pytest
 import torch
 
-from tests.scenes import error, generator
+from tests.scenes import error, generator, relative_error
 from warpgs.config import ModelConfig
 from warpgs.model.fields import make_deformation
 from warpgs.training import motion_fit
@@ -39,15 +41,18 @@ def points_on_balls():
 
 
 FOUND = points_on_balls()
+UNEVEN = FOUND.chosen((torch.arange(len(FOUND.views)) % NUM_POINTS < 6) | (FOUND.views % 4 == 2))
+"""Most frames show 6 of the points on each object."""
 
 
-def new_deformation(seed=0):
-    torch.manual_seed(seed)
-    return make_deformation(MODEL, torch.zeros(3), torch.ones(3))
+def new_deformation(device="cpu", **model):
+    torch.manual_seed(0)
+    box = torch.zeros(3, device=device), torch.ones(3, device=device)
+    return make_deformation(dataclasses.replace(MODEL, **model), *box)
 
 
-def fit(found, deformation, num_iterations=300):
-    return fit_motion(deformation, found, TIMES, EXTENT, num_iterations, generator())
+def fit(found, deformation, num_steps=300, is_stopped=bool):
+    return fit_motion(deformation, found, TIMES, EXTENT, num_steps, generator(), is_stopped)
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +86,58 @@ def test_each_object_is_one_cluster_in_canonical_space(fitted):
     assert (first.mean(0) - second.mean(0)).norm() > 0.5
 
 
-def test_an_object_is_carried_along_its_own_way(fitted):
-    canonical, deformation = fitted
+def largest_error(canonical, deformation):
+    """Largest distance between the means of the deformed points of an object and where the object is."""
+    errors = []
     for color, label in zip(COLORS, (0, 1), strict=True):
-        points = canonical.chosen((canonical.colors == color).all(1)).positions
-        for view in range(NUM_VIEWS):
+        points = canonical.positions[(canonical.colors == color).all(1)].to(next(deformation.parameters()).device)
+        for time in TIMES:
             with torch.no_grad():
-                moved = points + deformation(points, TIMES[view : view + 1])[:, :3]
-            assert error(moved.mean(0), centers(TIMES[view])[label]) < 0.1  # they are 0.6 apart
+                moved = points + deformation(points, time[None].to(points.device))[:, :3]
+            errors.append(error(moved.mean(0).cpu(), centers(time)[label]))
+    return max(errors)
+
+
+def test_an_object_is_carried_along_its_own_way(fitted):
+    assert largest_error(*fitted) < 0.1  # they are 0.6 apart
+
+
+def pick_with_repetitions(points, index):
+    """Stands in for ``_PointsByView.pick``, which does so on CUDA."""
+    return points.times[index][0], points.seen[index][0], points.counts[index][0]
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_objects_are_followed_through_frames_with_few_points(monkeypatch, repeats):
+    if repeats:
+        monkeypatch.setattr(motion_fit._PointsByView, "pick", pick_with_repetitions)
+    deformation = new_deformation()
+    canonical = fit(UNEVEN, deformation)
+    assert len(canonical.views) > 0.8 * len(UNEVEN.views)
+    assert largest_error(canonical, deformation) < 0.15  # they are 0.6 apart
+
+
+def test_repetitions_change_neither_the_distance_of_a_view_nor_its_gradient():
+    points = motion_fit._PointsByView(UNEVEN, TIMES, EXTENT, torch.device("cpu"), generator())
+    assert points.counts.unique().tolist() == [12, 2 * NUM_POINTS]
+    deformed = (points.home + 0.3 * torch.randn(points.home.shape, generator=generator())).requires_grad_()
+    for index, view in enumerate(points.views):
+        time, seen, count = points.pick(torch.tensor([index]))
+        assert torch.equal(time, TIMES[view : view + 1])
+        assert torch.equal(seen, points._features(UNEVEN.chosen(UNEVEN.views == view)))
+        alone, repeated = (motion_fit._distance(deformed, some, count) for some in (seen, points.seen[index]))
+        assert relative_error(repeated, alone) < 1e-6
+        assert relative_error(*(torch.autograd.grad(x, deformed)[0] for x in (repeated, alone))) < 1e-5
+
+
+def test_the_distance_is_the_mean_over_all_points_of_that_to_the_nearest_one():
+    deformed, seen = (torch.randn(num, 6, generator=generator(num)) for num in (50, 30))
+    squared = torch.cdist(deformed.double(), seen.double()).square()
+    found, hidden = (9.0 * nearest / (9.0 + nearest) for nearest in (squared.amin(0), squared.amin(1)))
+    expected = found.mean() + motion_fit.HIDDEN_WEIGHT * hidden.mean()
+    for repetitions in (0, 1, 30, 47):
+        repeated = torch.cat([seen, seen, seen])[: 30 + repetitions]
+        assert relative_error(motion_fit._distance(deformed, repeated, torch.tensor(30)), expected) < 1e-5
 
 
 def beside(center, views):
@@ -133,9 +182,11 @@ def test_the_points_of_each_frame_are_subsampled(monkeypatch):
     monkeypatch.setattr(motion_fit, "MAX_POINTS_PER_VIEW", 10)
     sizes = []
     distance = motion_fit._distance
-    monkeypatch.setattr(motion_fit, "_distance", lambda a, b: sizes.append((len(a), len(b))) or distance(a, b))
+    monkeypatch.setattr(
+        motion_fit, "_distance", lambda a, b, c: sizes.append((len(a), len(b), int(c))) or distance(a, b, c)
+    )
     canonical = fit(FOUND, new_deformation(), 5)
-    assert set(sizes) == {(10, 10)}
+    assert set(sizes) == {(10, 10, 10)}
     assert len(canonical.views) > 10 * NUM_VIEWS
 
 
@@ -145,10 +196,7 @@ def test_a_deformation_without_parameters_stays_as_it_is():
 
 def test_a_fit_that_is_stopped_leaves_the_deformation_as_it_was():
     deformation, steps = new_deformation(), []
-    stopped = fit_motion(
-        deformation, FOUND, TIMES, EXTENT, 300, generator(), lambda: steps.append(0) or len(steps) == 7
-    )
-    assert stopped is None
+    assert fit(FOUND, deformation, is_stopped=lambda: steps.append(0) or len(steps) == 7) is None
     assert len(steps) == 7
     for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
         assert torch.equal(ours, new)

@@ -73,24 +73,40 @@ def fit_motion(
         deformation as it was, if stopped.
     """
     fitted = copy.deepcopy(deformation).requires_grad_(True)
-    parameters = list(fitted.parameters())
-    if not parameters:
+    device = next((parameter.device for parameter in fitted.parameters()), None)
+    if device is None:
         return found
-    points = _PointsByView(found, times, extent, parameters[0].device, generator)
-    rate = torch.tensor(LEARNING_RATE, device=parameters[0].device)
-    optimizer = Adam([{"params": parameters, "lr": rate}])
-    for step in range(num_steps):
-        _take_step(fitted, points, points.choose_view(step / (GROWTH * num_steps), generator), optimizer)
-        if is_stopped():
-            return None
+    points = _PointsByView(found, times, extent, device, generator)
+    if not _fit(fitted, points, num_steps, generator, is_stopped):
+        return None
     deformation.load_state_dict(fitted.state_dict())
     return points.canonical(deformation, found)
 
 
+def _fit(
+    deformation: nn.Module,
+    points: "_PointsByView",
+    num_steps: int,
+    generator: torch.Generator,
+    is_stopped: Callable[[], bool],
+) -> bool:
+    """Takes the steps until stopped; whether all were taken."""
+    device = points.home.device
+    rate, index = torch.tensor(LEARNING_RATE, device=device), torch.zeros(1, dtype=torch.int64, device=device)
+    optimizer = Adam([{"params": list(deformation.parameters()), "lr": rate}])
+    for step in range(num_steps):
+        index.fill_(points.choose_view(step / (GROWTH * num_steps), generator))
+        _take_step(deformation, points, index, optimizer)
+        if is_stopped():
+            return False
+    return True
+
+
 @torch.enable_grad()
-def _take_step(deformation: nn.Module, points: "_PointsByView", view: int, optimizer: Adam) -> None:
-    """Fits the deformation a little better to the points of a view."""
-    _distance(points.deformed(deformation, view), points.seen[view]).backward()
+def _take_step(deformation: nn.Module, points: "_PointsByView", index: Int64[Tensor, "1"], optimizer: Adam) -> None:
+    """Fits the deformation a little better to the points of the view whose index is on the device."""
+    time, seen, count = points.pick(index)
+    _distance(points.deformed(deformation, time), seen, count).backward()
     optimizer.step()
     optimizer.zero_grad()
 
@@ -101,11 +117,13 @@ class _PointsByView:
     Attributes:
         extent: Extent of the capture [scene units].
         unit: Difference of positions that counts as 1 [scene units].
-        times: [T, 1] times of all views.
-        seen: By view, [P, 6] features of its points, at most ``MAX_POINTS_PER_VIEW``.
-        home: [H, 6] features of the canonical points, likewise.
-        order: Views by their distance in time from the canonical points.
+        views: The V views with points, by their distance in time from the canonical points.
         gaps: [V] these distances.
+        times: [V, 1] times.
+        seen: [V, P, 6] features of at most ``MAX_POINTS_PER_VIEW`` points of each view, repeated until there are as
+            many as in the view with the most.
+        counts: [V] number of points without repetitions.
+        home: [H, 6] features of the canonical points, at most ``MAX_POINTS_PER_VIEW``.
     """
 
     def __init__(
@@ -120,29 +138,37 @@ class _PointsByView:
         features = self._features(found)
         views, counts = found.views.unique(return_counts=True)
         start = _start_time(times[views], counts)
-        self.times = times[:, None].to(device)
+        self.gaps, order = (times[views] - start).abs().sort(stable=True)
 
         def some(chosen: Bool[Tensor, " S"]) -> Float[Tensor, "P 6"]:
             indices = chosen.nonzero()[:, 0]
-            return features[indices[subsample(indices, MAX_POINTS_PER_VIEW, generator)]].to(device)
+            return features[indices[subsample(indices, MAX_POINTS_PER_VIEW, generator)]]
 
-        self.seen = {view: some(found.views == view) for view in views.tolist()}
-        self.home = some((times[found.views] - start).abs() <= WINDOW)
-        self.gaps, order = (times[views] - start).abs().sort(stable=True)
-        self.order = views[order].tolist()
+        seen = [some(found.views == view) for view in views.tolist()]
+        self.home = some((times[found.views] - start).abs() <= WINDOW).to(device)
+        self.views, self.times = views[order].tolist(), times[views[order], None].to(device)
+        self.counts = counts[order].clamp_max(MAX_POINTS_PER_VIEW).to(device)
+        rows = torch.arange(max(len(points) for points in seen))
+        self.seen = torch.stack([points[rows % len(points)] for points in seen])[order].to(device)
 
     def _features(self, points: DynamicPoints) -> Float[Tensor, "S 6"]:
         return torch.cat([points.positions / self.unit, points.colors / COLOR_UNIT], 1)
 
     def choose_view(self, progress: float, generator: torch.Generator) -> int:
-        """A random view among those that are compared when a fraction of the way to the farthest one is done."""
+        """Index in ``views`` of a random one that is compared when a fraction of the way to the farthest is done."""
         count = int((self.gaps <= progress * self.gaps[-1]).sum())
-        return self.order[int(torch.randint(count, (), generator=generator))]
+        return int(torch.randint(count, (), generator=generator))
 
-    def deformed(self, deformation: nn.Module, view: int) -> Float[Tensor, "H 6"]:
-        """Features of the canonical points at the time of a view."""
+    def pick(self, index: Int64[Tensor, "1"]) -> tuple[Float[Tensor, "1"], Float[Tensor, "P 6"], Int64[Tensor, ""]]:
+        """Time of the view of an index on the device, features of its points, and their number without repetitions."""
+        time, seen, count = (values.index_select(0, index)[0] for values in (self.times, self.seen, self.counts))
+        # A graph needs one shape for all views. On the CPU repetitions would only cost time.
+        return time, seen if seen.is_cuda else seen[: int(count)], count
+
+    def deformed(self, deformation: nn.Module, time: Float[Tensor, "1"]) -> Float[Tensor, "H 6"]:
+        """Features of the canonical points at a time."""
         positions, colors = self.home.split(3, 1)
-        offsets = deformation(positions * self.unit, self.times[view])[:, :3]
+        offsets = deformation(positions * self.unit, time)[:, :3]
         return torch.cat([positions + offsets / self.unit, colors], 1)
 
     @torch.no_grad()
@@ -153,15 +179,15 @@ class _PointsByView:
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
         largest = MAX_ERROR * self.extent
-        for view in self.seen:
-            deformed = self.deformed(deformation, view)
+        for view, time in zip(self.views, self.times, strict=True):
+            deformed = self.deformed(deformation, time)
             for part in (found.views == view).nonzero()[:, 0].split(PIXELS_PER_CHUNK):
                 seen = self._features(found.chosen(part)).to(deformed.device)
                 distances, nearest = torch.cdist(seen, deformed).min(1)
                 is_shown = distances.square() <= MAX_SQUARED_DISTANCE
                 goal = seen[:, :3] * self.unit
                 start = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
-                moved, reached = to_canonical(deformation, goal, self.times[view], start, largest)
+                moved, reached = to_canonical(deformation, goal, time, start, largest)
                 reached &= ~is_shown | (moved == start).all(1)
                 positions[part], kept[part] = moved.cpu(), reached.cpu()
         return found._replace(positions=positions).chosen(kept)
@@ -174,14 +200,20 @@ def _start_time(times: Float[Tensor, " V"], counts: Int64[Tensor, " V"]) -> floa
     return float(times[middle[counts[middle].argmax()]])
 
 
-def _distance(deformed: Float[Tensor, "H 6"], seen: Float[Tensor, "P 6"]) -> Float[Tensor, ""]:
-    """Robust mean of the squared distances between points, in both directions."""
+def _distance(
+    deformed: Float[Tensor, "H 6"], seen: Float[Tensor, "P 6"], count: Int64[Tensor, ""]
+) -> Float[Tensor, ""]:
+    """Robust mean of the squared distances between points, in both directions.
+
+    Only the first ``count`` of the seen points are compared. The others repeat them, so that none of them is nearer.
+    """
     with torch.no_grad():
         distances = torch.cdist(deformed, seen)
         to_deformed, to_seen = distances.argmin(0), distances.argmin(1)
+        is_compared = torch.arange(len(seen), device=seen.device) < count
     found = (deformed[to_deformed] - seen).square().sum(1)
     hidden = (deformed - seen[to_seen]).square().sum(1)
-    return _robust(found).mean() + HIDDEN_WEIGHT * _robust(hidden).mean()
+    return (_robust(found) * is_compared).sum() / count + HIDDEN_WEIGHT * _robust(hidden).mean()
 
 
 def _robust(squared: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
