@@ -308,7 +308,7 @@ class TrainConfig:
     antialias: bool = False
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     graph: bool = True
-    """On CUDA, replay iterations as CUDA graphs."""
+    """On CUDA, replay iterations and the steps of ``schedule.fit_motion`` as CUDA graphs."""
     masks: MaskPerturbation = field(default_factory=MaskPerturbation)
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)

@@ -8,6 +8,8 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator, relative_error
+from tests.training.test_motion_fit import UNEVEN, fit, largest_error, new_deformation
+from warpgs.model.fields import FIELDS
 from warpgs.ops.encoding import aligned
 from warpgs.ops.mlp import num_values, perceptron, split
 from warpgs.rendering import render
@@ -15,6 +17,7 @@ from warpgs.runs.checkpoint import Metadata
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
 from warpgs.runtime.profiling import profile
+from warpgs.training import motion_fit
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -118,6 +121,34 @@ def test_graphs_that_are_captured_again_reuse_the_memory(data, tmp_path):
         torch.cuda.synchronize()
         reserved.append(torch.cuda.memory_reserved())
     assert reserved[-1] <= reserved[2]
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_a_replayed_fit_to_points_changes_parameters_as_an_eager_one_does(model):
+    """Up to noise, as above."""
+
+    def parameters(graph):
+        deformation = new_deformation("cuda", deformation=model)
+        fit(UNEVEN, deformation, 20, graph=graph)
+        return {name: p.detach() for name, p in deformation.named_parameters()}
+
+    eager, again, replayed = parameters(False), parameters(False), parameters(True)
+    new = new_deformation("cuda", deformation=model).state_dict()
+    for name, expected in eager.items():
+        assert not torch.equal(expected, new[name])
+        noise = relative_error(again[name], expected)
+        assert relative_error(replayed[name], expected) < max(1e-3, 4.0 * noise), name
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_replayed_fit_to_points_follows_objects_through_frames_with_few_points(monkeypatch, half):
+    eager_steps, asked, take_step = [], [], motion_fit._take_step
+    monkeypatch.setattr(motion_fit, "_take_step", lambda *args: eager_steps.append(0) or take_step(*args))
+    deformation = new_deformation("cuda", half=half)
+    canonical = fit(UNEVEN, deformation, 300, lambda: bool(asked.append(0)))
+    assert (len(eager_steps), len(asked)) == (WARM_UPS + 1, 300)  # the capture calls it, too
+    assert len(canonical.views) > 0.8 * len(UNEVEN.views)
+    assert largest_error(canonical, deformation) < 0.15  # they are 0.6 apart
 
 
 def rounded(x):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.scenes import error, generator, relative_error
-from warpgs.config import ModelConfig
+from warpgs.config import ModelConfig, TrainConfig
 from warpgs.model.fields import make_deformation
 from warpgs.training import motion_fit
 from warpgs.training.dynamic_points import DynamicPoints
@@ -51,8 +51,10 @@ def new_deformation(device="cpu", **model):
     return make_deformation(dataclasses.replace(MODEL, **model), *box)
 
 
-def fit(found, deformation, num_steps=300, is_stopped=bool):
-    return fit_motion(deformation, found, TIMES, EXTENT, num_steps, generator(), is_stopped)
+def fit(found, deformation, num_steps=300, is_stopped=bool, graph=True):
+    schedule = dataclasses.replace(TrainConfig().schedule, fit_motion=num_steps)
+    config = dataclasses.replace(TrainConfig(), schedule=schedule, graph=graph)
+    return fit_motion(deformation, found, TIMES, EXTENT, config, generator(), is_stopped)
 
 
 @pytest.fixture(scope="module")

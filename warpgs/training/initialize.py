@@ -96,8 +96,8 @@ def dynamic_gaussians(
     if found is None:
         return Gaussians.empty(0, degree)
     if protocol.fits_motion and found.depth_known:
-        times, steps = [capture.cameras[name].time for name in capture.train], config.schedule.fit_motion
-        fitted = fit_motion(deformation, found, torch.tensor(times), capture.extent, steps, generator, is_stopped)
+        times = torch.tensor([capture.cameras[name].time for name in capture.train])
+        fitted = fit_motion(deformation, found, times, capture.extent, config, generator, is_stopped)
         if fitted is None:
             return None
         found = fitted

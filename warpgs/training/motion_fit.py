@@ -8,12 +8,15 @@ points of all frames first.
 
 import copy
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from warpgs.config import TrainConfig
 from warpgs.ops.adam import Adam
+from warpgs.runtime.graphs import GraphCache
 
 from .dynamic_points import PIXELS_PER_CHUNK, DynamicPoints, to_canonical
 from .point_cloud import subsample
@@ -50,7 +53,7 @@ def fit_motion(
     found: DynamicPoints,
     times: Float[Tensor, " T"],
     extent: float,
-    num_steps: int,
+    config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
 ) -> DynamicPoints | None:
@@ -64,7 +67,8 @@ def fit_motion(
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
         extent: Extent of the capture [scene units].
-        num_steps: Number of steps of Adam, each on the points of one frame.
+        config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
+            says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
         is_stopped: Asked after each step whether to stop.
 
@@ -77,7 +81,7 @@ def fit_motion(
     if device is None:
         return found
     points = _PointsByView(found, times, extent, device, generator)
-    if not _fit(fitted, points, num_steps, generator, is_stopped):
+    if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
     return points.canonical(deformation, found)
@@ -86,29 +90,38 @@ def fit_motion(
 def _fit(
     deformation: nn.Module,
     points: "_PointsByView",
-    num_steps: int,
+    config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool],
 ) -> bool:
-    """Takes the steps until stopped; whether all were taken."""
-    device = points.home.device
+    """Takes the steps, on CUDA as replays of a graph, until stopped; whether all were taken."""
+    device, num_steps = points.home.device, config.schedule.fit_motion
     rate, index = torch.tensor(LEARNING_RATE, device=device), torch.zeros(1, dtype=torch.int64, device=device)
     optimizer = Adam([{"params": list(deformation.parameters()), "lr": rate}])
+    take_step = partial(_take_step, deformation, points, index, optimizer)
+    is_replayed = config.graph and device.type == "cuda"
+    graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=False) if is_replayed else None
     for step in range(num_steps):
         index.fill_(points.choose_view(step / (GROWTH * num_steps), generator))
-        _take_step(deformation, points, index, optimizer)
+        if graphs is None:
+            take_step()
+        else:
+            graphs.run("step", take_step)
         if is_stopped():
             return False
     return True
 
 
 @torch.enable_grad()
-def _take_step(deformation: nn.Module, points: "_PointsByView", index: Int64[Tensor, "1"], optimizer: Adam) -> None:
+def _take_step(
+    deformation: nn.Module, points: "_PointsByView", index: Int64[Tensor, "1"], optimizer: Adam
+) -> tuple[Tensor, ...]:
     """Fits the deformation a little better to the points of the view whose index is on the device."""
     time, seen, count = points.pick(index)
     _distance(points.deformed(deformation, time), seen, count).backward()
     optimizer.step()
     optimizer.zero_grad()
+    return ()
 
 
 class _PointsByView:
