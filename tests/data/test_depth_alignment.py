@@ -8,11 +8,12 @@ from scipy.optimize import linprog
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera, relative_error
 from warpgs.data.depth_alignment import (
     align_to_points,
-    align_to_rendering,
     fit_scale_offset,
     is_unusable,
     metric_depth,
     relative_errors,
+    sample_points,
+    sample_rendering,
     smooth_factor,
 )
 
@@ -36,6 +37,11 @@ def with_outliers(targets, fraction, by):
     return targets
 
 
+def fit(values, targets):
+    """The fit of one frame."""
+    return fit_scale_offset([(values, targets)])[0]
+
+
 def least_absolute_deviations(values, targets):
     """(a, b) that minimise Σ |a · values + b − targets|, by linear programming."""
     x, y, num = values.double().numpy(), targets.double().numpy(), len(values)
@@ -55,13 +61,13 @@ def total_error(alignment, values, targets):
 
 
 def test_exact_samples_give_their_scale_and_offset():
-    assert error(fit_scale_offset(*samples()), ALIGNMENT) < 1e-6
+    assert error(fit(*samples()), ALIGNMENT) < 1e-6
 
 
 @pytest.mark.parametrize(("fraction", "by"), [(0.1, 1000.0), (0.2, 5.0), (0.2, -5.0), (0.3, 1.0), (0.3, -1.0)])
 def test_outliers_do_not_count(fraction, by):
     values, targets = samples()
-    assert error(fit_scale_offset(values, with_outliers(targets, fraction, by)), ALIGNMENT) < 1e-3
+    assert error(fit(values, with_outliers(targets, fraction, by)), ALIGNMENT) < 1e-3
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.3])
@@ -69,13 +75,13 @@ def test_noisy_samples_are_fitted_with_the_minimum_absolute_error(fraction):
     values, targets = samples(noise=0.05)
     targets = with_outliers(targets, fraction, 3.0)
     best = total_error(least_absolute_deviations(values, targets), values, targets)
-    assert total_error(fit_scale_offset(values, targets), values, targets) < 1.001 * best
+    assert total_error(fit(values, targets), values, targets) < 1.001 * best
 
 
 def test_the_fit_scales_with_the_units_of_values_and_targets():
     values, targets = samples(noise=0.05)
-    a, b = fit_scale_offset(values, targets)
-    scaled = fit_scale_offset(100.0 * values, 0.01 * targets)
+    a, b = fit(values, targets)
+    scaled = fit(100.0 * values, 0.01 * targets)
     assert relative_error(scaled, torch.stack([1e-4 * a, 0.01 * b])) < 1e-4
 
 
@@ -83,36 +89,48 @@ def test_the_fit_scales_with_the_units_of_values_and_targets():
 def test_an_offset_far_from_zero_is_found(far):
     values, _ = samples()
     targets = SCALE * values + OFFSET
-    found = fit_scale_offset(values.double() + far, targets.double())
+    found = fit(values.double() + far, targets.double())
     assert relative_error(found, torch.tensor([SCALE, OFFSET - SCALE * far]).double()) < 1e-6
 
 
 def test_the_minimum_number_of_samples_is_enough_and_fewer_are_not():
     values, targets = samples(ENOUGH)
-    assert error(fit_scale_offset(values, targets), ALIGNMENT) < 1e-6
-    assert fit_scale_offset(values[1:], targets[1:]).isnan().all()
+    assert error(fit(values, targets), ALIGNMENT) < 1e-6
+    assert fit(values[1:], targets[1:]).isnan().all()
 
 
 def test_no_samples_give_no_alignment():
-    assert fit_scale_offset(torch.zeros(0), torch.zeros(0)).isnan().all()
+    assert fit(torch.zeros(0), torch.zeros(0)).isnan().all()
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
 def test_samples_of_one_value_give_no_alignment(value):
     _, targets = samples()
-    assert fit_scale_offset(torch.full_like(targets, value), targets).isnan().all()
+    assert fit(torch.full_like(targets, value), targets).isnan().all()
 
 
 def test_a_negative_scale_gives_no_alignment():
     values, targets = samples()
-    assert fit_scale_offset(values, -targets).isnan().all()
+    assert fit(values, -targets).isnan().all()
 
 
 @pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
 def test_a_sample_that_is_not_finite_gives_no_alignment(unknown):
     values, targets = samples()
     targets[3] = unknown
-    assert fit_scale_offset(values, targets).isnan().all()
+    assert fit(values, targets).isnan().all()
+
+
+def test_frames_are_fitted_together_as_each_alone():
+    few, (values, targets) = samples(ENOUGH - 1), samples(50, noise=0.05)
+    good = [samples(noise=0.05), (values, with_outliers(targets, 0.3, 3.0)), samples(ENOUGH)]
+    one_value, unknown, nothing = torch.ones_like(values), torch.full_like(values, torch.nan), values[:0]
+    bad = [few, (values, -targets), (one_value, targets), (unknown, targets), (values, unknown), (nothing, nothing)]
+    frames = [*good, *bad, *good]
+    found, alone = fit_scale_offset(frames), torch.stack([fit(*frame) for frame in frames])
+    assert found.isfinite().all(1).tolist() == [True] * 3 + [False] * 6 + [True] * 3
+    assert torch.equal(found.isnan(), alone.isnan())
+    assert relative_error(found[found.isfinite()], alone[alone.isfinite()]) < 1e-6
 
 
 # Against points ------------------------------------------------------------------------------------------------------
@@ -120,6 +138,11 @@ def test_a_sample_that_is_not_finite_gives_no_alignment(unknown):
 
 def random_inverse_depth():
     return 0.2 + torch.rand(HEIGHT, WIDTH, generator=generator())
+
+
+def align(*sources):
+    """The alignment of one frame to points; arguments as for ``sample_points``."""
+    return align_to_points([sample_points(*sources)])[0]
 
 
 def points_behind(inverse_depth, rows, columns):
@@ -131,14 +154,14 @@ def points_behind(inverse_depth, rows, columns):
 def test_points_align_the_inverse_depth_of_their_pixels():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
-    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+    assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
 def test_points_hidden_behind_other_surfaces_do_not_count():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     hidden = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 45, 5))
-    found = align_to_points(inverse_depth, EVERYWHERE, CAMERA, torch.cat([points, hidden]))
+    found = align(inverse_depth, EVERYWHERE, CAMERA, torch.cat([points, hidden]))
     assert error(found, ALIGNMENT) < 1e-3
 
 
@@ -148,7 +171,7 @@ def test_points_in_dynamic_regions_do_not_count():
     static[:, :25] = False
     true = points_behind(inverse_depth, range(2, 30, 3), range(26, 45, 3))
     wrong = points_behind(3.0 * inverse_depth, range(30), range(25))
-    assert error(align_to_points(inverse_depth, static, CAMERA, torch.cat([true, wrong])), ALIGNMENT) < 1e-4
+    assert error(align(inverse_depth, static, CAMERA, torch.cat([true, wrong])), ALIGNMENT) < 1e-4
 
 
 def test_points_behind_the_camera_or_outside_the_image_do_not_count():
@@ -157,27 +180,27 @@ def test_points_behind_the_camera_or_outside_the_image_do_not_count():
     behind = points_behind(-inverse_depth, range(20), range(20))
     outside = CAMERA.unproject(torch.arange(100), torch.full((100,), WIDTH + 3), torch.ones(100))
     points = torch.cat([behind, true, outside])
-    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+    assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
 def test_pixels_without_depth_do_not_count():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     inverse_depth[:15] = torch.nan
-    assert error(align_to_points(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
+    assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
 @pytest.mark.parametrize("num", [0, ENOUGH - 1])
 def test_a_frame_that_sees_too_few_points_is_not_aligned(num):
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(20), range(20))[:num]
-    assert align_to_points(inverse_depth, EVERYWHERE, CAMERA, points).isnan().all()
+    assert align(inverse_depth, EVERYWHERE, CAMERA, points).isnan().all()
 
 
 def test_a_frame_without_depth_is_not_aligned():
     points = points_behind(random_inverse_depth(), range(20), range(20))
     nothing = torch.full((HEIGHT, WIDTH), torch.nan)
-    assert align_to_points(nothing, EVERYWHERE, CAMERA, points).isnan().all()
+    assert align(nothing, EVERYWHERE, CAMERA, points).isnan().all()
 
 
 # Against a rendering -------------------------------------------------------------------------------------------------
@@ -192,7 +215,7 @@ def rendered_depth(inverse_depth):
 def test_a_rendering_aligns_inverse_depth():
     inverse_depth = random_inverse_depth()
     depth = rendered_depth(inverse_depth)
-    assert error(align_to_rendering(inverse_depth, EVERYWHERE, depth, OPAQUE), ALIGNMENT) < 1e-5
+    assert error(fit(*sample_rendering(inverse_depth, EVERYWHERE, depth, OPAQUE)), ALIGNMENT) < 1e-5
 
 
 @pytest.mark.parametrize("excluded", ["dynamic", "transparent", "unknown", "empty"])
@@ -209,12 +232,12 @@ def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(excluded)
         inverse_depth[wrong_rows] = torch.nan
     else:
         depth[wrong_rows] = 0.0
-    assert error(align_to_rendering(inverse_depth, static, depth, alpha), ALIGNMENT) < 1e-5
+    assert error(fit(*sample_rendering(inverse_depth, static, depth, alpha)), ALIGNMENT) < 1e-5
 
 
 def test_an_empty_rendering_gives_no_alignment():
     nothing = torch.zeros(HEIGHT, WIDTH)
-    assert align_to_rendering(random_inverse_depth(), EVERYWHERE, nothing, nothing).isnan().all()
+    assert fit(*sample_rendering(random_inverse_depth(), EVERYWHERE, nothing, nothing)).isnan().all()
 
 
 # Depth in scene units ------------------------------------------------------------------------------------------------
@@ -247,11 +270,12 @@ def test_errors_are_those_of_aligned_depth_and_of_a_constant():
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
     wrong = 1.1 * torch.tensor([SCALE, OFFSET])
-    found = relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, wrong)
+    samples = sample_points(inverse_depth, EVERYWHERE, CAMERA, points)
+    found = relative_errors(samples, wrong)
     z = CAMERA.project(points)[2]
     assert error(found[0], torch.tensor(0.1)) < 1e-4
     assert error(found[1], ((1.0 / z).median() * z - 1.0).abs().median()) < 1e-5
-    assert error(relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, ALIGNMENT)[0], torch.tensor(0.0)) < 1e-4
+    assert error(relative_errors(samples, ALIGNMENT)[0], torch.tensor(0.0)) < 1e-4
 
 
 def test_errors_of_points_in_dynamic_regions_do_not_count():
@@ -260,7 +284,7 @@ def test_errors_of_points_in_dynamic_regions_do_not_count():
     static[:, :25] = False
     points = points_behind(inverse_depth, range(2, 30, 3), range(27, 45, 4))
     wrong = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 25, 5))
-    found = relative_errors(inverse_depth, static, CAMERA, torch.cat([points, wrong]), ALIGNMENT)
+    found = relative_errors(sample_points(inverse_depth, static, CAMERA, torch.cat([points, wrong])), ALIGNMENT)
     assert found[0] < 1e-4
 
 
@@ -268,7 +292,7 @@ def test_errors_of_points_in_dynamic_regions_do_not_count():
 def test_errors_are_infinite_without_points_or_alignment(alignment):
     inverse_depth = random_inverse_depth()
     points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))[: 0 if alignment.isfinite().all() else None]
-    assert relative_errors(inverse_depth, EVERYWHERE, CAMERA, points, alignment).isinf().all()
+    assert relative_errors(sample_points(inverse_depth, EVERYWHERE, CAMERA, points), alignment).isinf().all()
 
 
 @pytest.mark.parametrize(
@@ -288,8 +312,6 @@ def test_depth_is_unusable_if_it_is_wrong_and_hardly_better_than_a_constant(dept
 
 # The smooth factor ---------------------------------------------------------------------------------------------------
 
-IDENTITY = torch.tensor([1.0, 0.0])
-
 
 def dense_points(depth, every=2):
     """Points of the scene at every second pixel of a depth image."""
@@ -307,8 +329,14 @@ def slanted():
     return torch.linspace(2.0, 4.0, WIDTH).expand(HEIGHT, WIDTH)
 
 
+def fitted_factor(inverse_depth, static=EVERYWHERE, points=None):
+    """The factor of inverse depth that needs no alignment, and the error that is left; by default at slanted points."""
+    points = dense_points(slanted()) if points is None else points
+    return smooth_factor(sample_points(inverse_depth, static, CAMERA, points), torch.tensor([1.0, 0.0]))
+
+
 def test_a_smooth_error_is_divided_out():
-    factor, left = smooth_factor(bumps() / slanted(), EVERYWHERE, CAMERA, dense_points(slanted()), IDENTITY)
+    factor, left = fitted_factor(bumps() / slanted())
     assert (factor * bumps() - 1.0).abs().median() < 0.005
     assert left < 0.01
 
@@ -318,23 +346,22 @@ def test_outliers_hardly_change_the_factor():
     points = dense_points(depth)
     hidden = torch.rand(len(points), generator=generator()) < 0.1
     points[hidden] = CAMERA.position + 2.0 * (points[hidden] - CAMERA.position)  # behind a surface
-    factor, _ = smooth_factor(bumps() / depth, EVERYWHERE, CAMERA, points, IDENTITY)
+    factor, _ = fitted_factor(bumps() / depth, points=points)
     assert (factor * bumps() - 1.0).abs().median() < 0.01
 
 
 def test_the_error_of_noise_is_left():
     noise = torch.exp(torch.randn(HEIGHT, WIDTH, generator=generator()))
-    _, left = smooth_factor(noise / slanted(), EVERYWHERE, CAMERA, dense_points(slanted()), IDENTITY)
+    _, left = fitted_factor(noise / slanted())
     assert left > 0.3
 
 
 def test_far_from_points_and_with_few_points_the_factor_is_1():
     static = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     static[:, : WIDTH // 3] = True
-    arguments = CAMERA, dense_points(slanted()), IDENTITY
-    factor, _ = smooth_factor(1.2 / slanted(), static, *arguments)
+    factor, _ = fitted_factor(1.2 / slanted(), static)
     assert (factor[:, : WIDTH // 4] * 1.2 - 1.0).abs().max() < 0.02
     assert error(factor[:, -WIDTH // 6 :], torch.ones(HEIGHT, -(-WIDTH // 6))) < 0.01
-    factor, left = smooth_factor(1.2 / slanted(), torch.zeros_like(static), *arguments)
+    factor, left = fitted_factor(1.2 / slanted(), torch.zeros_like(static))
     assert torch.equal(factor, torch.ones(HEIGHT, WIDTH))
     assert left == torch.inf

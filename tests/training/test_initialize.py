@@ -1,6 +1,7 @@
 """Initial Gaussians: from points, and from the depth of dynamic pixels."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -540,3 +541,33 @@ def test_depth_that_a_smooth_factor_makes_no_better_stays():
     before = views[0].inverse_depth.clone()
     initialize.align_to_points(capture, views, smooth=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))
+
+
+@pytest.mark.parametrize("source", ["points", "rendering"])
+def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch, source):
+    row, column = torch.cartesian_prod(torch.arange(HEIGHT), torch.arange(WIDTH)).T
+    depth = 1.5 + 2.5 * torch.rand(HEIGHT, WIDTH, generator=generator(3))
+    capture = make_capture(CAMERA.unproject(row, column, depth.flatten()))
+    factors = {"0": 1.0, "1": torch.nan, "2": 4.0}
+
+    def read(name):
+        known = torch.arange(HEIGHT)[:, None] < 10 * (1 + int(name))  # the number of samples differs, too
+        return dataclasses.replace(
+            capture.frame(name), inverse_depth=torch.where(known, factors[name] / depth, torch.nan)
+        )
+
+    views = Views(
+        Capture("made up", capture.cameras, capture.train, [], capture.points, None, read), torch.device("cpu"), 1 << 30
+    )
+    layer = SimpleNamespace(depth=depth, alpha=torch.ones(HEIGHT, WIDTH))
+    monkeypatch.setattr(initialize, "render", lambda *_, **__: SimpleNamespace(joint=layer))
+    before = torch.full((3, 2), 7.0)
+    for most in (1, 1 << 20):
+        monkeypatch.setattr(initialize, "MAX_SAMPLES_ON_CPU", most)
+        if source == "points":
+            found, unknown = initialize.align_to_points(capture, views).alignments, torch.nan
+        else:
+            scene = initialize.initial_scene(CONFIG, capture, generator())
+            found, unknown = initialize.align_to_rendering(before, views, scene, 0), 7.0
+        expected = torch.tensor([[1.0, 0.0], [unknown, unknown], [0.25, 0.0]])
+        assert torch.allclose(found, expected, atol=2e-3, equal_nan=True)  # depth is stored in half precision

@@ -16,7 +16,15 @@ from warpgs.cameras import Camera
 from warpgs.errors import visible
 
 from .capture import MASKS_REMEDY, MIN_EXTENT, Capture, Frame
-from .depth_alignment import DepthProblem, align_to_points, alignment_problem, is_unusable, relative_errors
+from .depth_alignment import (
+    DepthProblem,
+    PointSamples,
+    align_to_points,
+    alignment_problem,
+    is_unusable,
+    relative_errors,
+    sample_points,
+)
 from .loaders import load_capture, recognize
 from .motion_check import are_comparable, motion_between
 from .sampling import evenly_spaced_indices
@@ -256,32 +264,33 @@ def _contrast_at_points(frame: Frame, points: torch.Tensor) -> float | None:
 
 def _depth(capture: Capture) -> Iterator[Finding]:
     """Aligns the depth of the sampled frames to the points as training does, and measures its error."""
-    errors, unusable, count = [], 0, 0
-    problems: Counter[DepthProblem] = Counter()
-    for name in _sampled(capture.train, SAMPLES):
-        frame = capture.frame(name)
-        if frame.inverse_depth is None:
-            continue
-        count += 1
-        everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
-        static = everywhere if frame.static_mask is None else frame.static_mask
-        sources = (frame.inverse_depth, static, frame.camera, capture.points)
-        if problem := alignment_problem(*sources, capture.metric_depth):
-            problems[problem] += 1
-            continue
-        found = relative_errors(*sources, align_to_points(*sources, capture.metric_depth))
-        if bool(found.isfinite().all()):
-            errors.append(float(found[0]))
-            unusable += int(is_unusable(found))
+    samples = list(_depth_at_points(capture))
+    count = len(samples)
+    if count == 0:
+        return
+    pairs = list(zip(samples, align_to_points(samples, capture.metric_depth), strict=True))
+    problems = Counter(problem for pair in pairs if (problem := alignment_problem(*pair)))
     for problem, number in problems.items():
         if problem != "few points" or len(capture.points):  # without points, there is a warning already
             yield Finding("warning", "depth", f"the depth of {number} of {count} frames {DEPTH_PROBLEMS[problem]}")
-    if errors:
-        median = float(np.median(errors))
+    errors = torch.stack([relative_errors(*pair) for pair in pairs])
+    known = errors.isfinite().all(1)
+    if bool(known.any()):
+        median = float(np.median(errors[known, 0]))
         kind = "metric" if capture.metric_depth else "aligned"
         yield Finding("note", "depth", f"{kind} depth is {median:.1%} off at the points (median)")
-    if unusable:
+    if unusable := int(is_unusable(errors).sum()):
         yield Finding("warning", "depth", f"the depth of {unusable} of {count} frames is hardly better than a constant")
+
+
+def _depth_at_points(capture: Capture) -> Iterator[PointSamples]:
+    """The depth of the sampled frames that have any, at the points."""
+    for name in _sampled(capture.train, SAMPLES):
+        frame = capture.frame(name)
+        if frame.inverse_depth is not None:
+            everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)
+            static = everywhere if frame.static_mask is None else frame.static_mask
+            yield sample_points(frame.inverse_depth, static, frame.camera, capture.points)
 
 
 def _motion(capture: Capture) -> Iterator[Finding]:

@@ -2,13 +2,15 @@
 paper, a smooth factor over the image, because the errors of depth networks vary smoothly (Xu et al. 2022)."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from warpgs.cameras import Camera
 from warpgs.kernels.constants import MIN_INVERSE_DEPTH
@@ -35,59 +37,77 @@ MIN_SAMPLES = 16
 """Minimum number of samples; frames with fewer are not aligned and their depth is not used."""
 
 
-def fit_scale_offset(values: Float[Tensor, " S"], targets: Float[Tensor, " S"]) -> Float[Tensor, "2"]:
-    """(a, b) that minimise Σ |a · values + b − targets|, by iteratively reweighted least squares in float64.
+def fit_scale_offset(samples: Sequence[tuple[Tensor, Tensor]]) -> Float[Tensor, "V 2"]:
+    """(a, b) per frame that minimise Σ |a · values + b − targets|, by iteratively reweighted least squares in float64.
 
     Each iteration solves the two normal equations in closed form with weights 1 / |residual|, so that outliers, such as
-    points hidden behind other surfaces, have little weight.
+    points hidden behind other surfaces, have little weight. All frames are fitted at once, because the samples of one
+    keep a GPU busy for less time than it takes to launch its kernels.
+
+    Args:
+        samples: [S] values and [S] positive targets of each of V frames, at least one; S may differ between them.
 
     Returns:
-        [2]; NaN if there are fewer than ``MIN_SAMPLES``, all samples have the same value, or a ≤ 0.
+        [V, 2]; NaN if there are fewer than ``MIN_SAMPLES``, all samples have the same value, or a ≤ 0.
     """
-    nothing = values.new_full((2,), torch.nan)
-    if values.shape[0] < MIN_SAMPLES:
-        return nothing
-    x, y = values.double(), targets.double()
-    weights = torch.ones_like(x)
-    floor = 1e-4 * y.abs().median().clamp_min(1e-12)  # keeps the weight of an exact sample finite
-    a = b = x.new_tensor(0.0)
+    values, targets = ([part.double() for part in parts] for parts in zip(*samples, strict=True))
+    ones = pad_sequence([torch.ones_like(part) for part in values], batch_first=True)
+    # Relative to medians, the variance is no small difference of large numbers. The padding is 0 in all terms.
+    x0, y0 = (torch.stack([part.median() for part in parts])[:, None] for parts in (values, targets))
+    x = ones * (pad_sequence(values, batch_first=True) - x0)
+    y = ones * (pad_sequence(targets, batch_first=True) - y0)
+    terms = torch.stack([ones, x, y, x * x, x * y], 1)
+    floors = 1e-4 * y0.abs().clamp_min(1e-12)  # keeps the weight of an exact sample finite
+    weights = ones
     for _ in range(REWEIGHTINGS):
-        total = weights.sum()
-        mean_x, mean_y = (weights * x).sum() / total, (weights * y).sum() / total
-        variance = (weights * (x - mean_x) ** 2).sum()
-        a = (weights * (x - mean_x) * (y - mean_y)).sum() / variance
-        b = mean_y - a * mean_x
-        weights = 1.0 / (a * x + b - y).abs().clamp_min(floor)
-    if not bool(torch.isfinite(a + b)) or bool(a <= 0):
-        return nothing
-    return torch.stack([a, b]).to(values.dtype)
+        total, sum_x, sum_y, sum_xx, sum_xy = (terms * weights[:, None]).sum(2, keepdim=True).unbind(1)
+        a = (total * sum_xy - sum_x * sum_y) / (total * sum_xx - sum_x**2)
+        b = (sum_y - a * sum_x) / total
+        weights = 1.0 / (a * x + b - y).abs().clamp_min(floors)
+    fitted = torch.cat([a, b + y0 - a * x0], 1)
+    is_valid = (ones.sum(1, keepdim=True) >= MIN_SAMPLES) & fitted.isfinite().all(1, keepdim=True) & (a > 0)
+    return torch.where(is_valid, fitted, torch.nan).to(samples[0][0].dtype)
 
 
-def _samples(
-    inverse_depth: Float[Tensor, "H W"], static: Tensor, camera: Camera, points: Float[Tensor, "P 3"]
-) -> tuple[Float[Tensor, " S"], Float[Tensor, " S"]]:
-    """Known inverse depth of a frame at the visible sparse points in its static region, and that of the points."""
-    row, column, z, inside = camera.project(points)
-    values = inverse_depth[row, column]
-    known = inside & values.isfinite() & static[row, column]
-    return values[known], 1.0 / z[known]
+class PointSamples(NamedTuple):
+    """Inverse depth of a frame where it is known at the visible sparse points in the static region.
+
+    Attributes:
+        row: [S] row of each point's pixel.
+        column: [S] column of each point's pixel.
+        values: [S] inverse depth of the frame.
+        depth: [S] of the points [scene units].
+        size: (H, W) of the frame [px].
+        is_known: Whether the frame's inverse depth is known at any pixel.
+    """
+
+    row: Int64[Tensor, " S"]
+    column: Int64[Tensor, " S"]
+    values: Float[Tensor, " S"]
+    depth: Float[Tensor, " S"]
+    size: torch.Size
+    is_known: Bool[Tensor, ""]
 
 
-def align_to_points(
-    inverse_depth: Float[Tensor, "H W"],
-    static: Tensor,
-    camera: Camera,
-    points: Float[Tensor, "P 3"],
-    is_metric: bool = False,
-) -> Float[Tensor, "2"]:
-    """Scale and offset that align a frame's inverse depth with the visible sparse points in its static region.
+def sample_points(
+    inverse_depth: Float[Tensor, "H W"], static: Bool[Tensor, "H W"], camera: Camera, points: Float[Tensor, "P 3"]
+) -> PointSamples:
+    """Inverse depth of a frame at the sparse points."""
+    row, column, depth, inside = camera.project(points)
+    values, is_known = inverse_depth[row, column], inverse_depth.isfinite()
+    used = (inside & is_known[row, column] & static[row, column]).nonzero()[:, 0]
+    return PointSamples(row[used], column[used], values[used], depth[used], inverse_depth.shape, is_known.any())
+
+
+def align_to_points(samples: Sequence[PointSamples], is_metric: bool = False) -> Float[Tensor, "V 2"]:
+    """Scale and offset that align each frame's inverse depth with the sparse points.
 
     Metric depth (``Capture.metric_depth``) stays as it is: (1, 0), or NaN if it is known nowhere.
     """
     if is_metric:
-        known = bool(inverse_depth.isfinite().any())
-        return inverse_depth.new_tensor([1.0, 0.0] if known else [torch.nan, torch.nan])
-    return fit_scale_offset(*_samples(inverse_depth, static, camera, points))
+        is_known = torch.stack([part.is_known for part in samples])
+        return torch.where(is_known[:, None], samples[0].values.new_tensor([1.0, 0.0]), torch.nan)
+    return fit_scale_offset([(part.values, 1.0 / part.depth) for part in samples])
 
 
 DepthProblem = Literal["unknown", "few points", "constant", "inverted"]
@@ -95,73 +115,48 @@ DepthProblem = Literal["unknown", "few points", "constant", "inverted"]
 them, or a value that grows with distance."""
 
 
-def alignment_problem(
-    inverse_depth: Float[Tensor, "H W"],
-    static: Tensor,
-    camera: Camera,
-    points: Float[Tensor, "P 3"],
-    is_metric: bool = False,
-) -> DepthProblem | None:
-    """Why ``align_to_points`` finds no alignment of a frame; None if it finds one."""
-    if not bool(inverse_depth.isfinite().any()):
+def alignment_problem(samples: PointSamples, alignment: Float[Tensor, "2"]) -> DepthProblem | None:
+    """Why ``align_to_points`` found no alignment of a frame; None if it found one."""
+    if bool(alignment.isfinite().all()):
+        return None
+    if not bool(samples.is_known):
         return "unknown"
-    if is_metric:
-        return None
-    values, targets = _samples(inverse_depth, static, camera, points)
-    if len(values) < MIN_SAMPLES:
+    if len(samples.values) < MIN_SAMPLES:
         return "few points"
-    if bool(fit_scale_offset(values, targets).isfinite().all()):
-        return None
-    return "constant" if float(values.max()) == float(values.min()) else "inverted"
+    return "constant" if float(samples.values.max()) == float(samples.values.min()) else "inverted"
 
 
-def relative_errors(
-    inverse_depth: Float[Tensor, "H W"],
-    static: Tensor,
-    camera: Camera,
-    points: Float[Tensor, "P 3"],
-    alignment: Float[Tensor, "2"],
-) -> Float[Tensor, "2"]:
-    """Median relative errors of inverse depth at the visible sparse points in the static region.
+def relative_errors(samples: PointSamples, alignment: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
+    """Median relative errors of inverse depth at the sparse points.
 
     Returns:
         [2]: that of aligned inverse depth, and, for comparison, that of the points' median everywhere. Infinite if
         there are no points, or if the alignment is NaN.
     """
-    row, column, z, inside = camera.project(points)
-    aligned = alignment[0] * inverse_depth[row, column] + alignment[1]
-    known = inside & static[row, column] & aligned.isfinite()
-    if not bool(known.any()):
-        return z.new_full((2,), torch.inf)
-    aligned, z = aligned[known], z[known]
-    return torch.stack([(aligned * z - 1.0).abs().median(), ((1.0 / z).median() * z - 1.0).abs().median()])
+    aligned, z = alignment[0] * samples.values + alignment[1], samples.depth
+    errors = torch.stack([(found * z - 1.0).abs().median() for found in (aligned, (1.0 / z).median())])
+    return torch.where(errors.isfinite().all(), errors, torch.inf)
 
 
-def smooth_factor(
-    inverse_depth: Float[Tensor, "H W"],
-    static: Tensor,
-    camera: Camera,
-    points: Float[Tensor, "P 3"],
-    alignment: Float[Tensor, "2"],
-) -> tuple[Float[Tensor, "H W"], float]:
+def smooth_factor(samples: PointSamples, alignment: Float[Tensor, "2"]) -> tuple[Float[Tensor, "H W"], float]:
     """Factor of aligned inverse depth that brings it to the sparse points, and the error that is left.
 
     Logarithms of the factors at the points are smoothed by normalized convolution (Knutsson and Westin 1993).
 
     Returns:
-        [H, W] factors, and the median relative error at one half of the points after fitting to the other half.
+        [H, W] factors on the CPU, and the median relative error at one half of the points after fitting to the other
+        half.
     """
-    row, column, z, inside = camera.project(points)
-    aligned = alignment[0] * inverse_depth[row, column] + alignment[1]
-    known = inside & static[row, column] & (aligned > MIN_INVERSE_DEPTH)
-    row, column, ratios = (t[known].cpu() for t in (row, column, -(z * aligned).log()))
+    aligned = alignment[0] * samples.values + alignment[1]
+    used = aligned > MIN_INVERSE_DEPTH
+    ratios = -(samples.depth * aligned).log()
+    row, column, ratios = (part[used].cpu() for part in (samples.row, samples.column, ratios))
     if len(ratios) < 2 * MIN_SAMPLES:
-        return torch.ones_like(inverse_depth), torch.inf
-    size = inverse_depth.shape
+        return torch.ones(samples.size), torch.inf
     even = torch.arange(len(ratios)) % 2 == 0
-    half = _smoothed(row[even], column[even], ratios[even], size)
+    half = _smoothed(row[even], column[even], ratios[even], samples.size)
     error = (half[row, column] - ratios)[~even].expm1().abs().median().item()
-    return _smoothed(row, column, ratios, size).exp().to(inverse_depth), error
+    return _smoothed(row, column, ratios, samples.size).exp(), error
 
 
 def _smoothed(
@@ -191,15 +186,15 @@ def is_unusable(errors: Float[Tensor, "*N 2"]) -> Bool[Tensor, "*N"]:
     return error.isfinite() & (error > MAX_ERROR) & (error > MAX_ERROR_OF_CONSTANT * constant_error)
 
 
-def align_to_rendering(
+def sample_rendering(
     inverse_depth: Float[Tensor, "H W"],
-    static: Tensor,
+    static: Bool[Tensor, "H W"],
     depth: Float[Tensor, "H W"],
     alpha: Float[Tensor, "H W"],
-) -> Float[Tensor, "2"]:
-    """Scale and offset that align a frame's inverse depth with the rendered depth of the static Gaussians."""
+) -> tuple[Float[Tensor, " S"], Float[Tensor, " S"]]:
+    """A frame's known inverse depth in its static region, and that of the rendered static Gaussians there."""
     known = static & inverse_depth.isfinite() & (alpha > 0.9) & (depth > 0)
-    return fit_scale_offset(inverse_depth[known], 1.0 / depth[known])
+    return inverse_depth[known], 1.0 / depth[known]
 
 
 def metric_depth(inverse_depth: Float[Tensor, "H W"], alignment: Float[Tensor, "2"]) -> Float[Tensor, "H W"]:

@@ -28,6 +28,10 @@ from .views import Views
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views from which points without colours are coloured."""
 
+MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
+"""Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
+it takes to launch its kernels."""
+
 
 def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
@@ -148,16 +152,19 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
     errors = torch.full((len(views), 2), torch.inf, device=views.device)
     points = capture.points.to(views.device)
-    for index in range(len(views)):
-        view = views[index]
-        sources = (view.inverse_depth, view.static_mask, view.camera, points)
-        alignments[index] = depth_alignment.align_to_points(*sources, capture.metric_depth)
-        errors[index] = depth_alignment.relative_errors(*sources, alignments[index])
-        if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
-            factor, error = depth_alignment.smooth_factor(*sources, alignments[index])
-            if error < errors[index, 0]:
-                views.set_depth_factor(index, alignments[index], factor)
-                errors[index, 0] = error
+    for batch in _batches(views, len(points)):
+        samples = []
+        for index in batch:
+            view = views[index]
+            samples.append(depth_alignment.sample_points(view.inverse_depth, view.static_mask, view.camera, points))
+        alignments[batch] = depth_alignment.align_to_points(samples, capture.metric_depth)
+        for index, part in zip(batch, samples, strict=True):
+            errors[index] = depth_alignment.relative_errors(part, alignments[index])
+            if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
+                factor, error = depth_alignment.smooth_factor(part, alignments[index])
+                if error < errors[index, 0]:
+                    views.set_depth_factor(index, alignments[index], factor)
+                    errors[index, 0] = error
     return DepthAlignment(alignments, errors)
 
 
@@ -168,12 +175,22 @@ def align_to_rendering(
     """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
     splats = scene.static_splats(sh_degree)
     settings = RenderSettings(depth=True, antialias=antialias)
-    found = alignments.clone()
-    for index in range(len(views)):
-        view = views[index]
-        layer = render(splats, view.camera, settings=settings).joint
-        assert layer.depth is not None
-        found[index] = depth_alignment.align_to_rendering(
-            view.inverse_depth, view.static_mask, layer.depth, layer.alpha
-        )
-    return torch.where(found.isfinite(), found, alignments)
+    found = []
+    for batch in _batches(views, views.num_pixels // len(views)):
+        samples = []
+        for index in batch:
+            view = views[index]
+            layer = render(splats, view.camera, settings=settings).joint
+            assert layer.depth is not None
+            sources = view.inverse_depth, view.static_mask, layer.depth, layer.alpha
+            samples.append(depth_alignment.sample_rendering(*sources))
+        found.append(depth_alignment.fit_scale_offset(samples))
+    aligned = torch.cat(found)
+    return torch.where(aligned.isfinite(), aligned, alignments)
+
+
+def _batches(views: Views, samples_per_view: int) -> list[list[int]]:
+    """Indices of all views, divided into those that are fitted at once."""
+    most = MAX_SAMPLES_ON_GPU if views.device.type == "cuda" else MAX_SAMPLES_ON_CPU
+    indices = torch.arange(len(views)).split(max(1, most // max(1, samples_per_view)))
+    return [batch.tolist() for batch in indices]
