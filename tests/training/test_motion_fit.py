@@ -9,7 +9,7 @@ from tests.scenes import error, generator, relative_error
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.model.fields import make_deformation
 from warpgs.training import motion_fit
-from warpgs.training.dynamic_points import DynamicPoints
+from warpgs.training.dynamic_points import DynamicPoints, to_canonical
 from warpgs.training.motion_fit import MAX_ERROR, fit_motion
 
 NUM_VIEWS, NUM_POINTS = 21, 40
@@ -217,3 +217,44 @@ def test_a_fit_is_the_same_for_the_same_random_numbers(fitted):
 def test_points_of_a_single_frame_stay_where_they_are():
     chosen = FOUND.chosen(FOUND.views == 7)
     assert error(fit(chosen, new_deformation(), 50).positions, chosen.positions) < 0.01
+
+
+class Stretched(torch.nn.Module):
+    """Doubles distances from the origin, at any time; ``given`` has the numbers of points of all calls."""
+
+    def __init__(self):
+        super().__init__()
+        self.given = []
+
+    def forward(self, points, time):
+        self.given.append(len(points))
+        return torch.cat([points, points.new_zeros(len(points), 7)], 1)
+
+
+def test_a_deformation_is_inverted_where_points_are_not_there_yet():
+    deformation = Stretched()
+    seen = torch.rand(5, 3, generator=generator()) + 0.5
+    start = torch.cat([seen[:2] / 2.0, seen[2:]])
+    found, reached = to_canonical(deformation, seen, TIMES[:1], start, 1e-3)
+    assert reached.all()
+    assert torch.equal(found[:2], start[:2])
+    assert error(found, seen / 2.0) < 1e-3
+    assert deformation.given[0] == 5
+    assert set(deformation.given[1:]) == {3}
+
+
+def test_only_the_points_that_are_searched_move():
+    deformation = Stretched()
+    seen = torch.rand(4, 3, generator=generator()) + 0.5
+    searched = torch.tensor([True, False, False, True])
+    found, reached = to_canonical(deformation, seen, TIMES[:1], seen, 1e-3, searched)
+    assert torch.equal(reached, searched)
+    assert torch.equal(found[1:3], seen[1:3])
+    assert set(deformation.given[1:]) == {2}
+
+
+def test_inverting_ends_when_all_points_are_there():
+    deformation = Stretched()
+    seen = torch.rand(4, 3, generator=generator())
+    assert to_canonical(deformation, seen, TIMES[:1], seen / 2.0, 1e-3)[1].all()
+    assert deformation.given == [4]

@@ -86,6 +86,7 @@ def to_canonical(
     time: Float[Tensor, "1"],
     start: Float[Tensor, "P 3"],
     max_error: float,
+    searched: Bool[Tensor, " P"] | None = None,
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
     """Canonical positions x that a deformation d moves to points p at a time: x + d(x, time) = p.
 
@@ -95,16 +96,22 @@ def to_canonical(
         time: [1] in [0, 1].
         start: [P, 3] positions from which each is searched, by fixed-point iteration.
         max_error: Distance from p at which a search ends [scene units].
+        searched: [P] which points are searched; the others stay where they start. All if None.
 
     Returns:
         The positions, and which of them the deformation moves to within this distance.
     """
-    found = start
-    for step in range(INVERSION_STEPS + 1):
-        missing = seen - found - deformation(found, time)[:, :3]
-        reached = missing.norm(dim=1) <= max_error
-        if step < INVERSION_STEPS:
-            found = torch.where(reached[:, None], found, found + INVERSION_RATE * missing)
+    found, reached = start.clone(), torch.zeros(len(start), dtype=torch.bool, device=start.device)
+    left = torch.arange(len(start), device=start.device)
+    missing = torch.zeros_like(start)
+    for _ in range(INVERSION_STEPS + 1):
+        found[left] += INVERSION_RATE * missing
+        missing = seen[left] - found[left] - deformation(found[left], time)[:, :3]
+        reached[left] = missing.norm(dim=1) <= max_error
+        going_on = ~reached[left] if searched is None else ~reached[left] & searched[left]
+        left, missing = left[going_on], missing[going_on]
+        if not len(left):  # mostly after the first step
+            break
     return found, reached
 
 

@@ -200,8 +200,7 @@ class _PointsByView:
                 is_shown = distances.square() <= MAX_SQUARED_DISTANCE
                 goal = seen[:, :3] * self.unit
                 start = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
-                moved, reached = to_canonical(deformation, goal, time, start, largest)
-                reached &= ~is_shown | (moved == start).all(1)
+                moved, reached = to_canonical(deformation, goal, time, start, largest, searched=~is_shown)
                 positions[part], kept[part] = moved.cpu(), reached.cpu()
         return found._replace(positions=positions).chosen(kept)
 
