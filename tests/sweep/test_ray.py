@@ -1,10 +1,12 @@
 """Sweeps on a real Ray; with ``--cluster`` on two nodes, of which one is killed in the middle."""
 
 import contextlib
+import http.server
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -90,6 +92,41 @@ def test_an_address_without_a_cluster_is_refused_at_once():
     with pytest.raises(ConnectionError, match="expected HOST:PORT"):
         RayPool("auto", None, 1, None)
     assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize("port", ["of an HTTP server", "of a node"])
+def test_what_is_not_the_head_of_a_cluster_is_refused_in_one_line(pool, capfd, port):
+    with http.server.HTTPServer(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        number = server.server_port if port == "of an HTTP server" else pool._ray.nodes()[0]["NodeManagerPort"]
+        with pytest.raises(ConnectionError, match=rf"what answers at 127\.0\.0\.1:{number} is not the head of a Ray"):
+            ray_pool._require_head(f"127.0.0.1:{number}")
+        server.shutdown()
+    assert "gcs_client" not in capfd.readouterr().err
+    ray_pool._require_head(pool._head)
+
+
+CRASH = """
+import os, time
+from warpgs.sweep import ray_pool
+from warpgs.sweep.worker import Job
+
+def crash(job):
+    os._exit(1)
+
+ray_pool.run_job = crash
+pool = ray_pool.RayPool(None, "cpu", 1, 1)
+pool.submit(Job("cell", "", "", "", (), "cpu"))
+while not pool.wait(0.2):
+    pass
+time.sleep(3)  # Ray would print from a thread of its own
+pool.close()
+"""
+
+
+def test_ray_prints_nothing_about_workers_that_died():
+    done = subprocess.run([sys.executable, "-c", CRASH], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
 def test_a_training_that_fits_on_no_node_is_refused(pool):

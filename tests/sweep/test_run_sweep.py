@@ -71,12 +71,15 @@ def sweep(tmp_path, monkeypatch, finished_run):
     return run
 
 
-def test_a_sweep_without_ray_leaves_no_folder(sweep, tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [ImportError("a sweep needs Ray"), ConnectionError("there is no Ray cluster at h:1")])
+def test_a_sweep_without_ray_is_one_line_and_leaves_no_folder(sweep, tmp_path, monkeypatch, capsys, error):
     def missing(*_):
-        raise ImportError("a sweep needs Ray")
+        raise error
 
     monkeypatch.setattr(module, "RayPool", missing)
     assert sweep()[0] == 2
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err) == ("", f"warpgs: {error}\n")
     assert not (tmp_path / "out").exists()
 
 

@@ -9,6 +9,8 @@ from warpgs.sweep.worker import Job
 class Script:
     """A pool in which the attempts at each job end as told; None is success, "lost" a lost node."""
 
+    device = "cpu"
+
     def __init__(self, ends):
         self.ends, self.queue, self.stopped = {name: list(e) for name, e in ends.items()}, [], False
 

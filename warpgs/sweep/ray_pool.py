@@ -29,6 +29,9 @@ memory, which containers seldom have in /dev/shm."""
 def _import_ray(address: str | None) -> Any:
     """Ray, which reads these variables when it is imported."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # Ray prints what happens to its workers, also to those of no training, and even without log_to_driver; the sweep
+    # reports trainings itself. Lines that match are never printed.
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
     if address is None and "ray" not in sys.modules:
         # Anyone who can connect to Ray can run code, so a local instance listens on 127.0.0.1 only. That is Ray's
         # default on macOS and Windows; this variable, meant for these two, selects it on Linux as well.
@@ -72,7 +75,7 @@ class RayPool:
 
     def _connect(self, address: str | None) -> None:
         if address is not None:
-            _probe(address)  # Ray would try for a minute and a half, and then end the program
+            _require_head(address)  # Ray would print and try for minutes, and then end the program
         logging.getLogger("ray").setLevel(logging.ERROR)
         options = {} if address else _local_options()
         try:
@@ -170,6 +173,19 @@ def _probe(address: str) -> None:
         raise ConnectionError(
             f"there is no Ray cluster at {address} (expected HOST:PORT of its head): {one_line(error)}"
         ) from error
+
+
+def _require_head(address: str) -> None:
+    """Raises ConnectionError unless the head of a Ray cluster answers at HOST:PORT."""
+    _probe(address)
+    import grpc  # comes with TensorBoard
+    from ray._private.gcs_utils import create_gcs_channel  # with the TLS and the token of the cluster
+
+    try:
+        create_gcs_channel(address).unary_unary("/ray.rpc.NodeInfoGcsService/CheckAlive")(b"", timeout=PROBE_SECONDS)
+    except grpc.RpcError as error:
+        reason = one_line(ValueError(error.details() or error.code().name))[:200]
+        raise ConnectionError(f"what answers at {address} is not the head of a Ray cluster: {reason}") from error
 
 
 def _described(node: dict[str, float]) -> str:

@@ -1,8 +1,8 @@
 """``warpgs sweep``: plan, train what is missing, write the tables."""
 
 import dataclasses
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
 from .results import tables_text, write_report, write_tables
-from .scheduler import Event, run_jobs
+from .scheduler import Event, Pool, run_jobs
 from .shared_gpu import shared_gpus
 from .spec import MAX_SEEDS, SweepSpec, read_spec
 from .table import Peers
@@ -97,14 +97,15 @@ def _check_index(out: Path, cells: list[Cell]) -> None:
 
 def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> int:
     code, stopped = 0, False
-    try:
-        if not options.tables_only:
-            _train(options, spec, board, peers, log)
-    except OSError as error:  # the cluster is gone, or there is no space for a built-in capture
-        log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
-        code = FAILED
-    except KeyboardInterrupt:
-        stopped = True
+    with _pool(options, board, log) as pool:  # outside of the try: without it, the command is refused
+        try:
+            if pool is not None:
+                _train(pool, spec, board, peers)
+        except OSError as error:  # the cluster is gone, or there is no space for a built-in capture
+            log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
+            code = FAILED
+        except KeyboardInterrupt:
+            stopped = True
     if code or stopped:
         board.stop()
     log(tables_text(spec, board, peers))  # before they are written: the disk may be full
@@ -130,21 +131,27 @@ def _shares_local_gpus(options: Sweep) -> bool:
     return torch.cuda.device_count() > 0
 
 
-def _train(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> None:
-    if not board.jobs(""):
+@contextmanager
+def _pool(options: Sweep, board: Board, log: Log) -> Iterator[Pool | None]:
+    """Where cells are trained; None if there is nothing to do."""
+    if options.tables_only or not board.jobs(""):
+        yield None
         return
+    with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
+        pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
+        try:
+            yield pool
+        finally:
+            pool.close()
 
+
+def _train(pool: Pool, spec: SweepSpec, board: Board, peers: Peers) -> None:
     def on_event(event: Event) -> None:
         board.tell(event)
         with suppress(OSError):  # a full disk, which is reported at the end, and stops no training that still runs
             write_tables(board.out, spec, board, peers)  # Ray may end this program
 
-    with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():
-        pool = RayPool(options.address, options.device, options.per_gpu, options.cpus)
-        try:
-            for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
-                builtin_folder(data)  # once, not in every cell
-            with board:
-                run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
-        finally:
-            pool.close()
+    for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
+        builtin_folder(data)  # once, not in every cell
+    with board:
+        run_jobs(pool, board.jobs(pool.device), on_event, board.poll)

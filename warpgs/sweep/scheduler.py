@@ -35,7 +35,13 @@ class ClusterGoneError(ConnectionError):
 
 @runtime_checkable
 class Pool(Protocol):
-    """Runs jobs, as many at a time as there is room for."""
+    """Runs jobs, as many at a time as there is room for.
+
+    Attributes:
+        device: Device of the trainings.
+    """
+
+    device: str
 
     def submit(self, job: Job) -> None:
         """Queues a job."""
