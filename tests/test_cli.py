@@ -119,7 +119,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         ),
         (
             ["train", "--resume", "r", "--seed", "1"],
-            "warpgs train: --resume takes all but --data, --device, --iterations and --lpips from",
+            "warpgs train: --resume takes all but --data, --device, --iterations, --lpips and --as-taken from",
         ),
     ],
 )

@@ -325,6 +325,8 @@ class TrainConfig:
     """Folder with the weights of LPIPS, for the evaluation at the end."""
     lpips_net: NetName = "vgg"
     """Network of LPIPS: vgg (3DGS), alex (DyCheck's mLPIPS) or squeeze."""
+    as_taken: bool = False
+    """Whether the evaluation at the end compares frames as they were taken, with the distortion of their lens."""
 
 
 def validate(config: TrainConfig) -> None:

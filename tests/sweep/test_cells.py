@@ -2,13 +2,21 @@
 
 import dataclasses
 import json
+import shlex
 
 import pytest
 
 from tests.data import layouts
 from warpgs.config import LossConfig, TrainConfig
 from warpgs.presets import PRESETS
-from warpgs.sweep.cells import arguments, find_scenes, finished_metrics, plan_cells
+from warpgs.sweep.cells import (
+    arguments,
+    find_scenes,
+    finished_metrics,
+    is_evaluated,
+    plan_cells,
+    without_evaluation,
+)
 from warpgs.sweep.spec import SweepSpec, Variant, read_spec
 from warpgs.training.command import parse
 
@@ -161,6 +169,33 @@ def test_an_unknown_built_in_capture_is_refused_before_anything_is_trained(tmp_p
     for data in ("builtin:synthetic", "builtin:room?depth=none"):
         with pytest.raises(ValueError, match="there is no built-in capture builtin:"):
             plan(spec(), {"s": data}, tmp_path)
+
+
+def test_cells_that_are_evaluated_in_another_way_are_trained_by_the_same_command(tmp_path):
+    commands = [
+        plan(spec(), out=tmp_path, **options)[0].command
+        for options in ({}, {"lpips": str(tmp_path / "my weights"), "lpips_net": "alex"}, {"as_taken": True})
+    ]
+    assert len(set(commands)) == 3
+    assert all(without_evaluation(command) == shlex.split(commands[0]) for command in commands)
+    [other] = plan(spec(), out=tmp_path, factor=2)
+    assert without_evaluation(other.command) != shlex.split(commands[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "metrics", "expected"),
+    [
+        ({}, {"lpips_net": None, "frames": "undistorted"}, True),
+        ({"lpips": "/weights"}, {"lpips_net": None}, False),
+        ({"lpips": "/weights"}, {"lpips_net": "vgg"}, True),
+        ({"lpips": "/weights", "lpips_net": "alex"}, {"lpips_net": "vgg"}, False),
+        ({"as_taken": True}, {"frames": "undistorted"}, False),
+        ({"as_taken": True}, {"frames": "as taken"}, True),
+    ],
+)
+def test_a_cell_is_evaluated_again_if_its_metrics_are_not_what_is_asked_for(tmp_path, options, metrics, expected):
+    [cell] = plan(spec(), out=tmp_path, **options)
+    assert is_evaluated(cell, metrics) == expected
 
 
 def test_a_cell_is_finished_once_its_last_iteration_was_evaluated(tmp_path):

@@ -183,6 +183,28 @@ def test_results_of_other_options_are_never_mixed_in(sweep, capsys):
     assert "as-full-seed0 was trained with other options" in capsys.readouterr().err
 
 
+def test_finished_cells_that_lack_what_is_asked_for_are_evaluated_again(sweep, tmp_path, capsys):
+    def evaluate(job):
+        assert job.is_trained
+        assert job.evaluation == ("--lpips", str(weights), "--as-taken")
+        path = tmp_path / "out" / job.name / "metrics.json"
+        added = {"lpips": 0.25, "lpips_net": "vgg", "frames": "as taken"}
+        path.write_text(json.dumps({**json.loads(path.read_text()), **added}))
+
+    weights = tmp_path / "weights"
+    weights.mkdir()
+    for name in ("vgg16.pth", "lpips_v0.1_vgg_lin.pth"):
+        (weights / name).touch()
+    options = ["--lpips", str(weights), "--as-taken"]
+    sweep()
+    assert sweep(*options, "--tables-only") == (0, [])
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
+    code, evaluated = sweep(*options, by=evaluate)
+    assert (code, len(evaluated)) == (0, 4)
+    assert "| full | 20.50 ± 0.71 | 0.2500 ± 0.0000 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
+    assert sweep(*options) == sweep() == (0, [])
+
+
 def test_a_cell_that_ends_without_results_has_failed(sweep, capsys):
     code, _ = sweep(by=lambda job: None)
     assert code == 1
@@ -215,7 +237,7 @@ def test_a_note_says_which_frames_were_resampled(sweep, tmp_path, capsys, undist
     assert sweep(by=finish)[0] == 0
     printed = capsys.readouterr().out
     assert note in printed
-    assert "warpgs eval RUN --as-taken" in printed
+    assert "The same sweep with --as-taken compares them as they were taken" in printed
     for name in ("table.md", "report.html"):
         assert note in (tmp_path / "out" / name).read_text()
 

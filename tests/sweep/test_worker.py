@@ -1,7 +1,9 @@
 """A cell on its node: a child process, its log, and what is reported."""
 
+import json
 import os
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -63,10 +65,18 @@ def test_a_new_cell_gets_its_arguments_and_one_that_has_begun_is_resumed(tmp_pat
     assert run_job(job(tmp_path, "--seed", "3")) is None
     (tmp_path / "cell").mkdir()
     (tmp_path / "cell/config.json").write_text("{}")
-    assert run_job(job(tmp_path, "--seed", "3")) is None
+    assert run_job(job(tmp_path, "--seed", "3")._replace(evaluation=("--as-taken",))) is None
     lines = (tmp_path / "logs/cell.log").read_text().splitlines()
-    assert lines[1] == "['--seed', '3', '--device', 'cpu']"
-    assert lines[3] == f"['--resume', '{tmp_path}/cell', '--device', 'cpu']"
+    assert lines[1] == "['train', '--seed', '3', '--device', 'cpu']"
+    assert lines[3] == f"['train', '--resume', '{tmp_path}/cell', '--as-taken', '--device', 'cpu']"
+
+
+def test_a_cell_that_is_trained_is_evaluated(tmp_path, finished_run):
+    cell = shutil.copytree(finished_run, tmp_path / "cell")
+    assert run_job(job(tmp_path)._replace(evaluation=("--as-taken",), is_trained=True)) is None
+    assert json.loads((cell / "metrics.json").read_text())["psnr"] > 0
+    log = (tmp_path / "logs/cell.log").read_text()
+    assert log.startswith(f"{HOST}: warpgs eval {cell} --as-taken --device cpu\n")
 
 
 def test_a_cell_that_is_killed_says_by_what(tmp_path, monkeypatch):
@@ -123,7 +133,7 @@ def test_a_training_ends_with_its_worker(tmp_path):
         "import os, subprocess, sys\n"
         "code = 'import os, sys, time; from warpgs.sweep import child; import warpgs.training.command as c;'\n"
         "code += 'c.main = lambda *_: (print(os.getpid(), flush=True), time.sleep(60));'\n"
-        "code += 'child.main([], int(sys.argv[1]))'\n"
+        "code += 'child.main([\"train\"], int(sys.argv[1]))'\n"
         "p = subprocess.Popen([sys.executable, '-c', code, str(os.getpid())], stdout=subprocess.PIPE)\n"
         "print(p.stdout.readline().decode(), flush=True); os._exit(0)"
     )

@@ -327,6 +327,16 @@ def test_a_finished_run_that_is_resumed_says_so(config):
     assert f"training is finished ({tiny.LENGTH} iterations), and the run is evaluated again" in "\n".join(lines)
 
 
+def test_a_run_that_is_resumed_is_evaluated_as_it_is_told_now(config, tmp_path, monkeypatch):
+    warpgs.train(config)
+    given = []
+    monkeypatch.setattr(script, "evaluate_run", lambda *arguments: given.append(arguments[2:]) or "")
+    for name in ("alexnet.pth", "lpips_v0.1_alex_lin.pth"):
+        (tmp_path / name).touch()
+    warpgs.train(TrainConfig(resume=config.out, lpips=tmp_path, lpips_net="alex", as_taken=True))
+    assert given == [((tmp_path, "alex"), "cpu", True, True)]
+
+
 def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt

@@ -50,7 +50,7 @@ TITLES = {
 }
 """Titles of metrics; others keep their names in metrics.json."""
 
-UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net"}
+UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net", "as_taken"}
 """Settings that do not affect training."""
 
 Row = tuple[str, list[Any], list[str]]

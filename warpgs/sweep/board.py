@@ -12,7 +12,7 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
-from .cells import Cell, finished_metrics
+from .cells import Cell, evaluation_arguments, finished_metrics, is_evaluated
 from .scheduler import Event
 from .worker import Job
 
@@ -32,7 +32,7 @@ class Board:
         log: Receives a line for each event if stdout is not a terminal.
 
     Attributes:
-        metrics: Results by name of the cell, of those that have finished.
+        metrics: Results by name of the cell, of those that have finished, also if they are to be evaluated again.
         errors: Last error by name of the cell.
         states: State by name of the cell: queued, running, retried, lost, failed, stopped or finished.
     """
@@ -54,7 +54,8 @@ class Board:
             metrics = finished_metrics(cell)
         except ValueError as error:
             metrics, self.errors[cell.name] = None, str(error)
-        self.states[cell.name] = "queued" if metrics is None else "finished"
+        is_done = metrics is not None and is_evaluated(cell, metrics)
+        self.states[cell.name] = "finished" if is_done else "queued"
         if metrics is not None:
             self.metrics[cell.name] = metrics
 
@@ -70,9 +71,11 @@ class Board:
                 running=str(self._running / cell.name),
                 arguments=tuple(arguments(cell.config)),
                 device=device,
+                evaluation=tuple(evaluation_arguments(cell.config)),
+                is_trained=cell.name in self.metrics,
             )
             for cell in self.cells
-            if cell.name not in self.metrics
+            if self.states[cell.name] != "finished"
         ]
 
     @property
@@ -86,7 +89,7 @@ class Board:
         if event.error is None:
             self.errors.pop(event.name, None)
             self.read(cell)
-            if event.name not in self.metrics:
+            if self.states[event.name] != "finished":
                 self.states[event.name], self.errors[event.name] = "failed", f"{cell.folder} has no results"
         else:
             self.errors[event.name] = event.error

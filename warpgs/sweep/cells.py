@@ -1,5 +1,6 @@
 """The cells of a sweep: every variant on every capture with every seed, each a run folder of its own."""
 
+import argparse
 import dataclasses
 import os
 import shlex
@@ -18,6 +19,9 @@ from warpgs.runs.config_file import parse_config
 from .spec import SweepSpec, Variant
 
 MAX_CELLS = 100_000
+
+EVALUATION = ("--lpips", "--lpips-net", "--as-taken")
+"""Options of ``warpgs train`` and ``warpgs eval`` that change how a run is evaluated, not how it is trained."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,21 @@ def arguments(config: TrainConfig) -> list[str]:
     return first + [word for words in _different("", config, PRESETS[config.preset]) for word in words]
 
 
+def evaluation_arguments(config: TrainConfig) -> list[str]:
+    """Those of the arguments that say how the run is evaluated."""
+    assert config.preset is not None
+    given = _different("", config, PRESETS[config.preset])
+    return [word for words in given if words[0] in EVALUATION for word in words]
+
+
+def without_evaluation(command: str) -> list[str]:
+    """The words of a cell's command, without those that say how it is evaluated."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in EVALUATION:
+        parser.add_argument(name, nargs="?")
+    return parser.parse_known_args(shlex.split(command))[1]
+
+
 def _different(prefix: str, config: Any, default: Any) -> Iterator[list[str]]:
     for field in dataclasses.fields(config):
         name, value, usual = field.name.replace("_", "-"), getattr(config, field.name), getattr(default, field.name)
@@ -191,6 +210,12 @@ def finished_metrics(cell: Cell) -> dict[str, Any] | None:
         return None
     metrics = read_json(path)
     return metrics if metrics.get("iterations") == cell.num_iterations else None
+
+
+def is_evaluated(cell: Cell, metrics: Mapping[str, Any]) -> bool:
+    """Whether the metrics of a finished cell have what its config asks for."""
+    has_lpips = cell.config.lpips is None or metrics.get("lpips_net") == cell.config.lpips_net
+    return has_lpips and not (cell.config.as_taken and metrics.get("frames") == "undistorted")
 
 
 def is_started(cell: Cell) -> bool:

@@ -29,7 +29,7 @@ def notes_of(board: Board) -> list[str]:
     if resampled := _resampled(board):
         notes.append(
             f"Frames of {', '.join(resampled)} were undistorted, and so resampled, before they were compared. "
-            "To compare them as taken: warpgs eval RUN --as-taken for each run, then the same sweep with --tables-only."
+            "The same sweep with --as-taken compares them as they were taken, without training again."
         )
     reasons: dict[str, list[str]] = {}
     for name, error in board.errors.items():

@@ -13,7 +13,7 @@ from warpgs.presets import PRESETS
 from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board
-from .cells import Cell, find_scenes, is_started, plan_cells
+from .cells import Cell, find_scenes, is_started, plan_cells, without_evaluation
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
@@ -78,6 +78,7 @@ def _spec(options: Sweep) -> SweepSpec:
 def _overrides(options: Sweep) -> dict[str, Any]:
     lpips = None if options.lpips is None else str(options.lpips.resolve())
     given = {"iterations": options.iterations, "factor": options.factor, "lpips": lpips, "lpips_net": options.lpips_net}
+    given["as_taken"] = options.as_taken or None
     return {name: value for name, value in given.items() if value is not None}
 
 
@@ -86,7 +87,7 @@ def _check_index(out: Path, cells: list[Cell]) -> None:
     path = out / INDEX
     known = read_json(path) if path.exists() else {}
     for cell in cells:
-        if is_started(cell) and known.get(cell.name) != cell.command:
+        if is_started(cell) and without_evaluation(known.get(cell.name, "")) != without_evaluation(cell.command):
             raise ValueError(
                 f"{cell.folder} was trained with other options ({known.get(cell.name)}): choose another --out"
             )

@@ -34,6 +34,8 @@ class Job(NamedTuple):
         running: File that exists while it runs, and holds the name of the host.
         arguments: Arguments of ``warpgs train`` for a new run.
         device: Device to train on.
+        evaluation: Options of the evaluation, for a run that has begun.
+        is_trained: Whether there is nothing to do but to evaluate it.
     """
 
     name: str
@@ -42,10 +44,12 @@ class Job(NamedTuple):
     running: str
     arguments: tuple[str, ...]
     device: str
+    evaluation: tuple[str, ...] = ()
+    is_trained: bool = False
 
 
 def run_job(job: Job) -> str | None:
-    """Trains and evaluates a cell, from its newest checkpoint if there is one.
+    """Trains and evaluates a cell, from its newest checkpoint if there is one; one that is trained is evaluated.
 
     Returns:
         None on success, else one line that names the host and says why it failed.
@@ -66,11 +70,15 @@ def run_job(job: Job) -> str | None:
 
 
 def _train(job: Job) -> str | None:
-    resumed = (Path(job.folder) / "config.json").is_file()
-    arguments = ["--resume", job.folder] if resumed else list(job.arguments)
+    if job.is_trained:
+        arguments = ["eval", job.folder, *job.evaluation]
+    elif (Path(job.folder) / "config.json").is_file():
+        arguments = ["train", "--resume", job.folder, *job.evaluation]
+    else:
+        arguments = ["train", *job.arguments]
     arguments += ["--device", job.device]
     log_path = Path(job.log)
-    _append(log_path, f"warpgs train {' '.join(arguments)}")
+    _append(log_path, f"warpgs {' '.join(arguments)}")
     with open(log_path, "ab") as log:
         command = [sys.executable, "-m", "warpgs.sweep.child", str(os.getpid()), *arguments]
         # A session of its own: Ctrl-C in the terminal reaches the sweep, which stops its cells itself.

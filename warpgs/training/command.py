@@ -14,7 +14,7 @@ ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
 )
 
-RESUMING = {"--resume", "--data", "--device", "--iterations", "--lpips", "--lpips-net", "--help"}
+RESUMING = {"--resume", "--data", "--device", "--iterations", "--lpips", "--lpips-net", "--as-taken", "--help"}
 """Options that can be given with ``--resume``."""
 
 UNFIT = 1
@@ -32,8 +32,8 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     options = {argument.split("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")}
     if "--resume" in options and (others := sorted(options - RESUMING)):
         raise ValueError(
-            "--resume takes all but --data, --device, --iterations and --lpips from the run's config.json: omit "
-            f"{others[0]}"
+            "--resume takes all but --data, --device, --iterations, --lpips and --as-taken from the run's config.json: "
+            f"omit {others[0]}"
         )
     if "--dataset" in options and not options & {"--data", "--help"}:
         raise ValueError("--dataset says how the capture of --data is read: add --data CAPTURE")

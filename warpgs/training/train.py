@@ -108,12 +108,13 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
 
 def _evaluate(trainer: Trainer, log: Log | None) -> None:
     """Evaluates what was trained and logs the results; a KeyboardInterrupt says how to evaluate later."""
-    quiet, log = log is None, log or ignore
+    quiet, log, config = log is None, log or ignore, trainer.config
+    weights = (config.lpips, config.lpips_net)  # config.json has others if they were given with --resume
     if trainer.views.poses is not None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
     try:
-        log(evaluate_run(trainer.run, capture, device=trainer.config.device, quiet=quiet))
+        log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"training is done, evaluation stopped; run it with warpgs eval {trainer.run}"
@@ -220,6 +221,8 @@ def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trai
         saved = dataclasses.replace(saved, data=config.data)
     if config.lpips is not None:
         saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
+    if config.as_taken:
+        saved = dataclasses.replace(saved, as_taken=True)
     run = Run(folder, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
     locate(run.config.lpips, run.config.lpips_net)
     capture = check_capture(run.open_capture(quiet), run.config, log)
