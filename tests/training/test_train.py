@@ -323,6 +323,7 @@ def test_a_finished_run_that_is_resumed_says_so(config):
     lines = []
     warpgs.train(config, log=lines.append)
     assert not any("is finished" in line for line in lines)
+    assert any(re.fullmatch(r"evaluating \d+ views", line) for line in lines)
     warpgs.train(TrainConfig(resume=config.out), log=lines.append)
     assert f"training is finished ({tiny.LENGTH} iterations), and the run is evaluated again" in "\n".join(lines)
 

@@ -113,6 +113,8 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     if trainer.views.poses is not None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
+    if capture.val:
+        log(f"evaluating {len(capture.val)} views")  # without a terminal, there is no progress bar for minutes
     try:
         log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
