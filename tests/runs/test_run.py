@@ -179,7 +179,7 @@ def test_a_field_of_another_type_is_refused_by_its_name(run, name, value):
 @pytest.mark.parametrize("value", ["0.5", None, True, [1.0]])
 def test_a_rate_that_is_not_a_number_is_refused(run, value):
     edit(run, lambda values: values["optim"].update(means=value))
-    with pytest.raises(ValueError, match=r"config\.json: means cannot be "):
+    with pytest.raises(ValueError, match=r"config\.json: optim.means cannot be "):
         read_config(run)
 
 

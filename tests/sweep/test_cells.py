@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shlex
+from pathlib import Path
 
 import pytest
 
@@ -22,7 +23,7 @@ from warpgs.training.command import parse
 
 
 def spec(*variants, seeds=(0,), options=None):
-    return SweepSpec("mine", "Mine", "best", seeds, (), options or {}, variants or (Variant("full", "full", {}),))
+    return SweepSpec(Path("mine"), "Mine", "best", seeds, (), options or {}, variants or (Variant("full", "full", {}),))
 
 
 def plan(spec, scenes=None, out=None, **overrides):
@@ -101,6 +102,7 @@ def test_two_cells_with_one_name_are_refused(tmp_path):
     [
         ({"iterations": "many"}, "mine: variant v: iterations cannot be 'many'"),
         ({"model": {"sh_degree": 4}}, "mine: variant v: expected model.appearance_degree <= model.sh_degree"),
+        ({"optim": {"means": "x"}}, "mine: variant v: optim.means cannot be 'x'"),
         ({"densify": {"every": 0}}, "mine: variant v: densify.every must be a number of at least 1"),
     ],
 )
@@ -130,6 +132,7 @@ def test_a_folder_of_captures_may_have_any_layout(write, tmp_path):
 
 
 def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
+    (tmp_path / "dataset.json").touch()
     assert find_scenes([f"mine={tmp_path}", "builtin:room", "b=builtin:room"]) == {
         "mine": str(tmp_path),
         "room": "builtin:room",
@@ -139,16 +142,20 @@ def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
 
 def test_two_captures_with_one_name_are_refused(tmp_path):
     first, second = tmp_path / "x/as", tmp_path / "y/as"
-    first.mkdir(parents=True)
-    second.mkdir(parents=True)
+    for root in (first, second):
+        root.mkdir(parents=True)
+        (root / "dataset.json").touch()
     message = f"two captures have the name as: {first} and {second}; name one with --data NAME={second}"
     with pytest.raises(ValueError, match=message):
         find_scenes([str(first), str(second)])
 
 
-def test_a_capture_that_does_not_exist_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"nowhere does not exist: --data takes captures and folders of captures"):
-        find_scenes([str(tmp_path / "nowhere")])
+@pytest.mark.parametrize("name", ["", "as="])
+def test_what_is_no_capture_is_refused_as_training_does(name, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for path, problem in (("nowhere", "does not exist"), ("empty", "has no dataset.json and the files of no other")):
+        with pytest.raises(ValueError, match=f"{path} {problem}"):
+            find_scenes([f"{name}{tmp_path / path}"])
 
 
 def test_a_sweep_without_captures_is_refused():

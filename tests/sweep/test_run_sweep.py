@@ -59,13 +59,15 @@ def sweep(tmp_path, monkeypatch, finished_run):
     train, trained = finish, []
     monkeypatch.setattr(module, "RayPool", Pretended)
     (tmp_path / "mine.toml").write_text(TOML)
+    (tmp_path / "as").mkdir()
+    (tmp_path / "as/dataset.json").touch()
 
     def run(*arguments, by=finish):
         nonlocal train
         train = by
         trained.clear()
-        out = ["--out", str(tmp_path / "out")]
-        return main(["sweep", str(tmp_path / "mine.toml"), "--data", "as=/nerfds/as", *out, *arguments]), list(trained)
+        options = ["--data", str(tmp_path / "as"), "--out", str(tmp_path / "out")]
+        return main(["sweep", str(tmp_path / "mine.toml"), *options, *arguments]), list(trained)
 
     run.finish = finish
     return run
@@ -89,7 +91,7 @@ def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
     assert trained == ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"]
     assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
     text = (tmp_path / "out/table.md").read_text()
-    assert f"warpgs train --preset quick --data /nerfds/as --out {tmp_path}/out/as-full-seed0 --iterations 32" in text
+    assert f"warpgs train --preset quick --data {tmp_path}/as --out {tmp_path}/out/as-full-seed0" in text
     assert r"20.50 $\pm$ 0.71" in (tmp_path / "out/table.tex").read_text()
     assert (tmp_path / "out/cells.csv").read_text().count("finished") == 4
     assert "20.50 ± 0.71" in (tmp_path / "out/report.html").read_text()
@@ -250,7 +252,16 @@ def test_frames_compared_as_they_were_taken_need_no_note(sweep, capsys):
 def test_numbers_of_others_stand_beside(sweep, tmp_path, capsys):
     (tmp_path / "peers.json").write_text(json.dumps({"D3DGS": {"as": {"psnr": 25.8}}}))
     assert sweep("--compare", str(tmp_path / "peers.json"))[0] == 0
-    assert "| D3DGS | **25.80** |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| D3DGS | **25.80** |" in printed
+    assert "warning" not in printed
+
+
+def test_numbers_of_others_on_an_unknown_capture_are_named(sweep, tmp_path, capsys):
+    path = tmp_path / "peers.json"
+    path.write_text(json.dumps({"D3DGS": {"sa": {"psnr": 25.8}, "mean": {"psnr": 24.0}}}))
+    assert sweep("--compare", str(path))[0] == 0
+    assert f"warning: {path}: the sweep has no capture sa, only as\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -267,6 +278,18 @@ def test_wrong_options_are_one_line(sweep, capsys, arguments, message):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_folder_without_weights_of_lpips_is_refused_before_anything_is_trained(sweep, tmp_path, capsys):
+    assert sweep("--lpips", str(tmp_path)) == (2, [])
+    assert f"{tmp_path} does not hold the weights of LPIPS" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_type_names_the_file_and_the_whole_option(sweep, tmp_path, capsys):
+    (tmp_path / "mine.toml").write_text("variants.a.optim.means = 'x'")
+    assert sweep() == (2, [])
+    assert capsys.readouterr().err == f"warpgs: {tmp_path}/mine.toml: variant a: optim.means cannot be 'x'\n"
 
 
 def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, tmp_path):

@@ -91,8 +91,8 @@ def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
     return config
 
 
-def _parse(cls: Any, values: Any, path: Path | str) -> Any:
-    """A (nested) dataclass from parsed JSON."""
+def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
+    """A (nested) dataclass from parsed JSON; the prefix has the names of those around it, with dots."""
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object for {cls.__name__}, got {values!r}")
     values = {RENAMED.get(name, name): value for name, value in values.items()}
@@ -103,11 +103,11 @@ def _parse(cls: Any, values: Any, path: Path | str) -> Any:
     for name, value in values.items():
         hint = hints[name]
         if dataclasses.is_dataclass(hint):
-            value = _parse(hint, value, path)
+            value = _parse(hint, value, path, f"{prefix}{name}.")
         elif Path in typing.get_args(hint) and isinstance(value, str):
             value = Path(value)
         elif not _matches(value, hint):
-            raise ValueError(f"{path}: {name} cannot be {reprlib.repr(value)}")
+            raise ValueError(f"{path}: {prefix}{name} cannot be {reprlib.repr(value)}")
         fields[name] = float(value) if hint is float else value
     return cls(**fields)
 

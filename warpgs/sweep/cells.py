@@ -67,7 +67,7 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
 
     Raises:
-        ValueError: If there is none, or two have one name; the message names both.
+        ValueError: If there is none, one is no capture, or two have one name; the message names them.
     """
     if not data:
         raise ValueError("a sweep needs captures: give them with --data")
@@ -85,17 +85,20 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
 def _named(text: str) -> Iterator[tuple[str, str]]:
     name, equals, rest = text.partition("=")
     if equals and name.replace("-", "").replace("_", "").isalnum() and not Path(text).exists():
-        yield name, rest if is_builtin(rest) else str(Path(rest).resolve())
+        yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
     elif is_builtin(text):
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
     else:
         root = Path(text).resolve()
-        inside = _captures_in(root)
-        yield from ((path.name, str(path)) for path in inside)
-        if not root.exists():
-            raise ValueError(f"{root} does not exist: --data takes captures and folders of captures")
-        if not inside:
-            yield root.name, str(root)
+        yield from ((path.name, str(path)) for path in _captures_in(root) or [_capture(root)])
+
+
+def _capture(root: Path) -> Path:
+    """The folder; raises ValueError if it is no capture, as training would."""
+    from warpgs.data.loaders import require_capture  # imports torch
+
+    require_capture(root)
+    return root
 
 
 def _captures_in(root: Path) -> list[Path]:
@@ -138,7 +141,7 @@ def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides:
 def _cell(
     spec: SweepSpec, variant: Variant, scene: str, data: str, seed: int, out: Path, overrides: Mapping[str, Any]
 ) -> Cell:
-    where = f"{spec.name}: variant {variant.name}"
+    where = f"{spec.source}: variant {variant.name}"
     if variant.query:
         if not is_builtin(data) or "?" in data:
             raise ValueError(f"{where} needs a plain built-in capture such as --data builtin:studio, got {data}")

@@ -8,6 +8,7 @@ from typing import Any
 
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.errors import FAILED, one_line
+from warpgs.evaluation.lpips import locate
 from warpgs.files import kept_if_used, read_json, write_json
 from warpgs.presets import PRESETS
 from warpgs.runs.run import LOCK, lock_folder
@@ -21,7 +22,7 @@ from .results import tables_text, write_report, write_tables
 from .scheduler import Event, Pool, run_jobs
 from .shared_gpu import shared_gpus
 from .spec import MAX_SEEDS, SweepSpec, read_spec
-from .table import Peers
+from .table import ALL_SCENES, Peers
 
 INDEX = "sweep.json"
 """File in the folder of a sweep with the command of each cell, so that results of other options are never mixed in."""
@@ -47,11 +48,17 @@ def run_sweep(options: Sweep, log: Log) -> int:
     """
     spec = _spec(options)
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
-    cells = plan_cells(spec, find_scenes(spec.data), out, _overrides(options))
+    scenes = find_scenes(spec.data)
+    cells = plan_cells(spec, scenes, out, _overrides(options))
     peers = read_peers(options.compare) if options.compare else {}
+    if unknown := sorted({scene for numbers in peers.values() for scene in numbers} - {*scenes, ALL_SCENES}):
+        log(f"warning: {options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
+    if not options.tables_only:
+        for lpips, net in {(cell.config.lpips, cell.config.lpips_net) for cell in cells}:
+            locate(lpips, net)  # reports a wrong folder now, not in every cell
     with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
         _check_index(out, cells)
         board = Board(out, cells, log)

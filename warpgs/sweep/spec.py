@@ -64,7 +64,7 @@ class SweepSpec:
     """A sweep, as its file describes it.
 
     Attributes:
-        name: Name of the file, without its ending.
+        source: The file, or the name of a sweep that ships, as it was given.
         title: Title of the tables.
         preset: Preset of every training.
         seeds: Seeds of every variant.
@@ -73,13 +73,18 @@ class SweepSpec:
         variants: In the order of the table.
     """
 
-    name: str
+    source: Path
     title: str
     preset: str
     seeds: tuple[int, ...]
     data: tuple[str, ...]
     options: Mapping[str, Any]
     variants: tuple[Variant, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the file, without its ending."""
+        return self.source.stem
 
 
 def shipped() -> list[str]:
@@ -100,10 +105,10 @@ def read_spec(name: str) -> SweepSpec:
         values = tomllib.loads(read_bounded(path, MAX_BYTES).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is not valid TOML: {error}") from error
-    return _parse(path, values)
+    return _parse(path, Path(name), values)
 
 
-def _parse(path: Path, values: dict[str, Any]) -> SweepSpec:
+def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     _check_keys(f"{path}", values, ("title", "preset", "seeds", "data", "options", "variants"))
     preset = values.get("preset", "best")
     if preset not in PRESETS:
@@ -120,7 +125,7 @@ def _parse(path: Path, values: dict[str, Any]) -> SweepSpec:
         raise ValueError(f"{path}: data must be a list of captures, got {data!r}")
     parsed = tuple(_variant(path, name, variant) for name, variant in variants.items())
     seeds = _seeds(path, values.get("seeds", 1))
-    return SweepSpec(path.stem, title, preset, seeds, tuple(data), options, parsed)
+    return SweepSpec(source, title, preset, seeds, tuple(data), options, parsed)
 
 
 def _variant(path: Path, name: str, values: Any) -> Variant:

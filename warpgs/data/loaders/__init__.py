@@ -24,7 +24,7 @@ from .nerfds import NerfDsLoader
 from .nerfstudio import NerfstudioLoader
 from .vipe import VipeLoader
 
-__all__ = ["LOADERS", "Loader", "is_capture", "load_capture", "recognize"]
+__all__ = ["LOADERS", "Loader", "is_capture", "load_capture", "recognize", "require_capture"]
 
 
 class Loader(Protocol):
@@ -86,7 +86,7 @@ def load_capture(
     check_perturbation(perturbation)
     root = builtin_folder(root) if is_builtin(root) else Path(root)
     if dataset is None:
-        _require_parts(root)
+        require_capture(root)
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
         factor = vrig_factor
@@ -98,8 +98,8 @@ def is_capture(root: Path) -> bool:
     return (root / "dataset.json").exists() or any(loader.recognizes(root) for loader in LOADERS.values())
 
 
-def _require_parts(root: Path) -> None:
-    """Refuses what has no part of a capture; if some parts are there, the loader says which are missing."""
+def require_capture(root: Path) -> None:
+    """Raises ValueError if a path has no part of a capture; if it has some, the loader says what is missing."""
     if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
         return
     if not root.exists():
