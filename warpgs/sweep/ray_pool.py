@@ -178,9 +178,11 @@ def _probe(address: str) -> None:
 def _require_head(address: str) -> None:
     """Raises ConnectionError unless the head of a Ray cluster answers at HOST:PORT."""
     _probe(address)
-    import grpc  # comes with TensorBoard
-    from ray._private.gcs_utils import create_gcs_channel  # with the TLS and the token of the cluster
-
+    try:
+        import grpc  # comes with TensorBoard
+        from ray._private.gcs_utils import create_gcs_channel  # with the TLS and the token of the cluster
+    except ImportError:  # private to Ray, so it may move; then Ray finds out, which takes it minutes
+        return
     try:
         create_gcs_channel(address).unary_unary("/ray.rpc.NodeInfoGcsService/CheckAlive")(b"", timeout=PROBE_SECONDS)
     except grpc.RpcError as error:
