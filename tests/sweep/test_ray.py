@@ -152,7 +152,7 @@ model = {position_bands = 2, time_bands = 2, depth = 2, width = 8, skip = 1, max
 dynamic_points = 20}
 loss.ssim = 0.0
 densify.max_gaussians = 120
-iterations = 150
+iterations = 600
 checkpoint_every = 10
 """
 
