@@ -116,7 +116,7 @@ PAPER = {
 """Every option of the method, by the section of the paper, or of the code that it builds upon, that sets it."""
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
-RUN |= {"lpips_net", "background"}
+RUN |= {"lpips_net", "as_taken", "background"}
 RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 
