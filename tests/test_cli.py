@@ -121,6 +121,10 @@ def test_positional_arguments_have_names(command, metavars, capsys):
             ["train", "--resume", "r", "--seed", "1"],
             "warpgs train: --resume takes all but --data, --device, --iterations, --lpips and --as-taken from",
         ),
+        (
+            ["train", "--resume", "r", "--lpips-net", "alex"],
+            "warpgs train: --lpips-net with --resume needs --lpips, the folder of its weights\n",
+        ),
     ],
 )
 def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):

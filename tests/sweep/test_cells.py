@@ -12,11 +12,12 @@ from warpgs.config import LossConfig, TrainConfig
 from warpgs.presets import PRESETS
 from warpgs.sweep.cells import (
     arguments,
+    as_evaluated_before,
     find_scenes,
     finished_metrics,
     is_evaluated,
+    parse_evaluation,
     plan_cells,
-    without_evaluation,
 )
 from warpgs.sweep.spec import SweepSpec, Variant, read_spec
 from warpgs.training.command import parse
@@ -184,9 +185,26 @@ def test_cells_that_are_evaluated_in_another_way_are_trained_by_the_same_command
         for options in ({}, {"lpips": str(tmp_path / "my weights"), "lpips_net": "alex"}, {"as_taken": True})
     ]
     assert len(set(commands)) == 3
-    assert all(without_evaluation(command) == shlex.split(commands[0]) for command in commands)
+    assert all(parse_evaluation(command)[1] == shlex.split(commands[0]) for command in commands)
     [other] = plan(spec(), out=tmp_path, factor=2)
-    assert without_evaluation(other.command) != shlex.split(commands[0])
+    assert parse_evaluation(other.command)[1] != shlex.split(commands[0])
+
+
+def test_a_cell_keeps_how_it_was_evaluated_before_unless_told_otherwise(tmp_path):
+    before = {"lpips": str(tmp_path / "weights"), "lpips_net": "alex"}
+    [measured] = plan(spec(), out=tmp_path, **before)
+    for options, expected in (
+        ({"as_taken": True}, (tmp_path / "weights", "alex", True)),
+        ({"lpips_net": "vgg"}, (tmp_path / "weights", "vgg", False)),
+        ({"lpips": str(tmp_path / "others")}, (tmp_path / "others", "alex", False)),
+    ):
+        [cell] = plan(spec(), out=tmp_path, **options)
+        config = as_evaluated_before(cell, measured.command, options).config
+        assert (config.lpips, config.lpips_net, config.as_taken) == expected
+    [cell] = plan(spec(), out=tmp_path)
+    assert as_evaluated_before(cell, "", {}) == cell
+    [taken] = plan(spec(), out=tmp_path, as_taken=True)
+    assert as_evaluated_before(cell, taken.command, {}) == taken
 
 
 @pytest.mark.parametrize(
@@ -197,6 +215,7 @@ def test_cells_that_are_evaluated_in_another_way_are_trained_by_the_same_command
         ({"lpips": "/weights"}, {"lpips_net": "vgg"}, True),
         ({"lpips": "/weights", "lpips_net": "alex"}, {"lpips_net": "vgg"}, False),
         ({"as_taken": True}, {"frames": "undistorted"}, False),
+        ({"as_taken": True}, {}, False),
         ({"as_taken": True}, {"frames": "as taken"}, True),
     ],
 )

@@ -188,23 +188,50 @@ def test_results_of_other_options_are_never_mixed_in(sweep, capsys):
 def test_finished_cells_that_lack_what_is_asked_for_are_evaluated_again(sweep, tmp_path, capsys):
     def evaluate(job):
         assert job.is_trained
-        assert job.evaluation == ("--lpips", str(weights), "--as-taken")
         path = tmp_path / "out" / job.name / "metrics.json"
-        added = {"lpips": 0.25, "lpips_net": "vgg", "frames": "as taken"}
-        path.write_text(json.dumps({**json.loads(path.read_text()), **added}))
+        lpips = {"lpips": 0.25, "lpips_net": "vgg"} if "--lpips" in job.evaluation else {}
+        frames = {"frames": "as taken" if "--as-taken" in job.evaluation else "undistorted"}
+        kept = {name: json.loads(path.read_text())[name] for name in ("psnr", "iterations", "train_seconds")}
+        path.write_text(json.dumps({**kept, **lpips, **frames}))
 
     weights = tmp_path / "weights"
     weights.mkdir()
     for name in ("vgg16.pth", "lpips_v0.1_vgg_lin.pth"):
         (weights / name).touch()
-    options = ["--lpips", str(weights), "--as-taken"]
     sweep()
-    assert sweep(*options, "--tables-only") == (0, [])
-    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
-    code, evaluated = sweep(*options, by=evaluate)
-    assert (code, len(evaluated)) == (0, 4)
-    assert "| full | 20.50 ± 0.71 | 0.2500 ± 0.0000 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
-    assert sweep(*options) == sweep() == (0, [])
+    for options in (["--lpips", str(weights)], ["--as-taken"]):  # the second one keeps LPIPS
+        capsys.readouterr()
+        code, evaluated = sweep(*options, by=evaluate)
+        assert (code, len(evaluated)) == (0, 4)
+        assert "| full | 20.50 ± 0.71 | 0.2500 ± 0.0000 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
+        assert sweep(*options) == sweep() == (0, [])
+    for text in ((tmp_path / "out/sweep.json").read_text(), (tmp_path / "out/table.md").read_text()):
+        assert text.count(f"--lpips {weights}") == text.count("--as-taken") == 4
+
+
+def test_networks_of_lpips_are_not_mixed_without_a_note(sweep, tmp_path, capsys):
+    sweep()
+    for name, net in (("as-full-seed0", "alex"), ("as-plain-seed0", "vgg")):
+        path = tmp_path / "out" / name / "metrics.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "lpips": 0.5, "lpips_net": net}))
+    capsys.readouterr()
+    sweep("--tables-only")
+    assert "LPIPS is of different networks (alex in 1, vgg in 1 trainings)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [["--lpips", "weights"], ["--lpips-net", "alex"], ["--as-taken"]])
+def test_tables_alone_evaluate_nothing(sweep, capsys, options):
+    sweep()
+    assert sweep("--tables-only", *options) == (2, [])
+    assert "--tables-only evaluates nothing" in capsys.readouterr().err
+
+
+def test_weights_in_the_environment_are_checked_only_if_needed(sweep, monkeypatch, tmp_path, capsys):
+    sweep()
+    monkeypatch.setenv("WARPGS_LPIPS", str(tmp_path / "nowhere"))
+    assert sweep("--tables-only") == (0, [])
+    assert sweep() == (2, [])
+    assert f"{tmp_path}/nowhere does not hold the weights of LPIPS" in capsys.readouterr().err
 
 
 def test_a_cell_that_ends_without_results_has_failed(sweep, capsys):

@@ -345,6 +345,21 @@ def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
     monkeypatch.setattr(script, "evaluate_run", interrupted)
     with pytest.raises(KeyboardInterrupt, match=f"run it with warpgs eval {config.out}$"):
         warpgs.train(config)
+    (config.out / "alexnet.pth").touch()
+    (config.out / "lpips_v0.1_alex_lin.pth").touch()
+    given = TrainConfig(resume=config.out, lpips=config.out, lpips_net="alex", as_taken=True)
+    with pytest.raises(KeyboardInterrupt, match=f"{config.out} --lpips {config.out} --lpips-net alex --as-taken$"):
+        warpgs.train(given)
+
+
+def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
+    warpgs.train(dataclasses.replace(config, as_taken=True))
+    taken, evaluate = [], evaluate_run.evaluate
+    monkeypatch.setattr(
+        evaluate_run, "evaluate", lambda *arguments: taken.append(arguments[-1]) or evaluate(*arguments)
+    )
+    evaluate_run.evaluate_run(config.out, quiet=True)
+    assert taken == [True]
 
 
 def test_train_raises_on_an_unknown_dataset_or_model(config):

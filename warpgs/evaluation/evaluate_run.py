@@ -47,7 +47,7 @@ def evaluate_run(
         lpips: Folder with the weights of LPIPS, and its network; those of the config where None.
         device: Device to render on; CUDA if None and there is a GPU.
         quiet: Whether to hide progress bars.
-        as_taken: Whether to compare frames with the distortion of their lens.
+        as_taken: Whether to compare frames with the distortion of their lens, also if the config does not say so.
 
     Returns:
         A summary to print.
@@ -63,7 +63,8 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
-    evaluation = evaluate(scene, capture, network and network.to(scene.device), save_image, align, quiet, as_taken)
+    network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
+    evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
     write_json(folder / "metrics.json", {**trial, **values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)

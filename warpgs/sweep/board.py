@@ -74,9 +74,12 @@ class Board:
                 evaluation=tuple(evaluation_arguments(cell.config)),
                 is_trained=cell.name in self.metrics,
             )
-            for cell in self.cells
-            if self.states[cell.name] != "finished"
+            for cell in self.unfinished()
         ]
+
+    def unfinished(self) -> list[Cell]:
+        """The cells to train or to evaluate, in order."""
+        return [cell for cell in self.cells if self.states[cell.name] != "finished"]
 
     @property
     def _running(self) -> Path:

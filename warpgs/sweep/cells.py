@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from .spec import SweepSpec, Variant
 
 MAX_CELLS = 100_000
 
-EVALUATION = ("--lpips", "--lpips-net", "--as-taken")
+EVALUATION = ("lpips", "lpips_net", "as_taken")
 """Options of ``warpgs train`` and ``warpgs eval`` that change how a run is evaluated, not how it is trained."""
 
 
@@ -180,16 +180,33 @@ def arguments(config: TrainConfig) -> list[str]:
 def evaluation_arguments(config: TrainConfig) -> list[str]:
     """Those of the arguments that say how the run is evaluated."""
     assert config.preset is not None
-    given = _different("", config, PRESETS[config.preset])
-    return [word for words in given if words[0] in EVALUATION for word in words]
+    plain = dataclasses.replace(config, **{name: getattr(PRESETS[config.preset], name) for name in EVALUATION})
+    return [word for words in _different("", config, plain) for word in words]
 
 
-def without_evaluation(command: str) -> list[str]:
-    """The words of a cell's command, without those that say how it is evaluated."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in EVALUATION:
-        parser.add_argument(name, nargs="?")
-    return parser.parse_known_args(shlex.split(command))[1]
+def parse_evaluation(command: str) -> tuple[dict[str, Any], list[str]]:
+    """How a cell's command evaluates, as fields of its config, and the other words of the command."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    parser.add_argument("--lpips", type=Path)
+    parser.add_argument("--lpips-net")
+    parser.add_argument("--as-taken", action="store_true")
+    found, words = parser.parse_known_args(shlex.split(command))
+    return vars(found), words
+
+
+def as_evaluated_before(cell: Cell, command: str, given: Collection[str]) -> Cell:
+    """The cell, evaluated as its command of before says, but for the options that were given or that its file has.
+
+    Another evaluation replaces the results: without this, one with ``--as-taken`` would drop LPIPS.
+    """
+    assert cell.config.preset is not None
+    usual = PRESETS[cell.config.preset]
+    before = {
+        name: value
+        for name, value in parse_evaluation(command)[0].items()
+        if name not in given and getattr(cell.config, name) == getattr(usual, name)
+    }
+    return dataclasses.replace(cell, config=dataclasses.replace(cell.config, **before))
 
 
 def _different(prefix: str, config: Any, default: Any) -> Iterator[list[str]]:
@@ -218,7 +235,7 @@ def finished_metrics(cell: Cell) -> dict[str, Any] | None:
 def is_evaluated(cell: Cell, metrics: Mapping[str, Any]) -> bool:
     """Whether the metrics of a finished cell have what its config asks for."""
     has_lpips = cell.config.lpips is None or metrics.get("lpips_net") == cell.config.lpips_net
-    return has_lpips and not (cell.config.as_taken and metrics.get("frames") == "undistorted")
+    return has_lpips and (not cell.config.as_taken or metrics.get("frames") == "as taken")
 
 
 def is_started(cell: Cell) -> bool:

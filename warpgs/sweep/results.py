@@ -31,6 +31,10 @@ def notes_of(board: Board) -> list[str]:
             f"Frames of {', '.join(resampled)} were undistorted, and so resampled, before they were compared. "
             "The same sweep with --as-taken compares them as they were taken, without training again."
         )
+    networks = Counter(net for metrics in board.metrics.values() if (net := metrics.get("lpips_net")))
+    if len(networks) > 1:
+        numbers = ", ".join(f"{net} in {count}" for net, count in networks.items())
+        notes.append(f"LPIPS is of different networks ({numbers} trainings), whose distances cannot be compared.")
     reasons: dict[str, list[str]] = {}
     for name, error in board.errors.items():
         if board.states[name] != "finished":

@@ -1,6 +1,7 @@
 """``warpgs sweep``: plan, train what is missing, write the tables."""
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -14,7 +15,7 @@ from warpgs.presets import PRESETS
 from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board
-from .cells import Cell, find_scenes, is_started, plan_cells, without_evaluation
+from .cells import Cell, as_evaluated_before, find_scenes, is_started, parse_evaluation, plan_cells
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
@@ -48,20 +49,23 @@ def run_sweep(options: Sweep, log: Log) -> int:
     """
     spec = _spec(options)
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
-    scenes = find_scenes(spec.data)
-    cells = plan_cells(spec, scenes, out, _overrides(options))
+    scenes, overrides, known = find_scenes(spec.data), _overrides(options), _known_commands(out)
+    cells = [
+        as_evaluated_before(cell, known.get(cell.name, ""), overrides)
+        for cell in plan_cells(spec, scenes, out, overrides)
+    ]
     peers = read_peers(options.compare) if options.compare else {}
     if unknown := sorted({scene for numbers in peers.values() for scene in numbers} - {*scenes, ALL_SCENES}):
         log(f"warning: {options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
-    if not options.tables_only:
-        for lpips, net in {(cell.config.lpips, cell.config.lpips_net) for cell in cells}:
-            locate(lpips, net)  # reports a wrong folder now, not in every cell
     with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
-        _check_index(out, cells)
         board = Board(out, cells, log)
+        if not options.tables_only:
+            for lpips, net in {(cell.config.lpips, cell.config.lpips_net) for cell in board.unfinished()}:
+                locate(lpips, net)  # reports a wrong folder now, not in every cell
+        _write_index(out, cells, known)
         return _run(options, spec, board, peers, log)
 
 
@@ -70,6 +74,8 @@ def _spec(options: Sweep) -> SweepSpec:
     spec = read_spec(options.sweep)
     if options.preset is not None and options.preset not in PRESETS:
         raise ValueError(f"--preset must be one of {', '.join(PRESETS)}, got {options.preset!r}")
+    if options.tables_only and (options.lpips or options.lpips_net or options.as_taken):
+        raise ValueError("--tables-only evaluates nothing: omit --lpips, --lpips-net and --as-taken")
     for name in ("seeds", "per_gpu", "cpus"):
         value = getattr(options, name)
         if value is not None and not 1 <= value <= MAX_SEEDS:
@@ -83,24 +89,33 @@ def _spec(options: Sweep) -> SweepSpec:
 
 
 def _overrides(options: Sweep) -> dict[str, Any]:
-    lpips = None if options.lpips is None else str(options.lpips.resolve())
-    given = {"iterations": options.iterations, "factor": options.factor, "lpips": lpips, "lpips_net": options.lpips_net}
-    given["as_taken"] = options.as_taken or None
+    lpips = options.lpips or os.environ.get("WARPGS_LPIPS")  # which other nodes of a cluster do not have
+    given = {
+        "iterations": options.iterations,
+        "factor": options.factor,
+        "lpips": str(Path(lpips).resolve()) if lpips and not options.tables_only else None,
+        "lpips_net": options.lpips_net,
+        "as_taken": options.as_taken or None,
+    }
     return {name: value for name, value in given.items() if value is not None}
 
 
-def _check_index(out: Path, cells: list[Cell]) -> None:
-    """Writes the command of each cell; refuses a cell that was begun with another one."""
+def _known_commands(out: Path) -> dict[str, str]:
+    """The command of each cell when the sweep last started in this folder."""
     path = out / INDEX
-    known = read_json(path) if path.exists() else {}
+    return read_json(path) if path.exists() else {}
+
+
+def _write_index(out: Path, cells: list[Cell], known: dict[str, str]) -> None:
+    """Writes the command of each cell; refuses a cell that was begun with another one."""
     for cell in cells:
-        if is_started(cell) and without_evaluation(known.get(cell.name, "")) != without_evaluation(cell.command):
+        if is_started(cell) and parse_evaluation(known.get(cell.name, ""))[1] != parse_evaluation(cell.command)[1]:
             raise ValueError(
                 f"{cell.folder} was trained with other options ({known.get(cell.name)}): choose another --out"
             )
     commands = {**known, **{cell.name: cell.command for cell in cells}}
     if commands != known:  # else the tables can be printed where the disk is full
-        write_json(path, commands)
+        write_json(out / INDEX, commands)
 
 
 def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> int:

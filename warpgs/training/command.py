@@ -35,6 +35,8 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
             "--resume takes all but --data, --device, --iterations, --lpips and --as-taken from the run's config.json: "
             f"omit {others[0]}"
         )
+    if {"--resume", "--lpips-net"} <= options and "--lpips" not in options:
+        raise ValueError("--lpips-net with --resume needs --lpips, the folder of its weights")
     if "--dataset" in options and not options & {"--data", "--help"}:
         raise ValueError("--dataset says how the capture of --data is read: add --data CAPTURE")
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -118,9 +119,9 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     try:
         log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"training is done, evaluation stopped; run it with warpgs eval {trainer.run}"
-        ) from None
+        lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
+        command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
+        raise KeyboardInterrupt(f"training is done, evaluation stopped; run it with {shlex.join(command)}") from None
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 
 
