@@ -8,7 +8,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator, relative_error
-from tests.training.test_motion_fit import UNEVEN, fit, largest_error, new_deformation
+from tests.training.test_motion_fit import UNEVEN, fit, max_error, new_deformation
 from warpgs.model.fields import FIELDS
 from warpgs.ops.encoding import aligned
 from warpgs.ops.mlp import num_values, perceptron, split
@@ -148,7 +148,7 @@ def test_a_replayed_fit_to_points_follows_objects_through_frames_with_few_points
     canonical = fit(UNEVEN, deformation, 300, lambda: bool(asked.append(0)))
     assert (len(eager_steps), len(asked)) == (WARM_UPS + 1, 300)  # the capture calls it, too
     assert len(canonical.views) > 0.8 * len(UNEVEN.views)
-    assert largest_error(canonical, deformation) < 0.15  # they are 0.6 apart
+    assert max_error(canonical, deformation) < 0.15  # the objects are 0.6 apart
 
 
 def rounded(x):

@@ -88,8 +88,8 @@ def test_each_object_is_one_cluster_in_canonical_space(fitted):
     assert (first.mean(0) - second.mean(0)).norm() > 0.5
 
 
-def largest_error(canonical, deformation):
-    """Largest distance between the means of the deformed points of an object and where the object is."""
+def max_error(canonical, deformation):
+    """Maximum distance between the means of the deformed points of an object and where the object is."""
     errors = []
     for color, label in zip(COLORS, (0, 1), strict=True):
         points = canonical.positions[(canonical.colors == color).all(1)].to(next(deformation.parameters()).device)
@@ -101,7 +101,7 @@ def largest_error(canonical, deformation):
 
 
 def test_an_object_is_carried_along_its_own_way(fitted):
-    assert largest_error(*fitted) < 0.1  # they are 0.6 apart
+    assert max_error(*fitted) < 0.1  # the objects are 0.6 apart
 
 
 def pick_with_repetitions(points, index):
@@ -116,7 +116,7 @@ def test_objects_are_followed_through_frames_with_few_points(monkeypatch, repeat
     deformation = new_deformation()
     canonical = fit(UNEVEN, deformation)
     assert len(canonical.views) > 0.8 * len(UNEVEN.views)
-    assert largest_error(canonical, deformation) < 0.15  # they are 0.6 apart
+    assert max_error(canonical, deformation) < 0.15  # the objects are 0.6 apart
 
 
 def test_repetitions_change_neither_the_distance_of_a_view_nor_its_gradient():

@@ -12,7 +12,7 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
-from .cells import Cell, evaluation_arguments, finished_metrics, is_evaluated
+from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
 from .scheduler import Event
 from .worker import Job
 
@@ -61,8 +61,6 @@ class Board:
 
     def jobs(self, device: str) -> list[Job]:
         """What is left to do, in order."""
-        from .cells import arguments
-
         return [
             Job(
                 name=cell.name,

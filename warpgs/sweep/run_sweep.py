@@ -157,7 +157,7 @@ def _shares_local_gpus(options: Sweep) -> bool:
 @contextmanager
 def _pool(options: Sweep, board: Board, log: Log) -> Iterator[Pool | None]:
     """Where cells are trained; None if there is nothing to do."""
-    if options.tables_only or not board.jobs(""):
+    if options.tables_only or not board.unfinished():
         yield None
         return
     with shared_gpus(log) if _shares_local_gpus(options) else nullcontext():

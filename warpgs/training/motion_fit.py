@@ -191,7 +191,7 @@ class _PointsByView:
         Only what no canonical point shows is searched elsewhere: the rest would be found where another object is.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
-        largest = MAX_ERROR * self.extent
+        max_error = MAX_ERROR * self.extent
         for view, time in zip(self.views, self.times, strict=True):
             deformed = self.deformed(deformation, time)
             for part in (found.views == view).nonzero()[:, 0].split(PIXELS_PER_CHUNK):
@@ -200,7 +200,7 @@ class _PointsByView:
                 is_shown = distances.square() <= MAX_SQUARED_DISTANCE
                 goal = seen[:, :3] * self.unit
                 start = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
-                moved, reached = to_canonical(deformation, goal, time, start, largest, searched=~is_shown)
+                moved, reached = to_canonical(deformation, goal, time, start, max_error, searched=~is_shown)
                 positions[part], kept[part] = moved.cpu(), reached.cpu()
         return found._replace(positions=positions).chosen(kept)
 
