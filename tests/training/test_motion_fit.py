@@ -219,8 +219,8 @@ def test_points_of_a_single_frame_stay_where_they_are():
     assert error(fit(chosen, new_deformation(), 50).positions, chosen.positions) < 0.01
 
 
-class Stretched(torch.nn.Module):
-    """Doubles distances from the origin, at any time; ``given`` has the numbers of points of all calls."""
+class Turned(torch.nn.Module):
+    """Turns about the z axis by ``time`` half turns, as objects that tumble; ``given`` has the numbers of positions."""
 
     def __init__(self):
         super().__init__()
@@ -228,33 +228,77 @@ class Stretched(torch.nn.Module):
 
     def forward(self, points, time):
         self.given.append(len(points))
-        return torch.cat([points, points.new_zeros(len(points), 7)], 1)
+        angle = torch.pi * time[0]
+        turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).view(2, 2)
+        return torch.nn.functional.pad(points[:, :2] @ turn.T - points[:, :2], (0, 8))
 
 
-def test_a_deformation_is_inverted_where_points_are_not_there_yet():
-    deformation = Stretched()
-    seen = torch.rand(5, 3, generator=generator()) + 0.5
-    start = torch.cat([seen[:2] / 2.0, seen[2:]])
-    found, reached = to_canonical(deformation, seen, TIMES[:1], start, 1e-3)
+@pytest.mark.parametrize("time", [0.3, 0.8])
+def test_a_deformation_that_turns_is_inverted(time):
+    time, start = torch.tensor([time]), torch.rand(20, 3, generator=generator())
+    seen = start + Turned()(start, time)[:, :3]
+    found, reached = to_canonical(Turned(), seen, time, start + 0.1, 1e-3)
     assert reached.all()
-    assert torch.equal(found[:2], start[:2])
-    assert error(found, seen / 2.0) < 1e-3
-    assert deformation.given[0] == 5
-    assert set(deformation.given[1:]) == {3}
+    assert error(found, start) < 1e-3
 
 
-def test_only_the_points_that_are_searched_move():
-    deformation = Stretched()
-    seen = torch.rand(4, 3, generator=generator()) + 0.5
-    searched = torch.tensor([True, False, False, True])
-    found, reached = to_canonical(deformation, seen, TIMES[:1], seen, 1e-3, searched)
-    assert torch.equal(reached, searched)
-    assert torch.equal(found[1:3], seen[1:3])
-    assert set(deformation.given[1:]) == {2}
+def test_only_points_that_are_not_there_yet_are_searched():
+    deformation, time = Turned(), torch.tensor([0.5])
+    start = torch.rand(5, 3, generator=generator())
+    seen = start + deformation(start, time)[:, :3]
+    found, reached = to_canonical(deformation, seen, time, start + torch.tensor([0.0, 0, 0, 0.2, 0.2])[:, None], 1e-3)
+    assert reached.all()
+    assert torch.equal(found[:3], start[:3])
+    assert deformation.given[1:] == [4 * 5, 4 * 2]
 
 
-def test_inverting_ends_when_all_points_are_there():
-    deformation = Stretched()
-    seen = torch.rand(4, 3, generator=generator())
-    assert to_canonical(deformation, seen, TIMES[:1], seen / 2.0, 1e-3)[1].all()
-    assert deformation.given == [4]
+def test_points_that_cannot_be_reached_are_said_not_to_be():
+    class Flat(torch.nn.Module):
+        def forward(self, points, time):
+            return torch.nn.functional.pad(-points, (0, 7))
+
+    _, reached = to_canonical(Flat(), torch.ones(3, 3), torch.zeros(1), torch.zeros(3, 3), 1e-3)
+    assert not reached.any()
+    assert to_canonical(Flat(), torch.ones(0, 3), torch.zeros(1), torch.zeros(0, 3), 1e-3)[0].shape == (0, 3)
+
+
+def test_sides_that_no_canonical_point_shows_are_found_where_an_object_turns():
+    """Each frame shows the half of a sphere that faces the camera, and the sphere makes a turn."""
+    sphere = torch.nn.functional.normalize(torch.randn(NUM_VIEWS * 200, 3, generator=generator()), dim=1) * 0.15
+    views = torch.arange(NUM_VIEWS).repeat_interleave(200)
+    turns = [Turned()(sphere[views == view], 2.0 * TIMES[view : view + 1])[:, :3] for view in range(NUM_VIEWS)]
+    positions = sphere + torch.cat(turns)
+    facing = positions[:, 1] < 0.0
+    found = DynamicPoints(positions, torch.full_like(positions, 0.5), views, True).chosen(facing)
+    points = motion_fit._PointsByView(found, TIMES, EXTENT, torch.device("cpu"), generator())
+
+    class Known(Turned):
+        def forward(self, points, time):
+            return super().forward(points, 2.0 * time)
+
+    start = motion_fit._start_time(TIMES, torch.bincount(found.views))
+    home = Known()(points.home[:, :3] * points.unit, torch.tensor([-start]))[:, :3]
+    points.home[:, :3] += home / points.unit
+    canonical = points.canonical(Known(), found)
+    assert len(canonical.views) > 0.95 * len(found.views)
+    behind = sphere[facing][:, 1] > 0.1
+    assert len(canonical.views[canonical.positions[:, 1] > 0.1]) > 0.9 * int(behind.sum())
+
+
+@pytest.mark.parametrize(("shift", "kept"), [(0.0, [0, 1, 2]), (0.5, [2])])
+def test_where_positions_are_searched_and_how_far_from_the_canonical_point(monkeypatch, shift, kept):
+    """By half a turn: a point where the canonical point is, one beside it, and one that no canonical point shows."""
+    colors = COLORS[[0, 0, 1]]
+    seen = torch.tensor([[-0.5, 0.0, 0.0], [-0.5, -0.1, 0.0], [0.2, 0.3, 0.0]])
+    found = DynamicPoints(seen, colors, torch.full((3,), NUM_VIEWS - 1), True)
+    points = motion_fit._PointsByView(found, TIMES, EXTENT, torch.device("cpu"), generator())
+    home = torch.tensor([[0.5, 0.0, 0.0]])
+    points.home = points._features(found.chosen(torch.tensor([0]))._replace(positions=home))
+
+    def search(deformation, goal, time, start, max_error):
+        assert error(start, torch.stack([home[0], home[0], home[0] + seen[2] - seen[0]])) < 1e-6
+        return start + shift, torch.ones(3, dtype=torch.bool)
+
+    monkeypatch.setattr(motion_fit, "to_canonical", search)
+    canonical = points.canonical(Turned(), found)
+    assert error(canonical.colors, colors[kept]) == 0.0

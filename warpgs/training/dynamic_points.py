@@ -42,9 +42,9 @@ MAX_SCALE_FRACTION = 0.5
 """Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
 
 
-INVERSION_STEPS, INVERSION_RATE = 12, 0.5
-"""Fixed-point iterations with which a deformation is inverted, and the fraction of the remaining distance that each of
-them moves a point: more would not converge where nearby points move differently."""
+NEWTON_STEPS, MAX_STEP = 12, 1.5
+"""Maximum number of Newton steps with which a deformation is inverted, and the maximum length of a step relative to the
+distance that is left."""
 
 
 class DynamicPoints(NamedTuple):
@@ -86,31 +86,38 @@ def to_canonical(
     time: Float[Tensor, "1"],
     start: Float[Tensor, "P 3"],
     max_error: float,
-    searched: Bool[Tensor, " P"] | None = None,
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
     """Canonical positions x that a deformation d moves to points p at a time: x + d(x, time) = p.
+
+    Newton's method, which also follows rotations; no gradient flows to positions, so derivatives are differences.
 
     Args:
         deformation: As ``fields.FIELDS`` says.
         seen: [P, 3] the points p.
         time: [1] in [0, 1].
-        start: [P, 3] positions from which each is searched, by fixed-point iteration.
+        start: [P, 3] positions from which each is searched.
         max_error: Distance from p at which a search ends [scene units].
-        searched: [P] which points are searched; the others stay where they start. All if None.
 
     Returns:
         The positions, and which of them the deformation moves to within this distance.
     """
     found, reached = start.clone(), torch.zeros(len(start), dtype=torch.bool, device=start.device)
-    left = torch.arange(len(start), device=start.device)
-    missing = torch.zeros_like(start)
-    for _ in range(INVERSION_STEPS + 1):
-        found[left] += INVERSION_RATE * missing
-        missing = seen[left] - found[left] - deformation(found[left], time)[:, :3]
-        reached[left] = missing.norm(dim=1) <= max_error
-        going_on = ~reached[left] if searched is None else ~reached[left] & searched[left]
-        left, missing = left[going_on], missing[going_on]
-        if not len(left):  # mostly after the first step
+    left, step = torch.arange(len(start), device=start.device), torch.zeros_like(start)
+    axes, width = torch.eye(3, device=start.device)[:, None], max_error / 3.0
+    for _ in range(NEWTON_STEPS + 1):
+        found[left] += step
+        probes = torch.cat([found[left][None], found[left] + width * axes])
+        at_probes = probes + deformation(probes.flatten(0, 1), time)[:, :3].view_as(probes)
+        missing = seen[left] - at_probes[0]
+        distances = missing.norm(dim=1, keepdim=True)
+        reached[left] = distances[:, 0] <= max_error
+        derivatives = (at_probes[1:] - at_probes[0]) / width  # by axis
+        cofactors = torch.linalg.cross(derivatives.roll(-1, 0), derivatives.roll(-2, 0))
+        step = (cofactors * missing).sum(2).T / (cofactors * derivatives).sum(2)[0][:, None]  # Cramer's rule
+        step *= (MAX_STEP * distances / step.norm(dim=1, keepdim=True)).clamp_max(1.0)
+        going_on = ~reached[left]
+        left, step = left[going_on], step[going_on]
+        if not len(left):
             break
     return found, reached
 

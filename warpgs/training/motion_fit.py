@@ -44,6 +44,10 @@ points, so that each is close to its solution when it is first compared."""
 LEARNING_RATE = 1e-3
 """Rate of Adam."""
 
+MAX_STRETCH = 1.5
+"""Maximum distance of a point from the nearest canonical one, relative to that at the time when it was seen: they are
+the same where an object turns as a whole."""
+
 MAX_ERROR = 0.03
 """Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
 
@@ -188,7 +192,9 @@ class _PointsByView:
     def canonical(self, deformation: nn.Module, found: DynamicPoints) -> DynamicPoints:
         """The points that are deformed to where they were seen, each at its place beside the nearest canonical point.
 
-        Only what no canonical point shows is searched elsewhere: the rest would be found where another object is.
+        That is where the offset of this canonical point leads. Where the object turns, the place is searched from the
+        canonical point itself, and not farther from it than the point was seen, or else it might be found on another
+        object. What no canonical point shows is searched from where the offset leads.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
         max_error = MAX_ERROR * self.extent
@@ -198,10 +204,14 @@ class _PointsByView:
                 seen = self._features(found.chosen(part)).to(deformed.device)
                 distances, nearest = torch.cdist(seen, deformed).min(1)
                 is_shown = distances.square() <= MAX_SQUARED_DISTANCE
-                goal = seen[:, :3] * self.unit
-                start = goal + (self.home[nearest] - deformed[nearest])[:, :3] * self.unit
-                moved, reached = to_canonical(deformation, goal, time, start, max_error, searched=~is_shown)
-                positions[part], kept[part] = moved.cpu(), reached.cpu()
+                goal, home = seen[:, :3] * self.unit, self.home[nearest, :3] * self.unit
+                away = goal - deformed[nearest, :3] * self.unit
+                start = home + away
+                is_there = (goal - start - deformation(start, time)[:, :3]).norm(dim=1) <= max_error
+                start = torch.where((is_shown & ~is_there)[:, None], home, start)
+                moved, reached = to_canonical(deformation, goal, time, start, max_error)
+                is_near = (moved - home).norm(dim=1) <= MAX_STRETCH * away.norm(dim=1) + max_error
+                positions[part], kept[part] = moved.cpu(), (reached & (is_near | ~is_shown)).cpu()
         return found._replace(positions=positions).chosen(kept)
 
 
