@@ -10,7 +10,7 @@ from typing import Any
 from warpgs.cli import COMMANDS
 from warpgs.command_line import Option, documented
 from warpgs.config import TrainConfig
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 
 MARKER = "<!-- options -->"
 

@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 
 import warpgs
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 
 
 def main() -> None:

@@ -11,8 +11,8 @@ import torch
 
 from tests.scenes import make_camera
 from warpgs.config import LossConfig, ModelConfig, TrainConfig, scaled, validate
+from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
-from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
 from warpgs.training.fitting import fitted, fitted_bands

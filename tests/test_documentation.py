@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from tests import tiny
-from warpgs import presets
 from warpgs.cli import COMMANDS
 from warpgs.command_line import flags, parse
+from warpgs.config import presets
 from warpgs.runs.run import Run
 from warpgs.training import command as training
 

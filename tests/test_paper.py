@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests import tiny
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 from warpgs.runs import checkpoint
 
 PAPER = {

@@ -16,7 +16,7 @@ from warpgs.bench.training import measure_steps, plain_phase, random_scene
 from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.cli import main
 from warpgs.config import RenderSettings
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 from warpgs.runs.run import Run
 from warpgs.training.schedule import Protocol
 

@@ -15,10 +15,10 @@ from tests.data import captures
 from tests.data.captures import CENTER, SCALE, SIZE, edit_json, image_of, write_array, write_capture, write_json
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
+from warpgs.config.presets import PRESETS
 from warpgs.data import loaders
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import LOADERS, load_capture, recognize
-from warpgs.presets import PRESETS
 from warpgs.runs.run import open_capture
 
 DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])

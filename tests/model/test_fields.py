@@ -6,12 +6,12 @@ import torch
 from tests.reference.encoding import encode
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.config import ModelConfig
+from warpgs.config.presets import PRESETS
 from warpgs.model.appearance import AppearanceField
 from warpgs.model.fields import FIELDS, make_deformation
 from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.trunk import Trunk
-from warpgs.presets import PRESETS
 
 CENTER = torch.tensor([1.0, -2.0, 0.5])
 HALF_SIZE = torch.tensor([2.0, 2.0, 2.0])

@@ -9,10 +9,10 @@ import torch
 
 from tests.reference.sh import bases
 from tests.scenes import generator, relative_error
+from warpgs.config.presets import PRESETS
 from warpgs.model import trunk
 from warpgs.model.appearance import AppearanceField
 from warpgs.ops import mlp
-from warpgs.presets import PRESETS
 
 NUM, RESIDUAL = 1000, 0.1
 TIME = torch.tensor([0.37])

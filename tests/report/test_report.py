@@ -16,9 +16,9 @@ import pytest
 from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
-from warpgs.presets import PRESETS
 from warpgs.report.charts import HEIGHT, MAX_POINTS, MAX_VALUES, WIDTH, Series, chart
 from warpgs.report.command import Report
 from warpgs.report.evaluated_run import read_runs

@@ -10,9 +10,9 @@ import torch
 from tests import tiny
 from tests.scenes import error
 from warpgs.config import MaskPerturbation, TrainConfig, scaled
+from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
-from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_run

@@ -9,7 +9,7 @@ import pytest
 
 from tests.data import layouts
 from warpgs.config import LossConfig, TrainConfig
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 from warpgs.sweep.cells import (
     arguments,
     as_evaluated_before,

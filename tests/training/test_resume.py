@@ -13,8 +13,8 @@ import torch
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.evaluation import evaluate_run
-from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.training import command, motion_fit
 from warpgs.training import train as script

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig, scaled
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 from warpgs.training.loss_terms import TERMS
 from warpgs.training.schedule import Phase, Protocol
 

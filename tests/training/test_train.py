@@ -21,10 +21,10 @@ import warpgs
 from tests import tiny
 from warpgs import cli
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
-from warpgs.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run

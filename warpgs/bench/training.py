@@ -12,12 +12,12 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.evaluation.evaluate import frame_rate
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.presets import PRESETS
 from warpgs.runs.run import Run
 from warpgs.runtime.graphs import WARM_UPS
 from warpgs.training.losses import DepthTrust

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from warpgs.config import TrainConfig
-from warpgs.presets import PRESETS
+from warpgs.config.presets import PRESETS
 
 from .evaluated_run import EvaluatedRun
 

@@ -14,8 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from warpgs.bounds import MAX_VALUE
 from warpgs.config import ModelConfig
+from warpgs.config.bounds import MAX_VALUE
 from warpgs.files import atomic_path, require_file
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene

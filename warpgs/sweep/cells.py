@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig, scaled
+from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import is_builtin, parse_builtin
 from warpgs.files import read_json
-from warpgs.presets import PRESETS
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config
 

@@ -7,11 +7,11 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.errors import FAILED, one_line
 from warpgs.evaluation.lpips import locate
 from warpgs.files import kept_if_used, read_json, write_json
-from warpgs.presets import PRESETS
 from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.files import read_bounded
-from warpgs.presets import PRESETS
 
 if sys.version_info >= (3, 11):
     import tomllib

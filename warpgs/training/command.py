@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import tyro
 
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.errors import ending_at_once, run_command
-from warpgs.presets import PRESETS
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"

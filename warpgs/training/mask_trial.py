@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warpgs.config import TrainConfig
+from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Assumption, Capture
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
-from warpgs.presets import PRESETS
 
 from . import ranks
 from .callbacks import Progress, render_and_compare

@@ -70,7 +70,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
     """Trains and evaluates a run.
 
     ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
-    does, with ``dataclasses.replace`` and ``warpgs.presets.PRESETS``.
+    does, with ``dataclasses.replace`` and ``warpgs.config.presets.PRESETS``.
 
     SIGTERM and the first Ctrl-C let the current iteration finish and save a checkpoint; the second Ctrl-C stops at
     once.

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from .config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig
+from .options import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig
 
 PAPER = TrainConfig(
     preset="paper",
