@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from warpgs.files import write_png
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 
 def fit(target: Tensor, num: int, num_steps: int) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import warpgs
 from warpgs.files import write_png
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ import torch
 import warpgs
 from tests import tiny
 from warpgs.runs.run import Run
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -8,11 +8,11 @@ import torch
 from tests.export import scenes
 from tests.export.browser import Browser, executable
 from tests.export.test_page import start
-from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
 from warpgs.video.camera_paths import evenly_spaced
+from warpgs.visualize.images import to_bytes
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="the test needs Chromium")
 
@@ -53,7 +53,7 @@ def shown(browser, page, options):
 
 def expected(cloud):
     camera = scenes.camera(*SIZE)
-    return visualize.to_bytes(scenes.image(cloud, camera))
+    return to_bytes(scenes.image(cloud, camera))
 
 
 def psnr(a, b):
@@ -101,7 +101,7 @@ def test_an_orbited_view_matches_the_renderer(browser, page, baked):
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     assert (rotation @ rotation.T - torch.eye(3)).abs().max() < 1e-5
     camera = Camera(viewmat, scenes.camera(*SIZE).K, *SIZE)
-    assert psnr(browser.screenshot(), visualize.to_bytes(scenes.image(baked.at(0.5), camera))) > 40
+    assert psnr(browser.screenshot(), to_bytes(scenes.image(baked.at(0.5), camera))) > 40
 
 
 def test_playing_advances_time_and_the_slider_stops_it(browser, page):

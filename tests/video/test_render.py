@@ -13,13 +13,13 @@ from PIL import Image
 
 from tests import tiny
 from tests.video.test_writer import frames_of
-from warpgs import visualize
 from warpgs.cli import main
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video import frames, render_run, writer
 from warpgs.video.command import Render
+from warpgs.visualize.images import to_bytes
 
 pytestmark = pytest.mark.usefixtures("quickly")
 quickly = tiny.quickly
@@ -52,7 +52,7 @@ def images_in(tmp_path):
 
 
 def expected(scene, camera):
-    return visualize.to_bytes(scene.render(camera).joint.image)
+    return to_bytes(scene.render(camera).joint.image)
 
 
 # Images -------------------------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def test_alpha_is_grey(run, capture, scene, tmp_path):
     render(run, tmp_path, layers="alpha")
     for name, image in images_in(tmp_path).items():
         alpha = scene.render(capture.cameras[name]).joint.alpha
-        assert (image == visualize.to_bytes(alpha[..., None].expand(-1, -1, 3))).all()
+        assert (image == to_bytes(alpha[..., None].expand(-1, -1, 3))).all()
 
 
 def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):

@@ -15,7 +15,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 from . import writer
 from .bodies import Body, as_tensors, euler, even_samples

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from warpgs import visualize
 from warpgs.config import NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
@@ -17,6 +16,7 @@ from warpgs.rendering import Rendering
 from warpgs.runs.run import MASK_TRIAL, Device, Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.writer import Video
+from warpgs.visualize.images import comparison, to_bytes
 
 from .evaluate import OnView, evaluate, write_views
 from .lpips import find
@@ -78,7 +78,7 @@ def _image_writer(folder: Path, num_views: int) -> OnView:
 
     def save(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
         if index in chosen:
-            write_png(folder / "images" / f"{frame.name}.png", visualize.comparison(truth, rendering))
+            write_png(folder / "images" / f"{frame.name}.png", comparison(truth, rendering))
 
     return save
 
@@ -108,7 +108,7 @@ def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool)
             rendering = scene.render(at_time, branches=True)
             layers = (rendering.joint, rendering.static, rendering.dynamic)
             images = [layer.image for layer in layers if layer is not None]
-            video.add(visualize.to_bytes(torch.cat(images, 1)))
+            video.add(to_bytes(torch.cat(images, 1)))
 
 
 def _summary(values: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.depth_colors import depth_image
+from warpgs.visualize.depth import depth_image
 
 MAX_THUMBNAILS = 30
 COLUMNS = 6

@@ -20,7 +20,7 @@ from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.progress import progress
 from warpgs.video.encodings import ENCODINGS
 from warpgs.video.writer import Video
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 RATE = 12.0
 """Frames per second."""

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from warpgs import visualize
 from warpgs.data.images import decode
 from warpgs.evaluation.poses import alignment
 from warpgs.progress import progress
 from warpgs.runs.run import Device, Run
+from warpgs.visualize.images import CAPTION_HEIGHT, error_image, reduced, to_bytes
 
 from .evaluated_run import EvaluatedRun
 
@@ -81,9 +81,9 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
         truth = frame.image.to(scene.device).float() / 255.0
         rendering = scene.render(align(frame), branches=True)
         layers = (rendering.joint, rendering.static, rendering.dynamic)
-        shown = [visualize.to_bytes(layer.image) for layer in layers if layer is not None]
-        error = visualize.error_image(rendering.joint.image.clamp(0, 1), truth)
-        strips[name] = Strip(*map(data_uri, (visualize.to_bytes(truth), *shown, error)))
+        shown = [to_bytes(layer.image) for layer in layers if layer is not None]
+        error = error_image(rendering.joint.image.clamp(0, 1), truth)
+        strips[name] = Strip(*map(data_uri, (to_bytes(truth), *shown, error)))
     measured, newest = evaluated.metrics.get("iterations"), scene.metadata.iteration
     note = "" if measured == newest else f"the images are of iteration {newest}, the metrics of iteration {measured}"
     return Strips(strips, note)
@@ -105,14 +105,14 @@ def _read_saved(folder: Path, name: str) -> Strip | None:
         image = decode(path, cv2.IMREAD_COLOR)
     except ValueError:  # the same as without a saved image, which the page's note says
         return None
-    if image.shape[1] % PANELS or image.shape[0] <= visualize.CAPTION_HEIGHT:
+    if image.shape[1] % PANELS or image.shape[0] <= CAPTION_HEIGHT:
         return None
-    panels = np.split(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[visualize.CAPTION_HEIGHT :], PANELS, axis=1)
+    panels = np.split(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)[CAPTION_HEIGHT:], PANELS, axis=1)
     return Strip(*(data_uri(np.ascontiguousarray(panel)) for panel in panels))
 
 
 def data_uri(image: UInt8[np.ndarray, "H W 3"]) -> str:
     """An RGB image as a data URI; scaled down to ``MAX_WIDTH``."""
-    image = visualize.reduced(image, MAX_WIDTH)
+    image = reduced(image, MAX_WIDTH)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}"

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from warpgs.visualize import ERROR_RANGE
+from warpgs.visualize.images import ERROR_RANGE
 
 from .charts import Series, chart, color_of
 from .evaluated_run import EvaluatedRun

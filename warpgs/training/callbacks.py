@@ -16,7 +16,7 @@ from warpgs.errors import one_line
 from warpgs.evaluation.metrics import psnr
 from warpgs.runs import preview
 from warpgs.runs.trained import TrainedScene
-from warpgs.visualize import reduced, to_bytes
+from warpgs.visualize.images import reduced, to_bytes
 
 from .logger import Status, TrainingLogger
 

@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from warpgs import visualize
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.depth_colors import depth_bounds, depth_image
 from warpgs.progress import progress
 from warpgs.rendering import Layer, render
 from warpgs.runs.trained import TrainedScene
+from warpgs.visualize.depth import depth_bounds, depth_image
+from warpgs.visualize.images import to_bytes
 
 from . import camera_paths
 from .command import Render
@@ -41,7 +41,7 @@ def render_frames(
         if options.truth:
             truth = fitted(capture.frame(name).image.to(scene.device).float() / 255.0, camera)
             images.insert(0, torch.cat([truth, torch.ones_like(truth[..., :1])], -1) if options.transparent else truth)
-        yield visualize.to_bytes(torch.cat(images, 1))
+        yield to_bytes(torch.cat(images, 1))
 
 
 def sized(options: Render, camera: Camera) -> Camera:

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
-from warpgs.depth_colors import depth_image
 from warpgs.model.splats import Splats
 from warpgs.rendering import Layer, render
-from warpgs.visualize import to_bytes
+from warpgs.visualize.depth import depth_image
+from warpgs.visualize.images import to_bytes
 
 Image = UInt8[np.ndarray, "H W 3"]
 

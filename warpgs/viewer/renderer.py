@@ -7,7 +7,7 @@ from typing import NamedTuple
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
 from warpgs.runs.trained import TrainedScene
-from warpgs.visualize import to_bytes
+from warpgs.visualize.images import to_bytes
 
 from .layers import Image, render_layer
 from .pose import Pose, camera_of

@@ -10,7 +10,7 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video.camera_paths import focus, upward
-from warpgs.visualize import reduced
+from warpgs.visualize.images import reduced
 
 from .pose import Pose, pose_of
 

@@ -5,8 +5,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from .depth_colors import colored
-from .rendering import Rendering
+from warpgs.rendering import Rendering
+
+from .depth import colored
 
 ERROR_RANGE = 0.25
 """Mean absolute error that has the brightest colour."""

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from warpgs.depth_colors import depth_image
+from warpgs.visualize.depth import depth_image
 
 H, W = 24, 32
 
