@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from warpgs.cli import COMMANDS
-from warpgs.command_line import Option, documented
+from warpgs.command_line.parsing import Option, documented
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 

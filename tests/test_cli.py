@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from warpgs.cli import COMMANDS, TRAIN_OPTIONS, Command, main
-from warpgs.command_line import described, flags
+from warpgs.command_line.parsing import described, flags
 from warpgs.config import TrainConfig
 
 

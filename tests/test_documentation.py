@@ -14,7 +14,7 @@ import pytest
 
 from tests import tiny
 from warpgs.cli import COMMANDS
-from warpgs.command_line import flags, parse
+from warpgs.command_line.parsing import flags, parse
 from warpgs.config import presets
 from warpgs.runs.run import Run
 from warpgs.training import command as training

@@ -10,8 +10,8 @@ from unittest.mock import Mock
 import pytest
 
 import warpgs
-from warpgs import version
 from warpgs.cli import COMMANDS
+from warpgs.command_line import version
 
 HEAVY = {"torch", "warp", "cv2", "pycolmap", "viser", "scipy", "skimage", "av", "tensorboard"}
 """Packages that take longer to import than a user waits for a help text."""
@@ -62,9 +62,9 @@ def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
 
 
 def test_an_extra_comes_from_the_checkout_or_from_the_index(monkeypatch, tmp_path):
-    checkout = Path(version.__file__).parents[1]
+    checkout = Path(version.__file__).parents[2]
     assert version.install_command("viewer") == f"pip install -e '{checkout}[viewer]'"
-    monkeypatch.setattr(version, "__file__", str(tmp_path / "warpgs" / "version.py"))
+    monkeypatch.setattr(version, "__file__", str(tmp_path / "warpgs" / "command_line" / "version.py"))
     assert version.install_command("viewer") == "pip install 'warpgs[viewer]'"
 
 

@@ -58,7 +58,7 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return importlib.import_module(".version", __name__).version()
+        return importlib.import_module(".command_line.version", __name__).version()
     if name not in _HOMES:
         raise AttributeError(f"module 'warpgs' has no attribute {name!r}")
     return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

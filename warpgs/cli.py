@@ -8,8 +8,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from .command_line.version import version
 from .errors import FAILED, ending_at_once, program, run_command, visible
-from .version import version
 
 
 class Command(NamedTuple):
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name == "train":
         return train(rest, "warpgs train")
     with ending_at_once():
-        from .command_line import parse  # imports tyro
+        from .command_line.parsing import parse  # imports tyro
 
         command = COMMANDS[name].load()
     options = parse(command, rest, f"warpgs {name}")
@@ -87,7 +87,7 @@ def train(arguments: Sequence[str], prog: str) -> int:
     if "--version" in arguments:
         return main(["--version"])
     with ending_at_once(prog):
-        from .command_line import described, one_line_errors
+        from .command_line.parsing import described, one_line_errors
         from .training import command as training
 
         config = COMMANDS["train"].load()
@@ -129,7 +129,7 @@ def usage() -> str:
 def _print_completion(arguments: list[str]) -> int:
     import tyro
 
-    from .command_line import described
+    from .command_line.parsing import described
 
     commands = {name: command.load() for name, command in COMMANDS.items()}
     with contextlib.ExitStack() as stack:

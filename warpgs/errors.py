@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import ParamSpec
 
-from . import posix
+from .command_line import posix
 
 P = ParamSpec("P")
 

@@ -15,7 +15,7 @@ from tests.data.captures import edit_json
 from tests.prepare.boards import write_video
 from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs import cli
-from warpgs.command_line import flags
+from warpgs.command_line.parsing import flags
 from warpgs.errors import FAILED
 from warpgs.evaluation import evaluate_run
 from warpgs.export.writers import WRITERS

@@ -11,12 +11,12 @@ import torch
 
 from tests.prepare import boards
 from warpgs.cli import main
+from warpgs.command_line.version import install_command
 from warpgs.prepare import weights
 from warpgs.prepare.depth_anything import network_size, predict
 from warpgs.prepare.networks import load, normalized
 from warpgs.prepare.sam2 import choose_prompts, track
 from warpgs.prepare.weights import DEPTH_ANYTHING, SAM2, find_weights
-from warpgs.version import install_command
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
 

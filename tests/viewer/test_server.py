@@ -18,7 +18,7 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs
 from tests.campaign.browser import Browser
 from tests.viewer import watched
 from warpgs.cli import main
-from warpgs.version import install_command
+from warpgs.command_line.version import install_command
 from warpgs.viewer import serve, server
 from warpgs.viewer.command import View
 from warpgs.viewer.renderer import Renderer

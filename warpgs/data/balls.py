@@ -16,9 +16,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.files import write_json, write_png
 from warpgs.ops.raytrace import SPHERE, raytrace
-from warpgs.progress import progress
 
 from .bodies import Body, Color, as_tensors, euler
 from .builtin_cache import cached, content_folder

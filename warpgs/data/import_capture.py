@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.command_line.progress import progress
 from warpgs.files import complete_or_absent
-from warpgs.progress import progress
 
 from . import writer
 from .capture import Capture, Frame

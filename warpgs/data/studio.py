@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
-from warpgs.progress import progress
 from warpgs.visualize.images import to_bytes
 
 from . import writer

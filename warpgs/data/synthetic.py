@@ -13,8 +13,8 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
-from warpgs.progress import progress
 from warpgs.visualize.images import to_bytes
 
 from . import writer

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from warpgs.command_line import RunFolder
+from warpgs.command_line.parsing import RunFolder
 from warpgs.config import NetName
 from warpgs.errors import ending_at_once
 

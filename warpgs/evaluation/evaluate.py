@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture, Frame, TakenFrame
 from warpgs.files import write_text
-from warpgs.progress import progress
 from warpgs.rendering import Rendering
 
 from . import metrics

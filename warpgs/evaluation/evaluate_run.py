@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 
+from warpgs.command_line.progress import progress
 from warpgs.config import NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import read_json, write_json, write_png
-from warpgs.progress import progress
 from warpgs.rendering import Rendering
 from warpgs.runs.run import MASK_TRIAL, Device, Run
 from warpgs.runs.trained import TrainedScene

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.config import RenderSettings
-from warpgs.progress import progress
 from warpgs.rendering import render
 from warpgs.runs.trained import TrainedScene
 

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 
-from warpgs.progress import progress
+from warpgs.command_line.progress import progress
 from warpgs.video.camera_paths import evenly_spaced
 
 from .cloud import Cloud

@@ -16,8 +16,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from warpgs.command_line.progress import progress
 from warpgs.files import write_bytes
-from warpgs.progress import progress
 from warpgs.video.camera_paths import evenly_spaced
 
 from .baking import PARTS, Baked, Branch, bake, texture_bytes

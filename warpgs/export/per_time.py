@@ -4,8 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from warpgs.command_line.progress import progress
 from warpgs.files import remove_numbered
-from warpgs.progress import progress
 from warpgs.video.camera_paths import evenly_spaced
 
 from .cloud import Cloud

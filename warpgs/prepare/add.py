@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from warpgs.command_line.progress import progress
 from warpgs.config import MaskPerturbation
 from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
@@ -25,7 +26,6 @@ from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.files import read_json, write_json, write_png
-from warpgs.progress import progress
 
 from .cameras import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION

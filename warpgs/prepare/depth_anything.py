@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch.nn.functional import interpolate
 
-from warpgs.progress import progress
+from warpgs.command_line.progress import progress
 
 from .networks import load, normalized
 from .weights import DEPTH_ANYTHING

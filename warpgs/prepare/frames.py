@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
 from warpgs.files import natural_order, read_json, write_json, write_png
-from warpgs.progress import progress
 
 from .images import resize_to_side, sharpness
 from .options import MAX_FRAMES, MIN_FRAMES, Selection

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import cv2
 
-from warpgs.progress import progress
+from warpgs.command_line.progress import progress
 
 MAX_THREADS = 8
 """Maximum number of threads; more are limited by memory bandwidth."""

@@ -14,7 +14,7 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from warpgs.progress import progress
+from warpgs.command_line.progress import progress
 
 from .networks import load, normalized
 from .weights import SAM2

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
 from warpgs.files import write_png
-from warpgs.progress import progress
 
 from .cameras import Cameras
 from .contact_sheet import choose_evenly, contact_sheet, overlay_mask

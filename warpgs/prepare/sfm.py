@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpgs.command_line.progress import progress_of_steps
 from warpgs.data.colmap import parameters_of_lens
 from warpgs.data.lens import Lens
-from warpgs.progress import progress_of_steps
 
 from .cameras import Cameras, NoCamerasError
 from .options import LensModel

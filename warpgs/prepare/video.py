@@ -11,10 +11,10 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
+from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_SIDE
 from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.files import require_file
-from warpgs.progress import progress
 
 from .cuts import CutFinder
 from .images import SHARPNESS_SIDE, grey_sharpness

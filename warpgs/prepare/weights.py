@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+from warpgs.command_line.version import install_command
 from warpgs.files import read_json, require_file
-from warpgs.version import install_command
 
 MAX_BYTES = 8 << 30
 """Maximum size of a file of weights [bytes]; the largest network has a fifth of that."""

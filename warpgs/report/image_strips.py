@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from warpgs.command_line.progress import progress
 from warpgs.data.images import decode
 from warpgs.evaluation.poses import alignment
-from warpgs.progress import progress
 from warpgs.runs.run import Device, Run
 from warpgs.visualize.images import CAPTION_HEIGHT, error_image, reduced, to_bytes
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
+from warpgs.command_line.version import version
 from warpgs.errors import one_line
 from warpgs.files import write_text
-from warpgs.version import version
 
 from .command import Report
 from .evaluated_run import EvaluatedRun, read_runs

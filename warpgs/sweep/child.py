@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Sequence
 
+from warpgs.command_line.posix import end_with_parent, unblock_interrupts
 from warpgs.errors import run_command
-from warpgs.posix import end_with_parent, unblock_interrupts
 
 
 def main(arguments: Sequence[str], parent: int) -> int:
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str], parent: int) -> int:
         from warpgs.training.command import main as train
 
         return train(rest, "warpgs train")
-    from warpgs.command_line import parse
+    from warpgs.command_line.parsing import parse
     from warpgs.evaluation.command import Eval
 
     return run_command(parse(Eval, rest, "warpgs eval").run, "warpgs eval")

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
+from warpgs.command_line.version import version
 from warpgs.files import write_text
 from warpgs.report.evaluated_run import read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
 from warpgs.report.page import Gallery, page, text
 from warpgs.report.write_report import extremes, groups
-from warpgs.version import version
 
 from .cells import Cell
 from .formats import heads, texts

@@ -9,8 +9,8 @@ import warnings
 from contextlib import suppress
 from typing import Any
 
+from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
-from warpgs.version import install_command
 
 from .scheduler import ClusterGoneError, Result
 from .worker import GRACE_SECONDS, Job, run_job

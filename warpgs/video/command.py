@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from warpgs.command_line import RunFolder
+from warpgs.command_line.parsing import RunFolder
 from warpgs.errors import ending_at_once
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]

@@ -8,10 +8,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.progress import progress
 from warpgs.rendering import Layer, render
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.depth import depth_bounds, depth_image

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from warpgs.command_line import RunFolder
+from warpgs.command_line.parsing import RunFolder
+from warpgs.command_line.posix import share_free_memory
 from warpgs.errors import ending_at_once
-from warpgs.posix import share_free_memory
 
 
 @dataclass(frozen=True)

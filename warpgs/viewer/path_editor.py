@@ -11,9 +11,9 @@ from typing import Protocol, runtime_checkable
 import viser
 
 from warpgs.cameras import Camera
+from warpgs.command_line.posix import interrupt
 from warpgs.data.capture import Capture
 from warpgs.errors import one_line
-from warpgs.posix import interrupt
 from warpgs.runs.run import Run
 from warpgs.video import keyframes
 

@@ -8,9 +8,9 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 
+from warpgs.command_line.posix import lower_priority
+from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
-from warpgs.posix import lower_priority
-from warpgs.version import install_command
 
 from .command import View
 from .source import Source, open_source

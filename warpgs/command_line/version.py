@@ -15,7 +15,7 @@ def version() -> str:
 
 def install_command(extra: str) -> str:
     """How to install an extra of the package: from the checkout that it runs from, or else from the package index."""
-    checkout = Path(__file__).parents[1]
+    checkout = Path(__file__).parents[2]
     if (checkout / "pyproject.toml").exists():
         return f"pip install -e '{checkout}[{extra}]'"
     return f"pip install 'warpgs[{extra}]'"

@@ -21,7 +21,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
-from .errors import FAILED, visible
+from warpgs.errors import FAILED, visible
 
 Options = TypeVar("Options")
 

@@ -5,8 +5,8 @@ import select
 
 import rich
 
-from warpgs import progress as module
-from warpgs.progress import progress, progress_of_steps
+from warpgs.command_line import progress as module
+from warpgs.command_line.progress import progress, progress_of_steps
 
 
 def everything_on(screen) -> str:

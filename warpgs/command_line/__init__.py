@@ -1,0 +1,1 @@
+"""What all commands share: parsing of options, progress bars, the version, what only some operating systems can do."""
