@@ -11,14 +11,14 @@ from warpgs.ops.ssim import ssim
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    "errors bounds config presets files posix progress command_line version",
+    "errors command_line config files",
     "kernels",
     "runtime",
     "ops",
     "cameras",
     "model",
     "rendering",
-    "depth_colors visualize",
+    "visualize",
     "data",
     "runs",
     "video",
