@@ -7,8 +7,7 @@ import torch
 
 from tests.scenes import make_camera, make_splats
 from warpgs.config import RenderSettings
-from warpgs.evaluation import poses as evaluation_poses
-from warpgs.evaluation.poses import aligned_camera, alignment
+from warpgs.evaluation.poses import MAX_CORRECTION, aligned_camera, alignment
 from warpgs.model.poses import PoseCorrections
 from warpgs.rendering import render
 from warpgs.runs.run import Run
@@ -34,6 +33,21 @@ def test_a_camera_that_was_moved_finds_back():
     assert (image(splats, aligned) - truth).abs().mean() < 0.1 * (image(splats, moved) - truth).abs().mean()
 
 
+def test_a_part_that_is_somewhere_else_does_not_move_a_camera():
+    splats = make_splats()
+    truth = image(splats, CAMERA)
+    truth[8:18, 10:22] = 1.0
+    aligned = aligned_camera(splats, CAMERA, truth, 4.0, antialias=True)
+    assert (aligned.viewmat - CAMERA.viewmat).norm() < 0.005  # 0.31 with a quadratic loss
+
+
+@pytest.mark.parametrize("region", [None, torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)])
+def test_a_camera_stays_where_nothing_is_rendered_or_compared(region):
+    splats = dataclasses.replace(make_splats(), means=torch.full((60, 3), -5.0))
+    truth = torch.rand(CAMERA.height, CAMERA.width, 3)
+    assert torch.equal(aligned_camera(splats, CAMERA, truth, 4.0, True, region).viewmat, CAMERA.viewmat)
+
+
 def scene_and_capture(finished_run, poses):
     run = Run.open(finished_run, "cpu")
     trained = run.trained_scene()
@@ -42,18 +56,17 @@ def scene_and_capture(finished_run, poses):
 
 
 @pytest.mark.parametrize("poses", [0.0, 1e-3])
-def test_held_out_cameras_are_aligned_if_poses_were_corrected(finished_run, monkeypatch, poses):
-    monkeypatch.setattr(evaluation_poses, "ITERATIONS", 3)
+def test_held_out_cameras_are_aligned_if_poses_were_corrected(finished_run, poses):
     scene, capture = scene_and_capture(finished_run, poses)
     frame = capture.frame(capture.val[0])
     aligned = alignment(scene, capture.extent)(frame)
     assert torch.equal(aligned.viewmat, frame.camera.viewmat) == (poses == 0.0)
-    assert (aligned.viewmat - frame.camera.viewmat).abs().max() < 0.1
+    limit = 2.0 * MAX_CORRECTION * max(1.0, capture.extent)  # this scene is poor: images would lead far away
+    assert (aligned.viewmat - frame.camera.viewmat).abs().max() < limit
     assert aligned.time == frame.camera.time
 
 
-def test_pixels_that_are_not_covisible_do_not_align_a_camera(finished_run, monkeypatch):
-    monkeypatch.setattr(evaluation_poses, "ITERATIONS", 3)
+def test_pixels_that_are_not_covisible_do_not_align_a_camera(finished_run):
     scene, capture = scene_and_capture(finished_run, 1e-3)
     frame = capture.frame(capture.val[0])
     seen = torch.zeros(frame.image.shape[:2], dtype=torch.bool)

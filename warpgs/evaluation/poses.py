@@ -1,23 +1,34 @@
-"""Alignment of held-out cameras to a scene whose training poses were corrected (as in BARF, Lin et al. 2021)."""
+"""Alignment of held-out cameras to a scene whose training poses were corrected (direct image alignment)."""
 
 from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Frame
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.splats import Splats
-from warpgs.ops.adam import Adam
 from warpgs.rendering import render
 from warpgs.runs.trained import TrainedScene
 
-ITERATIONS = 100
-RATES = (3e-3, 3e-5)
-"""Learning rate of Adam at the start and at the end [rad, and fractions of the unit]; exponential in between."""
+MAX_TRIALS, MIN_GAIN = 16, 1e-3
+"""Maximum number of steps that are tried, and the minimum relative gain of the loss for which another one is."""
+
+MAX_CORRECTION = 0.05
+"""Maximum of each component of a correction [rad, and fractions of the unit]: a poor scene must not lead far away."""
+
+DIFFERENCE = 0.15
+"""Step of the derivatives of an image by the pose [px at the image's centre, for rotations]."""
+
+ROBUST_ERROR = 0.03
+"""Error of a channel, in [0, 1], beyond which the loss grows linearly: what moves may be at another place."""
+
+DAMPING, DAMPING_FACTOR = 1e-3, 10.0
+"""Initial damping of Levenberg and Marquardt, and the factor by which failures raise it and successes lower it."""
 
 
 Align = Callable[[Frame], Camera]
@@ -43,7 +54,7 @@ def alignment(scene: TrainedScene, unit: float) -> Align:
     return align
 
 
-@torch.enable_grad()
+@torch.no_grad()
 def aligned_camera(
     splats: Splats,
     camera: Camera,
@@ -52,7 +63,7 @@ def aligned_camera(
     antialias: bool,
     region: Bool[Tensor, "H W"] | None = None,
 ) -> Camera:
-    """The camera, moved by steps of Adam on the L1 distance between the rendered image and the ground truth.
+    """The camera, moved to where the rendered image is nearest to the ground truth, by the Huber loss.
 
     Corrections of training poses move and turn the scene as a whole, too, and a held-out camera cannot follow.
 
@@ -64,17 +75,58 @@ def aligned_camera(
         antialias: As in ``RenderSettings``.
         region: [H, W] the pixels that are compared; all if None.
     """
-    poses = PoseCorrections(1, unit).to(camera.viewmat.device)
-    index = torch.zeros(1, dtype=torch.int64, device=camera.viewmat.device)
-    rate = torch.tensor(RATES[0], device=camera.viewmat.device)
-    optimizer = Adam([{"params": list(poses.parameters()), "lr": rate}])
-    settings = RenderSettings(antialias=antialias)
-    for _ in range(ITERATIONS):
-        image = render(splats, poses.moved(camera, index), settings=settings).joint.image
-        optimizer.zero_grad()
-        errors = (image - truth).abs()
-        (errors if region is None else errors[region]).mean().backward()
-        optimizer.step()
-        rate *= (RATES[1] / RATES[0]) ** (1.0 / ITERATIONS)
-    with torch.no_grad():
+    settings, device = RenderSettings(antialias=antialias), camera.viewmat.device
+    poses, index = PoseCorrections(1, unit).to(device), torch.zeros(1, dtype=torch.int64, device=device)
+
+    def moved(pose: Float[Tensor, "6"]) -> Camera:
+        poses.rotations.copy_(pose[None, :3])
+        poses.translations.copy_(pose[None, 3:])
         return poses.moved(camera, index)
+
+    def errors(pose: Float[Tensor, "6"]) -> Float[Tensor, " M"]:
+        difference = render(splats, moved(pose), settings=settings).joint.image - truth
+        return (difference if region is None else difference[region]).flatten()
+
+    return moved(_minimize(errors, torch.zeros(6, device=device), DIFFERENCE / float(camera.K[0, 0])))
+
+
+Errors = Callable[[Float[Tensor, "6"]], Float[Tensor, " M"]]
+
+
+def _minimize(errors: Errors, pose: Float[Tensor, "6"], width: float) -> Float[Tensor, "6"]:
+    """The pose with the smallest Huber loss of the errors, from a pose on, by the method of Levenberg and Marquardt.
+
+    Derivatives of the errors by the pose, of which there are six, are differences over a width.
+    """
+    error, damping = errors(pose), DAMPING
+    loss = _loss(error)
+    normal, gradient = _normal_equations(errors, pose, error, width)
+    for _ in range(MAX_TRIALS):
+        # The small number keeps the matrix regular where no pixel depends on the pose.
+        damped = normal + (damping * normal.diagonal() + 1e-9).diag()
+        trial = (pose - torch.linalg.solve(damped, gradient)).clamp(-MAX_CORRECTION, MAX_CORRECTION)
+        trial_error = errors(trial)
+        trial_loss = _loss(trial_error)
+        if not trial_loss < loss:
+            damping *= DAMPING_FACTOR
+            continue
+        gain, damping = 1.0 - trial_loss / loss, damping / DAMPING_FACTOR
+        pose, error, loss = trial, trial_error, trial_loss
+        if gain < MIN_GAIN:
+            break
+        normal, gradient = _normal_equations(errors, pose, error, width)
+    return pose
+
+
+def _normal_equations(
+    errors: Errors, pose: Float[Tensor, "6"], error: Float[Tensor, " M"], width: float
+) -> tuple[Float[Tensor, "6 6"], Float[Tensor, "6"]]:
+    """JᵀWJ and JᵀWe, of the errors e with derivatives J and the weights W that make their squares the Huber loss."""
+    axes = torch.eye(len(pose), device=pose.device)
+    roots = error.abs().clamp_min(ROBUST_ERROR).rsqrt()  # of the weights
+    derivatives = torch.stack([(errors(pose + width * axis) - error) * (roots / width) for axis in axes])
+    return derivatives @ derivatives.T, derivatives @ (roots * error)
+
+
+def _loss(error: Float[Tensor, " M"]) -> float:
+    return float(huber_loss(error, torch.zeros_like(error), delta=ROBUST_ERROR))
