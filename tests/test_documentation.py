@@ -62,7 +62,7 @@ def test_python_of_a_page_runs(page, program, capsys):
 
 def command_lines(text: str) -> list[str]:
     """The commands in lines of text, without comments and what other programs do with them."""
-    lines = [re.split(r"\s+#|\s+&&|\s+>>?\s|;", line)[0].strip() for line in text.splitlines()]
+    lines = [re.split(r"\s+#|\s+&&|\s+>>?\s|;", line)[0].strip().removeprefix("exec ") for line in text.splitlines()]
     return [line.replace("python train.py", "warpgs train") for line in lines if COMMAND.match(line)]
 
 
