@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -139,6 +140,15 @@ def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
         "room": "builtin:room",
         "b": "builtin:room",
     }
+
+
+@pytest.mark.parametrize("name", ["", "../esc", "a/b", "a|b"])
+def test_a_name_of_a_capture_that_no_folder_can_have_is_refused(tmp_path, name):
+    (tmp_path / "dataset.json").touch()
+    with pytest.raises(
+        ValueError, match=re.escape(f"there is no capture {name}={tmp_path}: {name!r} cannot be a name")
+    ):
+        find_scenes([f"{name}={tmp_path}"])
 
 
 def test_two_captures_with_one_name_are_refused(tmp_path):

@@ -16,7 +16,7 @@ from warpgs.files import read_json
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config
 
-from .spec import SweepSpec, Variant
+from .spec import SweepSpec, Variant, check_name
 
 MAX_CELLS = 100_000
 
@@ -67,7 +67,7 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
 
     Raises:
-        ValueError: If there is none, one is no capture, or two have one name; the message names them.
+        ValueError: If there is none, one is no capture, or a name is wrong or given twice; the message names it.
     """
     if not data:
         raise ValueError("a sweep needs captures: give them with --data")
@@ -84,10 +84,11 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
 
 def _named(text: str) -> Iterator[tuple[str, str]]:
     name, equals, rest = text.partition("=")
-    if equals and name.replace("-", "").replace("_", "").isalnum() and not Path(text).exists():
-        yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
-    elif is_builtin(text):
+    if is_builtin(text):
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
+    elif equals and not Path(text).exists():
+        check_name(f"there is no capture {text}", name)
+        yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
     else:
         root = Path(text).resolve()
         yield from ((path.name, str(path)) for path in _captures_in(root) or [_capture(root)])

@@ -38,6 +38,9 @@ MAX_BYTES = 1 << 20
 """Maximum size of a sweep's file [bytes]."""
 
 MAX_SEEDS = 1000
+MAX_NAME = 100
+"""Maximum length of the name of a variant or capture [bytes]; a file's name has 255."""
+
 RESERVED = ("data", "out", "resume", "preset", "seed", "device")
 """Options of a training that the sweep sets."""
 
@@ -128,7 +131,25 @@ def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     return SweepSpec(source, title, preset, seeds, tuple(data), options, parsed)
 
 
+def check_name(where: str, name: str) -> None:
+    """Refuses the name of a variant or capture that cannot be part of the name of a file.
+
+    Args:
+        where: Where the name was found, for the message.
+        name: The name.
+
+    Raises:
+        ValueError: If it is empty, longer than ``MAX_NAME``, or has a character that file systems refuse.
+    """
+    if not name.isprintable() or set(name) & set('/\\:*?"<>|') or not 0 < len(name.encode()) <= MAX_NAME:
+        raise ValueError(
+            f"{where}: {name!r} cannot be a name: folders are named after it, so it must have 1 to {MAX_NAME} bytes, "
+            'none of / \\ : * ? " < > |'
+        )
+
+
 def _variant(path: Path, name: str, values: Any) -> Variant:
+    check_name(f"{path}: variants", name)
     where = f"{path}: variant {name}"
     if not isinstance(values, dict):
         raise ValueError(f"{where} must be a table, got {values!r}")
