@@ -112,7 +112,7 @@ def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, capsys):
     assert trained.count("as-plain-seed0") == 2
     printed = capsys.readouterr().out
     assert "[4/4] as-plain-seed0 failed: warpgs train: broken" in printed
-    assert "| plain | **21.00** | 1.0 | 1 of 2 |" in printed
+    assert "| plain | 21.00 | 1.0 | 1 of 2 |" in printed
     assert "3 of 4 trainings finished" in printed
     assert "as-plain-seed0: warpgs train: broken" in printed
 

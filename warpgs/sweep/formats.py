@@ -39,7 +39,7 @@ def seeds(row: Row) -> str:
     """How many seeds are in the means of a line."""
     if not row.planned:
         return NOTHING
-    return str(row.done) if row.done == row.planned else f"{row.done} of {row.planned}"
+    return str(row.done) if row.is_complete else f"{row.done} of {row.planned}"
 
 
 def texts(table: Table) -> list[list[tuple[str, bool]]]:
@@ -48,7 +48,10 @@ def texts(table: Table) -> list[list[tuple[str, bool]]]:
     return [
         [
             *(
-                (statistic(metric, value), value is not None and round(value.mean, metric.digits) == top)
+                (
+                    statistic(metric, value),
+                    row.is_complete and value is not None and round(value.mean, metric.digits) == top,
+                )
                 for metric, value, top in zip(table.metrics, row.values, best, strict=True)
             ),
             (seeds(row), False),

@@ -90,6 +90,11 @@ class Row(NamedTuple):
     done: int
     planned: int
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all seeds are in the means."""
+        return self.done == self.planned
+
 
 class Table(NamedTuple):
     """A table.
@@ -205,10 +210,14 @@ def _without_empty(table: Table) -> Table:
 
 
 def best_means(table: Table) -> list[float | None]:
-    """The best mean of each column, as it is printed; None where no value is better than another."""
+    """The best mean of each column, as it is printed; None where no value is better than another.
+
+    Lines that lack seeds do not compete: those that are missing may be the worst.
+    """
+    rows = [row for row in table.rows if row.is_complete]
     best: list[float | None] = []
     for k, metric in enumerate(table.metrics):
-        means = [round(value.mean, metric.digits) for row in table.rows if (value := row.values[k]) is not None]
+        means = [round(value.mean, metric.digits) for row in rows if (value := row.values[k]) is not None]
         choose = {"higher": max, "lower": min}.get(metric.better)
         best.append(choose(means) if choose and len(set(means)) > 1 else None)
     return best
