@@ -103,7 +103,7 @@ def test_the_same_command_trains_nothing_again_and_more_seeds_train_those(sweep)
     assert sweep("--seeds", "3") == (0, ["as-full-seed2", "as-plain-seed2"])
 
 
-def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, capsys):
+def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, tmp_path, capsys):
     def fail(job):
         return "warpgs train: broken" if job.name == "as-plain-seed0" else sweep.finish(job)
 
@@ -115,6 +115,7 @@ def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, capsys):
     assert "| plain | 21.00 | 1.0 | 1 of 2 |" in printed
     assert "3 of 4 trainings finished" in printed
     assert "as-plain-seed0: warpgs train: broken" in printed
+    assert (tmp_path / "out/table.tex").read_text().endswith("\n\nas-plain-seed0: warpgs train: broken\n")
 
 
 @pytest.mark.parametrize(
@@ -267,7 +268,7 @@ def test_a_note_says_which_frames_were_resampled(sweep, tmp_path, capsys, undist
     printed = capsys.readouterr().out
     assert note in printed
     assert "The same sweep with --as-taken compares them as they were taken" in printed
-    for name in ("table.md", "report.html"):
+    for name in ("table.md", "table.tex", "report.html"):
         assert note in (tmp_path / "out" / name).read_text()
 
 

@@ -92,11 +92,26 @@ def test_markdown_has_a_line_per_variant_and_marks_the_best():
 
 
 def test_latex_is_escaped_and_balanced():
-    text = latex("Mine_1", make_tables(measured({("a", "as"): [30.0, 31.0], ("b", "as"): [29.0]}), LABELS, {}))
-    assert r"(b) 50\% \& more & 29.00 \\" in text
+    cells = measured({("a", "as"): [30.0, 31.0], ("b", "as"): [29.0]})
+    text = latex("Mine_1", make_tables(cells, LABELS, {}), ["as_1: 50% of `x|y` < 3"])
+    assert r"(b) 50\% \& more & 29.00 & 1 \\" in text
     assert r"\textbf{30.50 $\pm$ 0.71}" in text
-    assert r"\caption{Mine\_1: as}" in text
+    assert r"\caption{Mine\_1: as. Mean $\pm$ standard deviation over seeds.}" in text
+    note = r"as\_1: 50\% of \textasciigrave{}x\textbar{}y\textasciigrave{} \textless{} 3"
+    assert text.endswith(f"\\end{{table}}\n\n{note}\n")
     assert text.count(r"\begin") == text.count(r"\end")
+    lines = [line for line in text.splitlines() if line.endswith(r" \\")]
+    assert [line.count(" & ") for line in lines] == [2, 2, 2]
+    assert r"\begin{tabular}{lrr}" in text
+
+
+def test_every_format_says_how_many_seeds_of_how_many_are_in_a_line():
+    cells = measured({("a", "as"): [30.0, 31.0], ("b", "as"): [29.0, None]})
+    tables = make_tables(cells, LABELS, {"D3DGS": {"as": {"psnr": Statistic(25.0, None)}}})
+    assert "| (b) 50% & more | 29.00 | 1 of 2 |" in markdown("Mine", tables, [])
+    assert r"(b) 50\% \& more & 29.00 & 1 of 2 \\" in latex("Mine", tables, [])
+    lines = list(csv.DictReader(io.StringIO(means_csv(tables))))
+    assert [(line["seeds"], line["planned seeds"]) for line in lines] == [("2", "2"), ("1", "2"), ("", "")]
 
 
 def test_csv_has_unrounded_numbers():

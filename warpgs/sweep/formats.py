@@ -18,6 +18,10 @@ LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
     "±": r"$\pm$",
     "–": "--",
     "×": r"$\times$",
+    "|": r"\textbar{}",
+    "`": r"\textasciigrave{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
 }
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 
@@ -78,9 +82,9 @@ def markdown(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
     return "\n\n".join([*parts, *notes]) + "\n"
 
 
-def latex(title: str, tables: Sequence[Table]) -> str:
-    """A ``table`` environment for each table; needs the package booktabs."""
-    return "\n".join(_latex_table(title, table) for table in tables)
+def latex(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
+    """A ``table`` environment for each table and, below them, notes; needs the package booktabs."""
+    return "\n".join([*(_latex_table(title, table) for table in tables), *(f"{escaped(note)}\n" for note in notes)])
 
 
 def _latex_table(title: str, table: Table) -> str:
@@ -89,14 +93,14 @@ def _latex_table(title: str, table: Table) -> str:
     lines = [
         r"\begin{table}",
         r"\centering",
-        rf"\caption{{{escaped(title)}: {escaped(table.title)}}}",
-        rf"\begin{{tabular}}{{l{'r' * len(titles)}}}",
+        rf"\caption{{{escaped(title)}: {escaped(table.title)}. Mean $\pm$ standard deviation over seeds.}}",
+        rf"\begin{{tabular}}{{l{'r' * (len(titles) + 1)}}}",
         r"\toprule",
-        " & ".join(["", *titles]) + r" \\",
+        " & ".join(["", *titles, "seeds"]) + r" \\",
         r"\midrule",
     ]
     for row, cells in zip(table.rows, texts(table), strict=True):
-        values = [rf"\textbf{{{escaped(text)}}}" if is_best else escaped(text) for text, is_best in cells[:-1]]
+        values = [rf"\textbf{{{escaped(text)}}}" if is_best else escaped(text) for text, is_best in cells]
         lines.append(" & ".join([escaped(row.label), *values]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
 
@@ -120,15 +124,16 @@ def cells_csv(cells: Sequence[tuple[Cell, str, Mapping[str, Any] | None]]) -> st
 
 
 def means_csv(tables: Sequence[Table]) -> str:
-    """One line per line of every table: mean and standard deviation of each metric, unrounded."""
+    """One line per line of every table: mean and standard deviation of each metric, unrounded, and numbers of seeds."""
     metrics = list(dict.fromkeys(metric for table in tables for metric in table.metrics))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     pairs = [name for metric in metrics for name in (metric.title, f"{metric.title} deviation")]
-    writer.writerow(["table", "row", *pairs, "seeds"])
+    writer.writerow(["table", "row", *pairs, "seeds", "planned seeds"])
     for table in tables:
         for row in table.rows:
             found = dict(zip(table.metrics, row.values, strict=True))
             numbers = [n for metric in metrics for n in (found.get(metric) or (None, None))]
-            writer.writerow([table.title, row.label, *("" if n is None else n for n in numbers), row.done])
+            counts = [row.done, row.planned] if row.planned else ["", ""]
+            writer.writerow([table.title, row.label, *("" if n is None else n for n in numbers), *counts])
     return text.getvalue()

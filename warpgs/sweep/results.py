@@ -69,7 +69,7 @@ def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None
     tables, commands = tables_of(board, spec, peers), "\n".join(cell.command for cell in board.cells)
     text = tables_text(spec, board, peers)
     write_text(out / "table.md", f"{text}\n## Commands\n\n```sh\n{commands}\n```\n")
-    write_text(out / "table.tex", latex(spec.title, tables))
+    write_text(out / "table.tex", latex(spec.title, tables, notes_of(board)))
     write_text(out / "table.csv", means_csv(tables))
     lines = [(cell, board.states[cell.name], board.metrics.get(cell.name)) for cell in board.cells]
     write_text(out / "cells.csv", cells_csv(lines))
