@@ -99,6 +99,20 @@ def ending_at_once(prog: str = "warpgs") -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Lets SIGTERM end a command as Ctrl-C does, so that its processes end and the message says how to go on."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def program(main: Callable[P, int]) -> Callable[P, int]:
     """A program's main function.
 

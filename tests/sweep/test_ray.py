@@ -129,6 +129,44 @@ def test_ray_prints_nothing_about_workers_that_died():
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
+TERMINATED = """
+import os, signal, sys, time
+from pathlib import Path
+from warpgs.errors import run_command, terminable
+from warpgs.sweep import ray_pool
+from warpgs.sweep.scheduler import run_jobs
+from warpgs.sweep.worker import Job
+
+def train(job):
+    try:
+        Path(job.folder, "started").touch()
+        for _ in range(600):
+            time.sleep(0.1)  # in steps, so that Ray can interrupt
+    except KeyboardInterrupt:
+        Path(job.folder, "saved").touch()
+        raise
+
+def sweep():
+    with terminable():
+        pool = ray_pool.RayPool(None, "cpu", 1, 1)
+        run_jobs(pool, [Job("cell", sys.argv[1], "", "", (), "cpu")], print, terminate)
+
+def terminate():
+    if Path(sys.argv[1], "started").exists():
+        os.kill(os.getpid(), signal.SIGTERM)
+
+ray_pool.run_job = train
+sys.exit(run_command(sweep))
+"""
+
+
+def test_sigterm_stops_a_sweep_as_ctrl_c_does(tmp_path):
+    command = [sys.executable, "-c", TERMINATED, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "warpgs: stopped\n")
+    assert (tmp_path / "saved").exists()
+
+
 def test_a_training_that_fits_on_no_node_is_refused(pool):
     with pytest.raises(ValueError, match="no node of the cluster has 1000 cores for a training: "):
         pool._check_room(0.0, 1000)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -145,6 +146,17 @@ def test_a_sweep_that_stops_says_so_prints_what_is_there_and_goes_on(sweep, caps
     assert message in captured.out + captured.err
     assert "| full | 20.00 | 1.0 | 1 of 2 |" in captured.out
     assert sweep() == (0, ["as-plain-seed0", "as-full-seed1", "as-plain-seed1"])
+
+
+def test_sigterm_stops_a_sweep_as_ctrl_c_does(sweep, tmp_path, capsys):
+    def stop(job):
+        if job.name == "as-plain-seed0":
+            signal.raise_signal(signal.SIGTERM)
+        return sweep.finish(job)
+
+    assert sweep(by=stop) == (130, ["as-full-seed0", "as-plain-seed0"])
+    assert capsys.readouterr().err == "warpgs: stopped; the same command continues\n"
+    assert "| full | 20.00 | 1.0 | 1 of 2 |" in (tmp_path / "out/table.md").read_text()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, to which every write fails")

@@ -1,17 +1,13 @@
 """The commands ``warpgs prepare`` and ``warpgs sample``."""
 
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import tyro
 
-from warpgs.errors import ending_at_once
+from warpgs.errors import ending_at_once, terminable
 
 from .options import CameraMotion, LensModel, Options, Selection
 
@@ -82,7 +78,7 @@ class Prepare:
         names = (field.name for field in fields(Options) if field.name != "selection")
         options = Options(selection, **{name: getattr(self, name) for name in names})
         try:
-            with _terminable():
+            with terminable():
                 prepare(self.source, self.capture, options, force=self.force, log=log)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
@@ -114,17 +110,3 @@ class Sample:
         write_sample(self.video, log=log)
         if log is not None:
             log(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Lets SIGTERM end the command as Ctrl-C does, so that COLMAP's process ends and the message says how to go on."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

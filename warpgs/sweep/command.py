@@ -7,15 +7,15 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.config import NetName
-from warpgs.errors import ending_at_once
+from warpgs.errors import ending_at_once, terminable
 
 
 @dataclass(frozen=True)
 class Sweep:
     """Trains every variant on every capture with every seed, on this machine or a Ray cluster; writes the tables.
 
-    Each training is a run folder of its own. After Ctrl-C or an error, the same command continues. Exit code 1 if a
-    training failed twice. Needs Ray, which the extra sweep installs (docs/cluster.md).
+    Each training is a run folder of its own. After Ctrl-C, SIGTERM or an error, the same command continues. Exit code 1
+    if a training failed twice. Needs Ray, which the extra sweep installs (docs/cluster.md).
     """
 
     sweep: Annotated[str, tyro.conf.arg(metavar="SWEEP"), tyro.conf.Positional]
@@ -58,4 +58,5 @@ class Sweep:
         """Trains and prints the tables; returns the exit code; raises as ``run_sweep``."""
         with ending_at_once():
             from .run_sweep import run_sweep
-        return run_sweep(self, print)
+        with terminable():
+            return run_sweep(self, print)

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import socket
 import sys
 import time
@@ -78,6 +79,7 @@ class RayPool:
             _require_head(address)  # Ray would print and try for minutes, and then end the program
         logging.getLogger("ray").setLevel(logging.ERROR)
         options = {} if address else _local_options()
+        on_sigterm = signal.getsignal(signal.SIGTERM)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Ray's announcements of its future versions
@@ -90,6 +92,8 @@ class RayPool:
                 )
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ConnectionError(f"Ray cannot be reached at {address or 'this machine'}: {one_line(error)}") from error
+        finally:
+            signal.signal(signal.SIGTERM, on_sigterm)  # Ray's handler would end the program
 
     def _nodes(self) -> list[dict[str, float]]:
         return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]

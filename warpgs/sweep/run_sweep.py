@@ -45,7 +45,7 @@ def run_sweep(options: Sweep, log: Log) -> int:
         ValueError: If options, the sweep's file or the plan are wrong, or the folder holds another sweep's results.
         ImportError: If Ray is not installed.
         OSError: If a file cannot be written; tables that cannot be written have been printed.
-        KeyboardInterrupt: After Ctrl-C; the tables of what is finished are written.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM; the tables of what is finished are written.
     """
     spec = _spec(options)
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()

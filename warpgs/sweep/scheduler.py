@@ -84,7 +84,7 @@ def run_jobs(pool: Pool, jobs: Iterable[Job], on_event: Callable[[Event], None],
         on_poll: Called about twice a second.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C; by then the pool has stopped, and unfinished cells can be continued.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM; by then the pool has stopped, and unfinished cells can be continued.
         ClusterGoneError: If the cluster cannot be reached any more.
     """
     waiting = {job.name: job for job in jobs}
