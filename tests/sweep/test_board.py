@@ -48,6 +48,13 @@ def test_running_and_failed_cells_come_first_with_their_host_and_reason(board, t
     ]
 
 
+def test_brackets_are_shown_as_they_are(board):
+    board.tell(Event("as-full-seed1", "failed", "file [/data/x] is [bold]bad"))
+    shown = text(board.table())
+    assert any("PSNR [dB]" in line for line in shown)
+    assert "as-full-seed1 failed file [/data/x] is [bold]bad" in shown
+
+
 def test_without_a_terminal_every_end_is_a_line(board, lines):
     board.tell(Event("as-full-seed1", "retried", "broken"))
     board.tell(Event("as-full-seed1", "failed", "broken still"))

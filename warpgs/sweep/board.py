@@ -10,7 +10,8 @@ from types import TracebackType
 from typing import Any
 
 from rich.live import Live
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
 from .scheduler import Event
@@ -126,11 +127,13 @@ class Board:
         }
         counts = Counter(states.values())
         title = ", ".join(f"{counts[state]} {state}" for state in ORDER if counts[state])
-        table = Table("cell", "state", "PSNR [dB]", "", title=title, title_justify="left")
+        heads = ("cell", "state", "PSNR [dB]", "")
+        table = Table(*(Column(Text(head)) for head in heads), title=title, title_justify="left")
         for cell in sorted(self.cells, key=lambda cell: ORDER.index(states[cell.name]))[:MAX_LINES]:
             psnr = self.metrics.get(cell.name, {}).get("psnr")
             note = self.errors.get(cell.name) or self._hosts.get(cell.name, "")
-            table.add_row(cell.name, states[cell.name], "" if psnr is None else f"{psnr:.2f}", note)
+            values = (cell.name, states[cell.name], "" if psnr is None else f"{psnr:.2f}", note)
+            table.add_row(*map(Text, values))  # without markup: names and errors may have brackets
         return table
 
     def __enter__(self) -> "Board":
