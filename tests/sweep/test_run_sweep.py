@@ -253,12 +253,38 @@ def test_a_cell_that_ends_without_results_has_failed(sweep, capsys):
     assert "as-full-seed0 failed: " in capsys.readouterr().out
 
 
-def test_tables_only_and_dry_run_train_nothing(sweep, tmp_path, capsys):
+def test_a_dry_run_trains_nothing(sweep, tmp_path, capsys):
     assert sweep("--dry-run") == (0, [])
     assert not (tmp_path / "out").exists()
     assert len(capsys.readouterr().out.splitlines()) == 4
+
+
+def test_tables_alone_keep_the_reasons_and_the_exit_code(sweep, tmp_path, capsys):
+    def fail(job):
+        return 'node7: a, "b" is [bad]' if job.name == "as-plain-seed0" else sweep.finish(job)
+
+    assert sweep(by=fail)[0] == 1
+    note = 'as-plain-seed0: node7: a, "b" is [bad]'
+    assert note in (before := (tmp_path / "out/table.md").read_text())
+    for _ in range(2):
+        assert sweep("--tables-only") == (1, [])
+        assert (tmp_path / "out/table.md").read_text() == before
+        assert note in capsys.readouterr().out
+    assert sweep() == (0, ["as-plain-seed0"])
     assert sweep("--tables-only") == (0, [])
-    assert "0 of 4 trainings finished" in capsys.readouterr().out
+    assert "node7" not in (tmp_path / "out/table.md").read_text()
+
+
+@pytest.mark.parametrize("state", ["missing", "empty", "of another sweep"])
+def test_tables_alone_of_a_folder_without_the_sweep_are_refused(sweep, tmp_path, capsys, state):
+    if state != "missing":
+        (tmp_path / "out").mkdir()
+    if state == "of another sweep":
+        (tmp_path / "out/sweep.json").write_text('{"bell-full-seed0": "warpgs train"}')
+    before = sorted(tmp_path.rglob("*"))
+    assert sweep("--tables-only") == (2, [])
+    assert f"{tmp_path}/out has no training of this sweep" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

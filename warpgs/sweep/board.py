@@ -1,5 +1,6 @@
 """The state of every cell, as files say it, and as a table in the terminal."""
 
+import csv
 import sys
 import time
 from collections import Counter
@@ -16,6 +17,9 @@ from rich.text import Text
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
 from .scheduler import Event
 from .worker import Job
+
+CELLS = "cells.csv"
+"""File in the folder of a sweep with the state of each cell, and why those failed that did."""
 
 MAX_LINES = 30
 """Maximum number of cells in the live table; those that run and fail come first."""
@@ -59,6 +63,17 @@ class Board:
         self.states[cell.name] = "finished" if is_done else "queued"
         if metrics is not None:
             self.metrics[cell.name] = metrics
+
+    def recall(self) -> None:
+        """Takes note of what had not finished when the sweep ended, and why, as ``CELLS`` says."""
+        path = self.out / CELLS
+        lines = path.read_text("utf-8", "replace").splitlines() if path.is_file() else []
+        for line in csv.DictReader(lines):
+            name, state, error = (line.get(key) or "" for key in ("cell", "state", "error"))
+            if error and self.states.get(name, "finished") != "finished":
+                self.errors[name] = error
+                if state == "failed":
+                    self.states[name] = state
 
     def jobs(self, device: str) -> list[Job]:
         """What is left to do, in order."""

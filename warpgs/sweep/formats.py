@@ -110,15 +110,15 @@ def escaped(text: str) -> str:
     return "".join(LATEX.get(c, c) for c in text)
 
 
-def cells_csv(cells: Sequence[tuple[Cell, str, Mapping[str, Any] | None]]) -> str:
-    """One line per cell: name, capture, variant, seed, state, every metric, command."""
-    names = list(dict.fromkeys(name for _, _, metrics in cells for name in metrics or {}))
+def cells_csv(cells: Sequence[tuple[Cell, str, str, Mapping[str, Any] | None]]) -> str:
+    """One line per cell: name, capture, variant, seed, state, error, every metric, command."""
+    names = list(dict.fromkeys(name for *_, metrics in cells for name in metrics or {}))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["cell", "capture", "variant", "seed", "state", *names, "command"])
-    for cell, state, metrics in cells:
+    writer.writerow(["cell", "capture", "variant", "seed", "state", "error", *names, "command"])
+    for cell, state, error, metrics in cells:
         values = [(metrics or {}).get(name) for name in names]
-        row = [cell.name, cell.scene, cell.variant, cell.seed, state]
+        row = [cell.name, cell.scene, cell.variant, cell.seed, state, error]
         writer.writerow([*row, *("" if value is None else value for value in values), cell.command])
     return text.getvalue()
 

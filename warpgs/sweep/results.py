@@ -6,7 +6,7 @@ from pathlib import Path
 
 from warpgs.files import write_text
 
-from .board import Board
+from .board import CELLS, Board
 from .cells import Cell
 from .formats import cells_csv, latex, markdown, means_csv
 from .page import write_page
@@ -71,8 +71,11 @@ def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None
     write_text(out / "table.md", f"{text}\n## Commands\n\n```sh\n{commands}\n```\n")
     write_text(out / "table.tex", latex(spec.title, tables, notes_of(board)))
     write_text(out / "table.csv", means_csv(tables))
-    lines = [(cell, board.states[cell.name], board.metrics.get(cell.name)) for cell in board.cells]
-    write_text(out / "cells.csv", cells_csv(lines))
+    lines = [
+        (cell, board.states[cell.name], board.errors.get(cell.name, ""), board.metrics.get(cell.name))
+        for cell in board.cells
+    ]
+    write_text(out / CELLS, cells_csv(lines))
 
 
 def write_report(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None:

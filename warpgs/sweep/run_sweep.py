@@ -60,9 +60,13 @@ def run_sweep(options: Sweep, log: Log) -> int:
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
+    if options.tables_only and not any(cell.name in known for cell in cells):
+        raise ValueError(f"{out} has no training of this sweep: --tables-only needs the --out that it was started with")
     with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
         board = Board(out, cells, log)
-        if not options.tables_only:
+        if options.tables_only:
+            board.recall()
+        else:
             for lpips, net in {(cell.config.lpips, cell.config.lpips_net) for cell in board.unfinished()}:
                 locate(lpips, net)  # reports a wrong folder now, not in every cell
         _write_index(out, cells, known)
