@@ -128,6 +128,18 @@ def test_an_interrupt_is_passed_on_and_waited_for(tmp_path, monkeypatch):
     assert (tmp_path / "saved").exists()
 
 
+def test_a_worker_that_was_started_in_the_background_can_be_interrupted(tmp_path, monkeypatch):
+    """Shells let a command before & ignore SIGINT, and so do all processes below it."""
+    replace_child(monkeypatch, "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)")
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run_job(job(tmp_path)) is None
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert "True" in (tmp_path / "logs/cell.log").read_text().splitlines()
+
+
 def test_a_training_ends_with_its_worker(tmp_path):
     program = (
         "import os, subprocess, sys\n"

@@ -65,6 +65,12 @@ def unblock_interrupts() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
+def allow_interrupts() -> None:
+    """Lets SIGINT arrive if it is ignored, as in everything that a shell started in the background."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def is_closed_pipe(file: int) -> bool:
     """Whether an open file is a pipe that nobody reads any more; False on Windows, which cannot tell.
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from warpgs.command_line.posix import interrupt
+from warpgs.command_line.posix import allow_interrupts, interrupt
 from warpgs.errors import one_line
 from warpgs.files import write_text
 
@@ -58,6 +58,7 @@ def run_job(job: Job) -> str | None:
         KeyboardInterrupt: If it was stopped; a checkpoint was saved.
     """
     running = Path(job.running)
+    allow_interrupts()  # which are ignored if the sweep, or its node, was started with &
     try:
         write_text(running, socket.gethostname())
         reason = _train(job)
