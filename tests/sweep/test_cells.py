@@ -117,10 +117,15 @@ def test_a_folder_of_captures_stands_for_the_captures_in_it(tmp_path):
     for name in ("bell", "as"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "dataset.json").write_text("{}")
-    (tmp_path / "notes").mkdir()
-    found = find_scenes([str(tmp_path)])
+    for name in ("notes", "broken", ".git"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "notes.txt").touch()
+    lines = []
+    found = find_scenes([str(tmp_path)], lines.append)
+    assert lines == [f"warning: {tmp_path}: left out, as they are no captures: broken, notes"]
     assert found == {"as": str(tmp_path / "as"), "bell": str(tmp_path / "bell")}
-    assert find_scenes([str(tmp_path / "as")]) == {"as": str(tmp_path / "as")}
+    assert find_scenes([str(tmp_path / "as")], lines.append) == {"as": str(tmp_path / "as")}
+    assert len(lines) == 1
 
 
 @pytest.mark.parametrize("write", [layouts.write_colmap, layouts.write_nerfstudio, layouts.write_llff])

@@ -259,6 +259,18 @@ def test_a_dry_run_trains_nothing(sweep, tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 4
 
 
+def test_folders_that_are_no_captures_are_named_but_not_in_the_script_of_a_dry_run(sweep, tmp_path, capsys):
+    (tmp_path / "captures/broken").mkdir(parents=True)
+    (tmp_path / "as").rename(tmp_path / "captures/as")
+    options = ["--data", str(tmp_path / "captures")]
+    warning = f"warning: {tmp_path}/captures: left out, as they are no captures: broken\n"
+    assert sweep(*options, "--dry-run")[0] == 0
+    printed = capsys.readouterr()
+    assert (printed.err, printed.out.count("\n")) == (warning, 4)
+    assert sweep(*options)[0] == 0
+    assert capsys.readouterr().out.startswith(warning)
+
+
 def test_tables_alone_keep_the_reasons_and_the_exit_code(sweep, tmp_path, capsys):
     def fail(job):
         return 'node7: a, "b" is [bad]' if job.name == "as-plain-seed0" else sweep.finish(job)

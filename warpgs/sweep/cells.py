@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import os
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 from warpgs.config import TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import is_builtin, parse_builtin
+from warpgs.errors import visible
 from warpgs.files import read_json
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config
@@ -60,11 +61,12 @@ class Cell:
         return shlex.join(["warpgs", "train", *arguments(self.config)])
 
 
-def find_scenes(data: Sequence[str]) -> dict[str, str]:
+def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> dict[str, str]:
     """Captures by name, in order.
 
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
+        log: Receives a line for each folder of captures in which other folders are left out.
 
     Raises:
         ValueError: If there is none, one is no capture, or a name is wrong or given twice; the message names it.
@@ -73,7 +75,7 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
         raise ValueError("a sweep needs captures: give them with --data")
     scenes: dict[str, str] = {}
     for text in data:
-        for name, path in _named(text):
+        for name, path in _named(text, log):
             if name in scenes:
                 raise ValueError(
                     f"two captures have the name {name}: {scenes[name]} and {path}; name one with --data NAME={path}"
@@ -82,7 +84,7 @@ def find_scenes(data: Sequence[str]) -> dict[str, str]:
     return scenes
 
 
-def _named(text: str) -> Iterator[tuple[str, str]]:
+def _named(text: str, log: Callable[[str], object]) -> Iterator[tuple[str, str]]:
     name, equals, rest = text.partition("=")
     if is_builtin(text):
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
@@ -91,7 +93,7 @@ def _named(text: str) -> Iterator[tuple[str, str]]:
         yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
     else:
         root = Path(text).resolve()
-        yield from ((path.name, str(path)) for path in _captures_in(root) or [_capture(root)])
+        yield from ((path.name, str(path)) for path in _captures_in(root, log) or [_capture(root)])
 
 
 def _capture(root: Path) -> Path:
@@ -102,13 +104,18 @@ def _capture(root: Path) -> Path:
     return root
 
 
-def _captures_in(root: Path) -> list[Path]:
-    """The captures in a folder, by name; none if it is a capture itself."""
+def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
+    """The captures in a folder, by name; none if it is a capture itself. Says which other folders are in it."""
     from warpgs.data.loaders import is_capture  # imports torch
 
     if not root.is_dir() or is_capture(root):
         return []
-    return [path for path in sorted(root.iterdir()) if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
+    folders = [path for path in sorted(root.iterdir()) if os.path.isdir(path)]
+    found = [path for path in folders if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
+    others = [path.name for path in folders if path not in found and not path.name.startswith(".")]
+    if found and others:
+        log(visible(f"warning: {root}: left out, as they are no captures: {', '.join(others)}"))
+    return found
 
 
 def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides: Mapping[str, Any]) -> list[Cell]:

@@ -2,8 +2,10 @@
 
 import dataclasses
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +51,16 @@ def run_sweep(options: Sweep, log: Log) -> int:
     """
     spec = _spec(options)
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
-    scenes, overrides, known = find_scenes(spec.data), _overrides(options), _known_commands(out)
+    # The output of a dry run is a script.
+    warn = partial(print, file=sys.stderr) if options.dry_run else log
+    scenes, overrides, known = find_scenes(spec.data, warn), _overrides(options), _known_commands(out)
     cells = [
         as_evaluated_before(cell, known.get(cell.name, ""), overrides)
         for cell in plan_cells(spec, scenes, out, overrides)
     ]
     peers = read_peers(options.compare) if options.compare else {}
     if unknown := sorted({scene for numbers in peers.values() for scene in numbers} - {*scenes, ALL_SCENES}):
-        log(f"warning: {options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}")
+        warn(f"warning: {options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
