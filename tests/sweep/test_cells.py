@@ -122,7 +122,7 @@ def test_a_folder_of_captures_stands_for_the_captures_in_it(tmp_path):
     (tmp_path / "notes.txt").touch()
     lines = []
     found = find_scenes([str(tmp_path)], lines.append)
-    assert lines == [f"warning: {tmp_path}: left out, as they are no captures: broken, notes"]
+    assert lines == [f"warning: {tmp_path}: skipped folders that are not captures: broken, notes"]
     assert found == {"as": str(tmp_path / "as"), "bell": str(tmp_path / "bell")}
     assert find_scenes([str(tmp_path / "as")], lines.append) == {"as": str(tmp_path / "as")}
     assert len(lines) == 1

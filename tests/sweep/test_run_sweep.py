@@ -263,7 +263,7 @@ def test_folders_that_are_no_captures_are_named_but_not_in_the_script_of_a_dry_r
     (tmp_path / "captures/broken").mkdir(parents=True)
     (tmp_path / "as").rename(tmp_path / "captures/as")
     options = ["--data", str(tmp_path / "captures")]
-    warning = f"warning: {tmp_path}/captures: left out, as they are no captures: broken\n"
+    warning = f"warning: {tmp_path}/captures: skipped folders that are not captures: broken\n"
     assert sweep(*options, "--dry-run")[0] == 0
     printed = capsys.readouterr()
     assert (printed.err, printed.out.count("\n")) == (warning, 4)

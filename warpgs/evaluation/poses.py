@@ -34,6 +34,9 @@ DAMPING, DAMPING_FACTOR = 1e-3, 10.0
 Align = Callable[[Frame], Camera]
 """The camera of a frame, on the device of the scene."""
 
+Errors = Callable[[Float[Tensor, "6"]], Float[Tensor, " M"]]
+"""Errors of an image from a pose: its rotation and translation."""
+
 
 def alignment(scene: TrainedScene, unit: float) -> Align:
     """Aligns the cameras of frames if poses were corrected in training, else only moves them to the scene's device.
@@ -88,9 +91,6 @@ def aligned_camera(
         return (difference if region is None else difference[region]).flatten()
 
     return moved(_minimize(errors, torch.zeros(6, device=device), DIFFERENCE / float(camera.K[0, 0])))
-
-
-Errors = Callable[[Float[Tensor, "6"]], Float[Tensor, " M"]]
 
 
 def _minimize(errors: Errors, pose: Float[Tensor, "6"], width: float) -> Float[Tensor, "6"]:

@@ -66,7 +66,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> di
 
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
-        log: Receives a line for each folder of captures in which other folders are left out.
+        log: Receives a warning for each folder of captures with subfolders that are not captures.
 
     Raises:
         ValueError: If there is none, one is no capture, or a name is wrong or given twice; the message names it.
@@ -114,7 +114,7 @@ def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
     found = [path for path in folders if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
     others = [path.name for path in folders if path not in found and not path.name.startswith(".")]
     if found and others:
-        log(visible(f"warning: {root}: left out, as they are no captures: {', '.join(others)}"))
+        log(visible(f"warning: {root}: skipped folders that are not captures: {', '.join(others)}"))
     return found
 
 
