@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from warpgs.cameras import Camera
+from warpgs.data import capture as capture_module
 from warpgs.data.capture import MIN_EXTENT, Capture, Frame
 
 
@@ -37,6 +38,15 @@ def test_a_frame_is_read_once():
 
 def test_only_the_last_frames_are_cached():
     capture, read = make_capture(cache_frames=2)
+    for name in ("f0", "f1", "f2", "f2", "f1", "f0"):
+        capture.frame(name)
+    assert read == ["f0", "f1", "f2", "f0"]
+
+
+def test_the_cache_of_frames_has_a_maximum_size(monkeypatch):
+    frame_bytes = capture_module.BYTES_PER_PIXEL * make_capture()[0].cameras["f0"].width * 2
+    monkeypatch.setattr(capture_module, "MAX_CACHE_BYTES", 2 * frame_bytes)
+    capture, read = make_capture()
     for name in ("f0", "f1", "f2", "f2", "f1", "f0"):
         capture.frame(name)
     assert read == ["f0", "f1", "f2", "f0"]

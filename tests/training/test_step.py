@@ -85,7 +85,7 @@ class RecordedWork:
         pass
 
 
-def trained(data, folder, graphs=None):
+def trained(data, folder, graphs=None, **changes):
     """All tensors of a run that used ``graphs`` throughout."""
     make_step = Step.__init__
 
@@ -95,7 +95,7 @@ def trained(data, folder, graphs=None):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Step, "__init__", with_graphs)
-        assert tiny.train(tiny.trainer(data, folder))
+        assert tiny.train(tiny.trainer(data, folder, dataclasses.replace(tiny.CONFIG, **changes)))
     return tiny.state(folder)
 
 
@@ -103,6 +103,11 @@ def test_work_recorded_in_the_first_iteration_of_a_phase_serves_all_others_bit_f
     """A CUDA graph does that; so a step reads nothing of its plan but the phase, and everything else from tensors."""
     eager, recorded = trained(data, tmp_path / "eager"), trained(data, tmp_path / "recorded", RecordedWork)
     assert tiny.differences(eager, recorded) == []
+
+
+def test_training_on_views_from_disk_is_the_same_bit_for_bit(data, tmp_path):
+    kept, read = trained(data, tmp_path / "kept"), trained(data, tmp_path / "read", RecordedWork, resident_bytes=0)
+    assert tiny.differences(kept, read) == []
 
 
 def test_plans_with_equal_phases_share_a_graph(data, tmp_path):
@@ -118,9 +123,9 @@ def test_plans_with_equal_phases_share_a_graph(data, tmp_path):
     assert set(graphs.work) == {plans[0].phase}
 
 
-def test_the_work_of_a_step_is_given_a_phase_and_a_view_only():
+def test_the_work_of_a_step_is_given_a_phase_only():
     parameters = inspect.signature(Step._run).parameters
-    assert list(parameters) == ["self", "phase", "view"]
+    assert list(parameters) == ["self", "phase"]
     assert parameters["phase"].annotation is Phase
 
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import cv2
@@ -28,7 +29,7 @@ from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
-from warpgs.training import initialize
+from warpgs.training import initialize, view_cache
 from warpgs.training import train as script
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
@@ -393,3 +394,13 @@ def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp
     script._describe(script.make_trainer(config, lines.append), lines.append)
     assert any(re.match(r"depth is off by \d\.\d% ", line) for line in lines)
     assert any("depth can be aligned with the sparse points in 1 of" in line for line in lines)
+
+
+@pytest.mark.parametrize("free", [1e15, 0])
+def test_views_that_do_not_fit_on_the_device_are_announced(data, tmp_path, monkeypatch, free):
+    monkeypatch.setattr(view_cache.shutil, "disk_usage", lambda folder: types.SimpleNamespace(free=free))
+    lines = []
+    config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=tmp_path / "run", resident_bytes=1000)
+    script._describe(script.make_trainer(config, lines.append), lines.append)
+    expected = "decoded once into a file in" if free else "decoded again and again, for which a file has no room in"
+    assert any("--resident-bytes" in line and expected in line for line in lines)

@@ -11,7 +11,8 @@ from tests.data.captures import ids_of, write_capture
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
 from warpgs.model.poses import PoseCorrections
-from warpgs.training.views import Views, mask_border
+from warpgs.training.stored_views import mask_border
+from warpgs.training.views import Views
 
 CPU = torch.device("cpu")
 PLENTY = 1 << 30
@@ -69,10 +70,13 @@ def test_resident_views_equal_those_that_are_read_on_demand(capture):
         assert_same(kept[index], read[index])
 
 
-def test_a_view_picked_on_the_device_has_the_given_index(capture):
-    views = views_of(capture)
-    for index in range(len(views)):
-        assert_same(views.pick(torch.tensor([index])), views[index])
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_the_selected_view_is_that_of_the_index(capture, resident_bytes):
+    views = views_of(capture, resident_bytes)
+    for index in (*range(len(views)), 0):
+        views.select(index)
+        assert_same(views.selected(), views[index])
+        assert views.index.tolist() == [index]
 
 
 def test_a_view_has_the_image_time_and_mask_of_its_frame(capture):

@@ -320,7 +320,8 @@ class TrainConfig:
     keep_checkpoints: Annotated[int, Bounds(min=1)] = 2
     """Number of newest checkpoints to keep."""
     resident_bytes: int = 4 << 30
-    """Maximum memory for training views on the device [bytes]; larger captures are read from disk on demand."""
+    """Maximum memory for training views on the device [bytes]; larger captures are decoded once into a file in
+    the user's cache and read from there."""
     lpips: Path | None = None
     """Folder with the weights of LPIPS, for the evaluation at the end."""
     lpips_net: NetName = "vgg"

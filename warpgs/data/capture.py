@@ -22,6 +22,13 @@ def extent_of(cameras: Sequence[Camera]) -> float:
     return max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
 
 
+MAX_CACHE_BYTES = 1 << 30
+"""Maximum memory of a capture's cache of frames."""
+
+BYTES_PER_PIXEL = 8
+"""Of a cached frame: an image, a mask and depth."""
+
+
 Assumption = Literal["masks", "static", "dynamic"]
 """What is taken as dynamic: the region that the masks mark, nothing, or everything."""
 
@@ -88,7 +95,7 @@ class Capture:
         points: [P, 3] sparse static points, P may be 0.
         point_colors: [P, 3] 8-bit RGB of the points; None if the capture has none.
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
-        cache_frames: Number of frames to keep in memory.
+        cache_frames: Maximum number of frames to keep in memory, of which large ones are fewer: ``MAX_CACHE_BYTES``.
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
         read_taken: Reads a frame with the distortion of its lens; None if no lens of the capture distorts.
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
@@ -129,7 +136,9 @@ class Capture:
         self.extent = extent_of([self.cameras[name] for name in self.train])
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()
-        self._cached = lru_cache(maxsize=self.cache_frames)(self.read)
+        largest = max(camera.width * camera.height for camera in self.cameras.values())
+        fitting = max(1, MAX_CACHE_BYTES // (BYTES_PER_PIXEL * largest))
+        self._cached = lru_cache(maxsize=min(self.cache_frames, fitting))(self.read)
 
     @property
     def uses_estimated_masks(self) -> bool:

@@ -1,5 +1,6 @@
 """The frames of a video by their index."""
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,8 +19,14 @@ READ_LOCAL_FILES = {"protocol_whitelist": "file"}
 """Options of FFmpeg, with which playlists cannot make it open addresses."""
 
 
+NUM_KEPT = 16
+"""Number of decoded frames to keep: threads that read frames in their order ask for some a little late."""
+
+
 class VideoFrames:
-    """Decodes a video's frames on request; in the order of the frames that takes one pass.
+    """Decodes a video's frames on request; roughly in the order of the frames that takes one pass.
+
+    Several threads may read.
 
     Attributes:
         path: The video.
@@ -33,6 +40,8 @@ class VideoFrames:
         self.path = path
         require_file(path, MAX_BYTES)
         self._next, self._frames = 0, self._decoded()
+        self._kept: dict[int, np.ndarray] = {}
+        self._lock = threading.Lock()
         first = self.read(0)
         self.size = first.shape[1], first.shape[0]
 
@@ -42,13 +51,22 @@ class VideoFrames:
         Raises:
             ValueError: If the video is damaged, ends earlier, or changes its size.
         """
+        with self._lock:
+            if index not in self._kept:
+                self._decode_to(index)
+            return self._kept[index]
+
+    def _decode_to(self, index: int) -> None:
         if index < self._next:
             self._next, self._frames = 0, self._decoded()
-        for image in self._frames:
+            self._kept.clear()
+        while self._next <= index:
+            image = next(self._frames, None)
+            if image is None:
+                raise ValueError(f"{self.path} has {self._next} frames, no frame {index}")
+            self._kept[self._next] = image
+            self._kept.pop(self._next - NUM_KEPT, None)
             self._next += 1
-            if self._next > index:
-                return image
-        raise ValueError(f"{self.path} has {self._next} frames, no frame {index}")
 
     def _decoded(self) -> Iterator[np.ndarray]:
         try:

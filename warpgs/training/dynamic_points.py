@@ -151,7 +151,7 @@ def unproject_pixels(
     Returns:
         The points; None if the masks are empty.
     """
-    num = sum(int(mask_of(views[index]).sum()) for index in range(len(views)))
+    num = sum(int(mask_of(view).sum()) for view in views)
     if num == 0:
         return None
     fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num)
@@ -175,8 +175,7 @@ def _unproject(
 ) -> tuple[Tensor, ...]:
     """Positions, colours and views of a random fraction of the masks' pixels, on the CPU."""
     parts = []
-    for index in range(len(views)):
-        view = views[index]
+    for index, view in enumerate(views):
         mask = mask_of(view)
         depth = depth_of(index, view, mask)
         if fraction < 1.0:

@@ -103,8 +103,7 @@ def blend_weights(scene: SplitScene, views: Views, phase: Phase, antialias: bool
     """
     total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
     settings = RenderSettings(statistics=True, antialias=antialias)
-    for index in range(len(views)):
-        view = views[index]
+    for view in views:
         splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
         weights = render(splats, view.camera, settings=settings).weights
         assert weights is not None

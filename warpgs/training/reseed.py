@@ -52,8 +52,7 @@ def lost_pixels(scene: SplitScene, phase: Phase, antialias: bool) -> Callable[[V
 def lost_fraction(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) -> float:
     """Fraction of all views' dynamic pixels that are lost, in [0, 1]; 0 if nothing is dynamic."""
     lost = dynamic = 0
-    for index in range(len(views)):
-        view = views[index]
+    for view in views:
         lost, dynamic = lost + int(mask_of(view).sum()), dynamic + int((~view.static_mask).sum())
     return lost / max(1, dynamic)
 

@@ -1,6 +1,8 @@
 """The random choices of training: functions of the seed, the iteration, the number of rollbacks and the rank."""
 
 import hashlib
+from collections.abc import Iterator
+from itertools import count
 
 import torch
 
@@ -27,16 +29,29 @@ class Sampler:
 
     def __init__(self, seed: int, num_views: int, black: bool) -> None:
         self._seed, self._num_views, self._black = seed, num_views, black
-        self._order: tuple[int, int, list[int]] = (-1, 0, [])
+        self._orders: dict[tuple[int, int], list[int]] = {}
 
     def __call__(self, iteration: int, rollbacks: int, noise_deviation: float) -> Sample:
         """The choices of an iteration; the noise has a standard deviation in frame intervals."""
-        epoch, index = divmod(iteration * ranks.num_ranks() + ranks.rank(), self._num_views)
-        if self._order[:2] != (epoch, rollbacks):
-            order = torch.randperm(self._num_views, generator=random_numbers(self._seed, "views", epoch, rollbacks))
-            self._order = (epoch, rollbacks, order.tolist())
         generator = random_numbers(self._seed, "draw", iteration, rollbacks)
         for _ in range(ranks.rank() + 1):  # each rank has numbers of its own, after those of the ranks before it
             noise = noise_deviation / self._num_views * torch.randn(1, generator=generator).item()
             background = torch.rand(3, generator=generator)
-        return Sample(self._order[2][index], noise, torch.zeros(3) if self._black else background)
+        view = next(self.views(iteration, rollbacks))
+        return Sample(view, noise, torch.zeros(3) if self._black else background)
+
+    def views(self, iteration: int, rollbacks: int) -> Iterator[int]:
+        """The views of this rank from an iteration on, without end."""
+        for position in count(iteration * ranks.num_ranks() + ranks.rank(), ranks.num_ranks()):
+            epoch, index = divmod(position, self._num_views)
+            yield self._order(epoch, rollbacks)[index]
+
+    def _order(self, epoch: int, rollbacks: int) -> list[int]:
+        """The order of the views in an epoch; those of the last two epochs are remembered."""
+        key = epoch, rollbacks
+        if key not in self._orders:
+            while len(self._orders) > 1:
+                del self._orders[next(iter(self._orders))]
+            order = torch.randperm(self._num_views, generator=random_numbers(self._seed, "views", *key))
+            self._orders[key] = order.tolist()
+        return self._orders[key]

@@ -88,14 +88,13 @@ class Step:
         self.config, self.scene, self.views, self.extent = config, scene, views, extent
         device = views.device
         self.alignments, self._depth_trust = alignments, depth_trust
-        self._index = torch.zeros(1, dtype=torch.int64, device=device)
         sums = (*TERMS, "psnr", "iterations")
         self._inputs = StepInputs(sums, optim.GROUPS, device)
         self._sums = torch.zeros(len(sums), device=device)
         self._zero, self._one = torch.zeros((), device=device), torch.ones((), device=device)
         self.optimizer = optim.make_optimizer(self.parameters(), self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
-        if config.graph and views.resident and device.type == "cuda":
+        if config.graph and views.have_one_size and device.type == "cuda":
             self._graphs = GraphCache(max_graphs=1, repeatable=False, shared_memory=device)
         self.reset_statistics()
 
@@ -123,11 +122,11 @@ class Step:
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
         )
-        self._index.fill_(sample.view)
+        self.views.select(sample.view)
         if self._graphs is None:
-            self._run(plan.phase, self.views[sample.view])
+            self._run(plan.phase)
         else:
-            self._graphs.run(plan.phase, partial(self._run_resident, plan.phase))
+            self._graphs.run(plan.phase, partial(self._run, plan.phase))
 
     def release_graphs(self) -> None:
         """Frees the memory of the CUDA graphs; from then on, iterations are eager."""
@@ -140,13 +139,10 @@ class Step:
         self._sums.zero_()
         return Means({name: value / iterations for name, value in zip(TERMS, terms, strict=True)}, psnr / iterations)
 
-    def _run_resident(self, phase: Phase) -> tuple[Tensor, ...]:
-        """Runs the step on the view whose index is on the device."""
-        self._run(phase, self.views.pick(self._index))
-        return ()
-
-    def _run(self, phase: Phase, view: View) -> None:
+    def _run(self, phase: Phase) -> tuple[Tensor, ...]:
+        """All that happens on the device."""
         self._choose_trained(phase)
+        view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
@@ -162,11 +158,12 @@ class Step:
         self.optimizer.zero_grad()
         self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
+        return ()
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
-        """Alignment of the depth of the view whose index is on the device, and how much it is trusted."""
+        """Alignment of the depth of the selected view, and how much it is trusted."""
         values = (self.alignments, *self._depth_trust)
-        alignment, *trust = (tensor.index_select(0, self._index)[0] for tensor in values)
+        alignment, *trust = (tensor.index_select(0, self.views.index)[0] for tensor in values)
         return alignment, DepthTrust(*trust)
 
     def _settings(self, phase: Phase) -> RenderSettings:

@@ -157,6 +157,11 @@ def _describe(trainer: Trainer, log: Log) -> None:
     layout = "" if config.data is None else f" (read as {config.dataset or recognize(config.data)})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     log(f"{name}{layout}: {num_views} views, on {config.device}{together}, into {trainer.run}")
+    if (cache := trainer.views.cache) is not None:
+        read = "decoded once into a file" if cache.fits else "decoded again and again, for which a file has no room"
+        log(
+            f"not all views are on the device (--resident-bytes): {cache.nbytes / 1e9:.1f} GB, {read} in {cache.folder}"
+        )
     if jumps := int((trainer.gains != 1.0).any(1).sum()):
         low, high = trainer.gains.min().item(), trainer.gains.max().item()
         log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")

@@ -126,6 +126,7 @@ class Trainer:
                 self.save()
                 return False
             plan = self.protocol.at(self.iteration)
+            self.views.announce(self._sampler.views(self.iteration, self.rollbacks))
             self.step(plan, self._sample(plan))
             if plan.adapts:
                 self._adapt_all_ranks(plan, logger)

@@ -1,19 +1,20 @@
 """Training views on the device."""
 
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import MASKS_REMEDY, Capture, Frame
+from warpgs.data.builtin_cache import cache_folder
+from warpgs.data.capture import Capture
 from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
+
+from .stored_views import ReadAhead, Slot, StoredView, ViewReader
+from .view_cache import ViewCache
 
 
 class View(NamedTuple):
@@ -36,40 +37,14 @@ class View(NamedTuple):
     inverse_depth: Float[Tensor, "H W"]
 
 
-def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
-    """True in pixels that have both static and dynamic pixels within ``margin`` columns and rows."""
-    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-    static, dynamic = (cv2.dilate(mask.numpy().astype(np.uint8), kernel) for mask in (static_mask, ~static_mask))
-    return torch.from_numpy(static & dynamic).bool()
-
-
-class _Stored(NamedTuple):
-    """Views as they are stored: bytes for images, half precision for depth. Tensors may have a leading view axis."""
-
-    viewmat: Tensor
-    K: Tensor
-    time: Tensor
-    image: Tensor
-    static_mask: Tensor
-    inverse_depth: Tensor
-    mask_border: Tensor | None
-    gain: Tensor | None
-
-    def nbytes(self) -> int:
-        """Memory of all tensors [bytes]."""
-        return sum(tensor.nbytes for tensor in self if tensor is not None)
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> "_Stored":
-        """Applies a function to every tensor."""
-        return _Stored._make(None if tensor is None else function(tensor) for tensor in self)
-
-
 class Views:
     """The training frames of a capture.
 
-    Frames of one size that fit into ``resident_bytes`` are kept on the device. A view is then chosen by an index that
-    is on the device, too, so that choosing can be part of a CUDA graph. Other frames are read from the capture on
-    demand.
+    Frames of one size that fit into ``resident_bytes`` are kept on the device. Others are decoded once into a file and
+    read from there, by threads that are ahead of training where they are told what comes next.
+
+    A step of training trains on the selected view. That is one index or one slot on the device, so that steps on
+    frames of one size can be CUDA graphs.
 
     Args:
         capture: Source of the frames.
@@ -84,6 +59,9 @@ class Views:
         poses: The corrections.
         background: Colour behind everything.
         resident: Whether all views are on the device.
+        cache: The file of those that are not resident, so that each is decoded once; None if all are.
+        have_one_size: Whether all views are of one size.
+        index: [1] index of the selected view, on the device.
         num_pixels: Number of pixels of all views.
 
     Raises:
@@ -99,34 +77,60 @@ class Views:
         gains: Float[Tensor, "T 3"] | None = None,
         poses: PoseCorrections | None = None,
     ) -> None:
-        self.device, self._mask_margin = device, mask_margin
-        self.poses = poses
-        self._gains = {} if gains is None else dict(zip(capture.train, gains, strict=True))
+        self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
-        self._depth_changes: dict[str, list[Callable[[Tensor, Tensor], Tensor]]] = defaultdict(list)
-        first = self._store(capture.frame(capture.train[0]))
+        self._reader = ViewReader(capture, mask_margin, gains, pinned=device.type == "cuda")
+        self._read_ahead, self._slot = ReadAhead(self._reader.read, device), Slot(device)
+        self.index = torch.zeros(1, dtype=torch.int64, device=device)
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
-        self.resident = len(set(sizes)) == 1 and len(self) * first.nbytes() <= resident_bytes
+        self.have_one_size = len(set(sizes)) == 1
+        first = self._reader.read(0)
+        self.resident = self.have_one_size and len(self) * first.nbytes() <= resident_bytes
+        self.cache = None if self.resident else ViewCache(cache_folder(), sizes)
+        self._reader.cache = self.cache
         if self.resident:
-            stored = [self._store(capture.frame(name)) for name in capture.train]
-            parts = zip(*stored, strict=True)
-            self._all = _Stored._make(None if part[0] is None else torch.stack(part).to(device) for part in parts)
+            self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
+            for index in range(len(self)):
+                self._read_ahead.announce(range(index, len(self)))
+                self._at(index).copy_(self._read_ahead.take(index))
 
     def __len__(self) -> int:
         return len(self._capture.train)
 
     def __getitem__(self, index: int) -> View:
-        if self.resident:
-            stored = self._all.map(lambda tensors: tensors[index])
-        else:
-            stored = self._store(self._capture.frame(self._capture.train[index]))
-            stored = stored.map(lambda tensor: tensor.to(self.device))
-        return self._view(stored, torch.full((1,), index, device=self.device))
+        stored = self._at(index) if self.resident else self._read_ahead.take(index)
+        return self._view(stored.map(self._to_device), torch.full((1,), index, device=self.device))
 
-    def pick(self, index: Int64[Tensor, "1"]) -> View:
-        """The view of an index on the device; all views must be resident."""
-        return self._view(self._all.map(lambda tensors: tensors.index_select(0, index)[0]), index)
+    def _at(self, index: int) -> StoredView:
+        """The memory of a resident view."""
+        return self._all.map(lambda tensors: tensors[index])
+
+    def __iter__(self) -> Iterator[View]:
+        return self.some(range(len(self)))
+
+    def some(self, indices: Sequence[int]) -> Iterator[View]:
+        """The views of these indices, one after the other."""
+        for position, index in enumerate(indices):
+            self.announce(indices[position:])
+            yield self[index]
+
+    def announce(self, indices: Iterable[int]) -> None:
+        """Says which views come next, so that those that are not resident are read ahead."""
+        if not self.resident:
+            self._read_ahead.announce(indices)
+
+    def select(self, index: int) -> None:
+        """Selects the view of an index, in the order of the current stream."""
+        self.index.fill_(index)
+        if not self.resident:
+            self._slot.fill(self._read_ahead.take(index))
+
+    def selected(self) -> View:
+        """The selected view, read from addresses that stay the same if ``have_one_size``."""
+        if not self.resident:
+            return self._view(self._slot.view, self.index)
+        return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
 
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
         """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
@@ -156,7 +160,8 @@ class Views:
             depth, static_mask = (values[index].cpu() for values in (self._all.inverse_depth, self._all.static_mask))
             self._all.inverse_depth[index] = change(depth.float(), static_mask).half()
         else:
-            self._depth_changes[self._capture.train[index]].append(change)
+            self._reader.change_depth(index, change)
+            self._read_ahead.forget(index)
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
@@ -168,7 +173,7 @@ class Views:
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
 
-    def _view(self, stored: _Stored, index: Int64[Tensor, "1"]) -> View:
+    def _view(self, stored: StoredView, index: Int64[Tensor, "1"]) -> View:
         height, width = stored.static_mask.shape
         image = stored.image.float() / 255.0
         return View(
@@ -180,20 +185,5 @@ class Views:
             stored.inverse_depth.float(),
         )
 
-    def _store(self, frame: Frame) -> _Stored:
-        camera, size = frame.camera, frame.image.shape[:2]
-        if frame.static_mask is None:
-            raise ValueError(
-                f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
-                f"make masks {MASKS_REMEDY}"
-            )
-        depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
-        depth = depth.half()
-        for change in self._depth_changes.get(frame.name, ()):
-            depth = change(depth.float(), frame.static_mask).half()
-        time = torch.tensor([camera.time], dtype=torch.float32)
-        margin = round(self._mask_margin * max(size))
-        is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
-        border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
-        tensors = (camera.viewmat, camera.K, time, frame.image, frame.static_mask, depth)
-        return _Stored(*tensors, border, self._gains.get(frame.name))
+    def _to_device(self, tensor: Tensor) -> Tensor:
+        return tensor.to(self.device)

@@ -1,0 +1,207 @@
+"""Views as they are stored, read before they are needed and brought to the device while the step before still runs."""
+
+import os
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import islice
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from warpgs.data.capture import MASKS_REMEDY, Capture
+
+from . import ranks
+from .view_cache import Pixels, ViewCache
+
+MAX_THREADS = 16
+"""Maximum number of threads that read views; each holds one or two in memory."""
+
+SPARE = 2
+"""Number of views that may be ready beyond those that the threads are reading."""
+
+
+class StoredView(NamedTuple):
+    """A view as it is stored: bytes for images, half precision for depth. Tensors may have a leading view axis."""
+
+    viewmat: Tensor
+    K: Tensor
+    time: Tensor
+    image: Tensor
+    static_mask: Tensor
+    inverse_depth: Tensor
+    mask_border: Tensor | None
+    gain: Tensor | None
+
+    def nbytes(self) -> int:
+        """Memory of all tensors [bytes]."""
+        return sum(tensor.nbytes for tensor in self if tensor is not None)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "StoredView":
+        """Applies a function to every tensor."""
+        return StoredView._make(None if tensor is None else function(tensor) for tensor in self)
+
+    def copy_(self, other: "StoredView") -> None:
+        """Copies the values of another view of this size; from pinned memory without waiting."""
+        for old, new in zip(self, other, strict=True):
+            if old is not None and new is not None:
+                old.copy_(new, non_blocking=True)
+
+    def shapes(self) -> list[torch.Size | None]:
+        """The shape of every tensor."""
+        return [None if tensor is None else tensor.shape for tensor in self]
+
+
+def mask_border(static_mask: Bool[Tensor, "H W"], margin: int) -> Bool[Tensor, "H W"]:
+    """True in pixels that have both static and dynamic pixels within ``margin`` columns and rows."""
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    static, dynamic = (cv2.dilate(mask.numpy().astype(np.uint8), kernel) for mask in (static_mask, ~static_mask))
+    return torch.from_numpy(static & dynamic).bool()
+
+
+class ViewReader:
+    """Reads training views from a capture into host memory.
+
+    Args:
+        capture: Source of the frames.
+        mask_margin: As of ``Views``.
+        gains: As of ``Views``.
+        pinned: Whether into pinned memory, from which CUDA copies without waiting.
+
+    Attributes:
+        cache: Keeps decoded views, if they are to be read again and again.
+    """
+
+    def __init__(self, capture: Capture, mask_margin: float, gains: Float[Tensor, "T 3"] | None, pinned: bool) -> None:
+        self._capture, self._mask_margin, self._gains, self._pinned = capture, mask_margin, gains, pinned
+        self._depth_changes: dict[int, list[Callable[[Tensor, Tensor], Tensor]]] = defaultdict(list)
+        self.cache: ViewCache | None = None
+
+    def read(self, index: int) -> StoredView:
+        """The view of an index; several threads may read at once.
+
+        Raises:
+            ValueError: If the frame is damaged or has no mask; the message names it.
+        """
+        pixels = self.cache.load(index, self._pinned) if self.cache else None
+        if pixels is None:
+            pixels = self._decoded(index)
+            if self.cache:
+                self.cache.store(index, pixels)
+        camera = self._capture.cameras[self._capture.train[index]]
+        time = torch.tensor([camera.time], dtype=torch.float32)
+        gain = None if self._gains is None else self._gains[index]
+        stored = StoredView(camera.viewmat, camera.K, time, *pixels, gain)
+        return stored.map(Tensor.pin_memory) if self._pinned else stored
+
+    def change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Replaces the inverse depth of a view by a function of it and of the mask, whenever it is read."""
+        self._depth_changes[index].append(change)
+        if self.cache:
+            self.cache.forget(index)
+
+    def _decoded(self, index: int) -> Pixels:
+        frame = self._capture.frame(self._capture.train[index])
+        size = frame.image.shape[:2]
+        if frame.static_mask is None:
+            raise ValueError(
+                f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
+                f"make masks {MASKS_REMEDY}"
+            )
+        depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
+        depth = depth.half()
+        for change in self._depth_changes.get(index, ()):
+            depth = change(depth.float(), frame.static_mask).half()
+        margin = round(self._mask_margin * max(size))
+        is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
+        border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
+        return Pixels(frame.image, frame.static_mask, depth, border)
+
+
+class ReadAhead:
+    """Reads views by index in threads, before they are taken.
+
+    Threads suffice: OpenCV, torch and large numpy operations release the interpreter's lock. Every rank has its part of
+    the machine's cores.
+
+    Args:
+        read: Reads the view of an index; called by several threads at once.
+        device: Device of training.
+    """
+
+    def __init__(self, read: Callable[[int], StoredView], device: torch.device) -> None:
+        # New threads would use the first GPU, whatever the rank.
+        setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
+        threads = max(1, min(MAX_THREADS, (os.cpu_count() or 1) // ranks.num_local_ranks()))
+        self._read, self._max_pending = read, threads + SPARE
+        self._pool = ThreadPoolExecutor(threads, "views", initializer=setup)
+        self._pending: dict[int, Future[StoredView]] = {}
+
+    def announce(self, indices: Iterable[int]) -> None:
+        """Begins to read the first of these views, as many as there is room for, and forgets all others."""
+        wanted = list(islice(indices, self._max_pending))
+        for index in self._pending.keys() - wanted:
+            self.forget(index)
+        for index in wanted:
+            if index not in self._pending:
+                self._pending[index] = self._pool.submit(self._read, index)
+
+    def forget(self, index: int) -> None:
+        """Drops what was read ahead of a view, which is read again when it is taken."""
+        if index in self._pending:
+            self._pending.pop(index).cancel()
+
+    def take(self, index: int) -> StoredView:
+        """The view of an index, read ahead or now; raises what reading it raised."""
+        future = self._pending.pop(index, None)
+        return self._read(index) if future is None else future.result()
+
+
+class Slot:
+    """One view on the device, at addresses that stay the same as long as its size does.
+
+    On CUDA a view is copied twice: on a stream of its own from the host, while the step before still runs, and then on
+    the device to where the graph of a step reads it, which takes microseconds. So the host is at most one step ahead.
+
+    Args:
+        device: The device.
+
+    Attributes:
+        view: The view that was filled in last.
+    """
+
+    view: StoredView
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._arriving: StoredView | None = None
+        if device.type == "cuda":
+            self._stream, self._was_taken = torch.cuda.Stream(device), torch.cuda.Event()
+
+    def fill(self, view: StoredView) -> None:
+        """Replaces the view, in the order of the current stream.
+
+        Args:
+            view: In host memory, which is pinned if the host is not to wait.
+        """
+        if self._device.type != "cuda":
+            self.view = view
+            return
+        main = torch.cuda.current_stream(self._device)
+        if self._arriving is None or self._arriving.shapes() != view.shapes():
+            self._arriving, self.view = view.map(self._empty_like), view.map(self._empty_like)
+            self._stream.wait_stream(main)  # on which earlier work may still use this memory
+        self._was_taken.synchronize()
+        with torch.cuda.stream(self._stream):
+            self._arriving.copy_(view)
+        main.wait_stream(self._stream)
+        self.view.copy_(self._arriving)
+        self._was_taken.record(main)
+
+    def _empty_like(self, tensor: Tensor) -> Tensor:
+        return torch.empty_like(tensor, device=self._device)

@@ -1,0 +1,104 @@
+"""Views that were decoded once, in a file: reading them from there takes a tenth of decoding them again."""
+
+import contextlib
+import shutil
+import tempfile
+import threading
+import weakref
+from collections.abc import Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float16, UInt8
+from torch import Tensor
+
+BYTES_PER_PIXEL = 3 + 2 + 2 / 8
+"""Colour, depth in half precision, and one bit each of the mask and its border."""
+
+SPARE_BYTES = 4 << 30
+"""What must stay free on the disk [bytes]."""
+
+
+class Pixels(NamedTuple):
+    """What a view has for each of its pixels; see ``View``."""
+
+    image: UInt8[Tensor, "H W 3"]
+    static_mask: Bool[Tensor, "H W"]
+    inverse_depth: Float16[Tensor, "H W"]
+    mask_border: Bool[Tensor, "H W"] | None
+
+
+class ViewCache:
+    """The pixels of decoded views, by index.
+
+    The file has no name, so the operating system removes it however training ends. Several threads may store and load.
+
+    Args:
+        folder: Folder on the disk that is to hold the file.
+        sizes: Width and height of all views.
+
+    Attributes:
+        folder: The folder.
+        nbytes: Maximum size of the file [bytes].
+        fits: Whether the disk has room for it; if not, nothing is stored.
+    """
+
+    def __init__(self, folder: Path, sizes: Sequence[tuple[int, int]]) -> None:
+        self.folder, self._sizes = folder, sizes
+        # Bits are stored in whole bytes.
+        *self._starts, self.nbytes = accumulate(
+            (int(BYTES_PER_PIXEL * width * height) + 2 for width, height in sizes), initial=0
+        )
+        self.fits = shutil.disk_usage(folder).free > self.nbytes + SPARE_BYTES
+        self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115  # open as long as this lives
+        weakref.finalize(self, self._file.close)
+        self._lock = threading.Lock()
+        self._stored: dict[int, tuple[bool, bool]] = {}
+
+    def store(self, index: int, pixels: Pixels) -> None:
+        """Keeps the pixels of a view, unless the disk is full."""
+        if not self.fits:
+            return
+        has_depth = not bool(pixels.inverse_depth.isnan().all())
+        masks = [mask for mask in (pixels.static_mask, pixels.mask_border) if mask is not None]
+        parts = [pixels.image.numpy(), *(np.packbits(mask.numpy()) for mask in masks)]
+        parts += [pixels.inverse_depth.numpy()] * has_depth
+        data = b"".join(part.tobytes() for part in parts)
+        with self._lock:
+            self._file.seek(self._starts[index])
+            with contextlib.suppress(OSError):  # a full disk: the view is decoded again
+                if self._file.write(data) == len(data):
+                    self._stored[index] = len(masks) > 1, has_depth
+
+    def load(self, index: int, pinned: bool) -> Pixels | None:
+        """The pixels of a view; None if they are not stored.
+
+        Args:
+            index: Of the view.
+            pinned: Whether to read into pinned memory, from which CUDA copies without waiting.
+        """
+        if index not in self._stored:
+            return None
+        has_border, has_depth = self._stored[index]
+        width, height = self._sizes[index]
+        image = torch.empty(height, width, 3, dtype=torch.uint8, pin_memory=pinned)
+        depth = torch.empty(height, width, dtype=torch.half, pin_memory=pinned)
+        bits = np.empty((1 + has_border, -(-width * height // 8)), np.uint8)
+        parts = [image.numpy(), bits, *[depth.numpy()] * has_depth]
+        with self._lock:
+            self._file.seek(self._starts[index])
+            for part in parts:
+                if self._file.readinto(part.data) != part.nbytes:
+                    raise OSError(f"decoded views in {self.folder} cannot be read")
+        if not has_depth:
+            depth.fill_(torch.nan)
+        masks = torch.from_numpy(np.unpackbits(bits, axis=1, count=height * width)).view(torch.bool)
+        static, *border = (masks.pin_memory() if pinned else masks).view(-1, height, width).unbind()
+        return Pixels(image, static, depth, border[0] if border else None)
+
+    def forget(self, index: int) -> None:
+        """Removes a view, because what is made of its files changed."""
+        self._stored.pop(index, None)
