@@ -19,7 +19,7 @@ READ_LOCAL_FILES = {"protocol_whitelist": "file"}
 """Options of FFmpeg, with which playlists cannot make it open addresses."""
 
 
-NUM_KEPT = 16
+NUM_KEPT = 20
 """Number of decoded frames to keep: threads that read frames in their order ask for some a little late."""
 
 
