@@ -7,7 +7,7 @@ With the gradients g of the image and h of alpha, and R_i = Σ_{j>i} alpha_j T_j
 
 and the gradients of the Gaussian's six geometric values follow from the moments of s = alpha_i v_alpha_i over its
 pixels: Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy². ``rows`` turns them into gradients, once per Gaussian.
-T_i is recomputed from T_end by dividing by 1 - alpha_i, which ALPHA_MAX keeps away from zero.
+T_i is recomputed from T_end by dividing by 1 - alpha_i, which max_alpha keeps away from zero.
 """
 
 import functools
@@ -25,7 +25,7 @@ from .blocks import (
     state_types,
     tile_list,
 )
-from .constants import ALPHA_MAX, LN_2, LOG2_ALPHA_MIN, MIN_ALPHA
+from .constants import LN_2, LOG2_ALPHA_MIN, MIN_ALPHA
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -108,6 +108,7 @@ def make_composite_bwd(
         background_stride: int,
         width: int,
         height: int,
+        max_alpha: float,
         depth: wp.array[float],
         transmittance: wp.array[float],
         last: wp.array[int],
@@ -239,7 +240,7 @@ def make_composite_bwd(
                             hit = log2_alpha >= LOG2_ALPHA_MIN and position <= n[k]
                             contributes = contributes | wp.where(hit, 1, 0)
                             unclamped = exp2(log2_alpha)
-                            alpha = wp.where(hit, wp.min(ALPHA_MAX, unclamped), 0.0)
+                            alpha = wp.where(hit, wp.min(max_alpha, unclamped), 0.0)
                             scale = 1.0 / (1.0 - alpha)
                             t = T[k] * scale
                             w = alpha * t
@@ -248,7 +249,7 @@ def make_composite_bwd(
                                 v = v_color[c * wp.static(P) + k]
                                 v_weight += features[c] * v
                                 sums[c * wp.static(columns) + i] += w * v
-                            s = wp.where(unclamped <= ALPHA_MAX, alpha * (t * v_weight - R[k] * scale), 0.0)
+                            s = wp.where(unclamped <= max_alpha, alpha * (t * v_weight - R[k] * scale), 0.0)
                             R[k] = R[k] + w * v_weight
                             T[k] = t
                             sums[wp.static(C * columns) + i] += s
@@ -268,7 +269,7 @@ def make_composite_bwd(
                                     v_weight_images += features[c] * v_color[c * wp.static(P) + k]
                                 v_alpha_images = t * v_weight_images - R_images[k] * scale
                                 R_images[k] = R_images[k] + w * v_weight_images
-                                s = wp.where(unclamped <= ALPHA_MAX, LN_2 * alpha * v_alpha_images, 0.0)
+                                s = wp.where(unclamped <= max_alpha, LN_2 * alpha * v_alpha_images, 0.0)
                                 sums[wp.static((C + 6) * columns) + i] += s * (2.0 * row0[2] * dx + row0[3] * dy)
                                 sums[wp.static((C + 7) * columns) + i] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
                     else:
@@ -281,7 +282,7 @@ def make_composite_bwd(
                             log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
                             if log2_alpha >= LOG2_ALPHA_MIN:
                                 unclamped = exp2(log2_alpha)
-                                alpha = wp.min(ALPHA_MAX, unclamped)
+                                alpha = wp.min(max_alpha, unclamped)
                                 scale = 1.0 / (1.0 - alpha)
                                 v_alpha = float(0.0)
                                 v_alpha_images = float(0.0)
@@ -304,7 +305,7 @@ def make_composite_bwd(
                                     v_alpha = t * v_weight - R[k] * scale
                                     R[k] = R[k] + w * v_weight
                                     T[k] = t
-                                if unclamped <= ALPHA_MAX:
+                                if unclamped <= max_alpha:
                                     s = alpha * v_alpha
                                     sums[wp.static(C)] += s
                                     sums[wp.static(C + 1)] += s * dx

@@ -2,7 +2,7 @@
 
 A pixel p composites the Gaussians of its tile in depth order; with d = mean2d - p,
 
-    alpha_i = min(ALPHA_MAX, opacity_i exp(-½ dᵀ conic_i d)),  skipped below ALPHA_MIN,
+    alpha_i = min(max_alpha, opacity_i exp(-½ dᵀ conic_i d)),  skipped below ALPHA_MIN,
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
     image = Σ_i alpha_i T_i feature_i + T_end background.
 
@@ -37,7 +37,7 @@ from .blocks import (
     state_types,
     tile_list,
 )
-from .constants import ALPHA_MAX, LOG2_ALPHA_MIN, MIN_ALPHA, TRANSMITTANCE_MIN
+from .constants import LOG2_ALPHA_MIN, MIN_ALPHA, TRANSMITTANCE_MIN
 from .ellipse import ellipse_half_size, ellipse_span, ellipse_value
 from .lanes import (
     exp2,
@@ -96,6 +96,7 @@ def make_composite_fwd(
         background_stride: int,
         width: int,
         height: int,
+        max_alpha: float,
         image: wp.array2d[float],
         depth: wp.array[float],
         alpha_image: wp.array[float],
@@ -181,7 +182,7 @@ def make_composite_fwd(
                             t = T[k]
                             tags = n[k]
                             hit = log2_alpha >= LOG2_ALPHA_MIN and t > 0.0
-                            alpha = wp.where(hit, wp.min(ALPHA_MAX, exp2(log2_alpha)), 0.0)
+                            alpha = wp.where(hit, wp.min(max_alpha, exp2(log2_alpha)), 0.0)
                             t_next = t - alpha * t
                             closes = hit and t_next <= TRANSMITTANCE_MIN
                             w = wp.where(closes, 0.0, alpha * t)
@@ -202,7 +203,7 @@ def make_composite_fwd(
                             dx = row0[0] - (x0 + float(i * lane_columns()))
                             log2_alpha = row1[1] - ellipse_value(row0[2], row0[3], row1[0], dx, dy)
                             if log2_alpha >= LOG2_ALPHA_MIN:
-                                alpha = wp.min(ALPHA_MAX, exp2(log2_alpha))
+                                alpha = wp.min(max_alpha, exp2(log2_alpha))
                                 k = j * wp.static(columns) + i
                                 t = T[k]
                                 if t > 0.0:

@@ -10,9 +10,6 @@ TILE_SIZE = wp.constant(16)
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian whose alpha in a pixel is below this is skipped there; 3DGS, section 6."""
 
-ALPHA_MAX = wp.constant(0.999)
-"""Upper bound of a Gaussian's alpha in a pixel, so that 1 - alpha can be divided by; as in gsplat 1.5."""
-
 TRANSMITTANCE_MIN = wp.constant(1.0e-4)
 """Compositing of a pixel stops before its transmittance would fall to this; 3DGS, section 6."""
 

@@ -45,6 +45,8 @@ def test_presets_are_valid(name):
         ("loss.depth", float("inf")),
         ("schedule.sh_degree_every", 0),
         ("factor", 0),
+        ("max_alpha", 0.0),
+        ("max_alpha", 0.9999),  # no Gaussian of this alpha would be composited
         ("model.width", 100_000),
         ("model.depth", 65),
         ("model.time_bands", 10**9),

@@ -40,20 +40,20 @@ def outputs(rendering):
     return [layer.image for layer in layers] + [layer.alpha for layer in layers]
 
 
-def reference_outputs(splats, behind, branches=True, antialias=False):
+def reference_outputs(splats, behind, branches=True, **options):
     masks = (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,)
     doubles = as_doubles(splats)
-    results = [reference(doubles, CAMERA, behind, selected=mask, antialias=antialias) for mask in masks]
+    results = [reference(doubles, CAMERA, behind, selected=mask, **options) for mask in masks]
     return doubles, [r[0] for r in results] + [r[1] for r in results], results[0][2]
 
 
-@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("options", [{}, {"antialias": True}, {"max_alpha": 0.6}])
 @pytest.mark.parametrize("channels", [None, 3])
-def test_images_statistics_and_gradients_equal_the_reference(channels, antialias):
+def test_images_statistics_and_gradients_equal_the_reference(channels, options):
     splats = as_leaves(make_splats(channels=channels))
     behind, behind64 = background().requires_grad_(), background().double().requires_grad_()
-    result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, antialias=antialias))
-    doubles, expected, weights = reference_outputs(splats, behind64, antialias=antialias)
+    result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, **options))
+    doubles, expected, weights = reference_outputs(splats, behind64, **options)
     for actual, wanted in zip(outputs(result), expected, strict=True):
         assert error(actual, wanted) < 2e-6
     assert relative_error(result.weights, weights.sum((1, 2))) < 2e-6
@@ -383,3 +383,9 @@ def test_a_degree_of_harmonics_can_be_chosen():
     cut = dataclasses.replace(splats, sh=splats.sh[:, :4].contiguous(), sh_degree=None)
     assert torch.equal(render(splats, CAMERA).joint.image, render(cut, CAMERA).joint.image)
     assert set(float_tensors(splats)) == {*GEOMETRY, "sh"}
+
+
+@pytest.mark.parametrize("max_alpha", [0.0, -1.0, 0.9999, 1.0, float("nan")])
+def test_a_maximum_alpha_that_would_hide_gaussians_is_refused(max_alpha):
+    with pytest.raises(ValueError, match="max_alpha must be"):
+        RenderSettings(max_alpha=max_alpha)

@@ -200,7 +200,8 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
         tape.record_func(step, [])
     rows = splats.rows
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
-    composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, settings.statistics)
+    options = (settings.statistics, settings.max_alpha)
+    composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, *options)
     tape.record_func(back.composite, [])
 
     saved = _Saved(*splats[:3], features, rows.packed)

@@ -13,11 +13,11 @@ from warpgs.rendering import render
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
 
-CAMERA = make_camera()
+CAMERA, SETTINGS = make_camera(), RenderSettings(antialias=True)
 
 
 def image(splats, camera):
-    return render(splats, camera, settings=RenderSettings(antialias=True)).joint.image
+    return render(splats, camera, settings=SETTINGS).joint.image
 
 
 @torch.no_grad()
@@ -27,7 +27,7 @@ def test_a_camera_that_was_moved_finds_back():
     poses.translations += torch.tensor([0.004, -0.003, 0.002])
     moved = dataclasses.replace(CAMERA, viewmat=poses(CAMERA.viewmat, torch.tensor([0])))
     truth = image(splats, CAMERA)
-    aligned = aligned_camera(splats, moved, truth, 4.0, antialias=True)
+    aligned = aligned_camera(splats, moved, truth, 4.0, SETTINGS)
     assert not aligned.viewmat.requires_grad
     assert (aligned.viewmat - CAMERA.viewmat).norm() < 0.1 * (moved.viewmat - CAMERA.viewmat).norm()
     assert (image(splats, aligned) - truth).abs().mean() < 0.1 * (image(splats, moved) - truth).abs().mean()
@@ -37,7 +37,7 @@ def test_a_part_that_is_somewhere_else_does_not_move_a_camera():
     splats = make_splats()
     truth = image(splats, CAMERA)
     truth[8:18, 10:22] = 1.0
-    aligned = aligned_camera(splats, CAMERA, truth, 4.0, antialias=True)
+    aligned = aligned_camera(splats, CAMERA, truth, 4.0, SETTINGS)
     assert (aligned.viewmat - CAMERA.viewmat).norm() < 0.005  # 0.31 with a quadratic loss
 
 
@@ -45,7 +45,7 @@ def test_a_part_that_is_somewhere_else_does_not_move_a_camera():
 def test_a_camera_stays_where_nothing_is_rendered_or_compared(region):
     splats = dataclasses.replace(make_splats(), means=torch.full((60, 3), -5.0))
     truth = torch.rand(CAMERA.height, CAMERA.width, 3)
-    assert torch.equal(aligned_camera(splats, CAMERA, truth, 4.0, True, region).viewmat, CAMERA.viewmat)
+    assert torch.equal(aligned_camera(splats, CAMERA, truth, 4.0, SETTINGS, region).viewmat, CAMERA.viewmat)
 
 
 def scene_and_capture(finished_run, poses):

@@ -162,6 +162,13 @@ def test_a_page_starts_at_the_middle_view_and_follows_the_training_cameras(run, 
     assert start.title == "the run"
 
 
+def test_a_page_shows_images_as_the_config_says(run):
+    clouds = clouds_of(run)
+    clouds.scene.config = dataclasses.replace(clouds.scene.config, antialias=True, max_alpha=0.5)
+    start = start_view(clouds, None, keys=2, seconds=1.0)
+    assert (start.antialias, start.max_alpha) == (True, 0.5)
+
+
 @pytest.mark.parametrize(
     ("file", "options"),
     [

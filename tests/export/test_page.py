@@ -26,7 +26,7 @@ def start(title="scene", track=False):
     camera = scenes.camera()
     K, view = camera.K, camera.viewmat.tolist()
     intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    return StartView(title, camera.size, intrinsics, view, 3.0, [view, view] if track else [], 4.0, False)
+    return StartView(title, camera.size, intrinsics, view, 3.0, [view, view] if track else [], 4.0, False, 0.999)
 
 
 @pytest.fixture(scope="module")

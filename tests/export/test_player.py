@@ -1,5 +1,7 @@
 """The page in a browser: it shows what the renderer shows."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from tests.export import scenes
 from tests.export.browser import Browser, executable
 from tests.export.test_page import start
 from warpgs.cameras import Camera
+from warpgs.config import RenderSettings
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
+from warpgs.rendering import render
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.visualize.images import to_bytes
 
@@ -63,6 +67,15 @@ def psnr(a, b):
 @pytest.mark.parametrize("time", [0.0, 0.6, 1.0])
 def test_the_page_shows_the_image_of_the_renderer(browser, page, baked, time):
     assert psnr(shown(browser, page, f"time={time}"), expected(baked.at(time))) > 40
+
+
+def test_alphas_are_clamped_as_in_the_renderer(browser, baked, tmp_path):
+    write_page(tmp_path / "scene.html", baked, dataclasses.replace(start(), max_alpha=0.3))
+    image = shown(browser, tmp_path / "scene.html", "time=0.5")
+    settings, cloud = RenderSettings(max_alpha=0.3), baked.at(0.5)
+    wanted = render(cloud.splats(), scenes.camera(*SIZE), settings=settings).joint.image
+    assert psnr(image, to_bytes(wanted)) > 40
+    assert psnr(image, expected(cloud)) < 35
 
 
 @pytest.mark.parametrize("layer", ["static", "dynamic"])

@@ -43,7 +43,9 @@ def spherical_harmonics(means, sh, viewmat, *, degree=None, radii=None) -> torch
     return differentiable(op, means, sh, viewmat, radii)[0]
 
 
-def composite(splats, features, size, *, background=None, is_dynamic=None, statistics=False) -> Composite:
+def composite(
+    splats, features, size, *, background=None, is_dynamic=None, statistics=False, max_alpha=0.999
+) -> Composite:
     """Splats that are skipped keep their radii."""
     branch = None if is_dynamic is None else is_dynamic.view(torch.uint8)
     n = 1 if is_dynamic is None else NUM_BRANCH_IMAGES
@@ -52,7 +54,7 @@ def composite(splats, features, size, *, background=None, is_dynamic=None, stati
         *geometry, features, background = tensors
         rows, order = pack(Projection(*geometry, splats.radii.clone()), features, with_depth=False)
         tiles = bin_splats(rows, order, size, branch)
-        result, traversal = composite_fwd(rows, tiles, size, background, statistics)
+        result, traversal = composite_fwd(rows, tiles, size, background, statistics, max_alpha)
 
         def backward(saved, v_layers):
             _, conics, _, opacities, _, background, *alphas = saved

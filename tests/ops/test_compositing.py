@@ -54,10 +54,10 @@ def make_walled_inputs(num=40, size=SIZE):
     return inputs
 
 
-def theirs(inputs, size=SIZE, selected=None):
+def theirs(inputs, size=SIZE, selected=None, **options):
     means2d, conics, opacities, features, background, depths = inputs
     selected = torch.ones(means2d.shape[0], dtype=torch.bool) if selected is None else selected
-    return reference((means2d, conics, depths, opacities), features, selected, size, background)
+    return reference((means2d, conics, depths, opacities), features, selected, size, background, **options)
 
 
 def leaves(inputs, dtype=torch.float32):
@@ -133,17 +133,60 @@ def test_a_stack_of_opaque_splats_stops_where_the_reference_stops():
     assert not single[2].grad[hidden].any()
 
 
-def test_a_fully_opaque_splat_gets_no_gradient_where_it_is_clamped():
+@pytest.mark.parametrize("max_alpha", [0.999, 0.99])
+def test_a_fully_opaque_splat_gets_no_gradient_where_it_is_clamped(max_alpha):
     inputs = make_inputs(1)
     inputs[0] = torch.tensor([[25.5, 18.5]])
     inputs[2] = torch.ones(1)
     single, double = leaves(inputs), leaves(inputs, torch.float64)
-    result, alpha = ours(single), theirs(double)[1]
-    assert result.alphas[0].max().item() == pytest.approx(0.999, abs=1e-6)
+    result, alpha = ours(single, max_alpha=max_alpha), theirs(double, max_alpha=max_alpha)[1]
+    assert result.alphas[0].max().item() == pytest.approx(max_alpha, abs=1e-6)
     v_outputs = random_like([alpha])
     weighted_sum(result.alphas, v_outputs).backward()
     weighted_sum([alpha], v_outputs).backward()
     assert relative_error(single[2].grad, double[2].grad) < 1e-5
+
+
+def make_clamped_inputs():
+    """Wide splats, the first of which has a larger alpha than 0.99 in a third of the pixels, in front of the others."""
+    inputs = make_inputs(3)
+    inputs[0] = torch.tensor([[25.0, 18.5], [10.0, 30.0], [40.0, 5.0]])
+    inputs[1] = torch.tensor([[1e-4, 2e-5, 8e-5], [2e-3, 0.0, 1e-3], [1e-3, 0.0, 2e-3]])
+    inputs[2], inputs[5] = torch.tensor([0.998, 0.7, 0.9]), torch.tensor([1.0, 2.0, 3.0])
+    return inputs
+
+
+def test_gradients_with_clamped_alphas_equal_the_reference():
+    single, double = leaves(make_clamped_inputs()), leaves(make_clamped_inputs(), torch.float64)
+    result, expected = ours(single, max_alpha=0.99), theirs(double, max_alpha=0.99)[:2]
+    outputs = [result.images[0], result.alphas[0]]
+    assert error(outputs[0], expected[0]) < 2e-6
+    v_outputs = random_like(outputs)
+    weighted_sum(outputs, v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
+    for name, actual, wanted in zip(INPUTS, single, double, strict=False):
+        assert relative_error(actual.grad, wanted.grad) < 1e-5, name
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_gradients_with_clamped_alphas_predict_the_effect_of_a_small_step(name):
+    """Central differences along the gradient of the first splat, which is clamped."""
+    inputs, k = make_clamped_inputs(), INPUTS.index(name)
+    weights = torch.rand(SIZE[1], SIZE[0], 3, generator=generator()).double()
+
+    def loss(values):
+        return (ours([*inputs[:k], values, *inputs[k + 1 :]], max_alpha=0.99).images[0].double() * weights).sum()
+
+    values = inputs[k].clone().requires_grad_()
+    loss(values).backward()
+    direction = values.grad.clone()
+    if name != "background":
+        direction[1:] = 0
+    direction /= direction.norm()
+    step = {"means2d": 0.3, "conics": 2e-6, "opacities": 5e-4}.get(name, 1e-2)
+    sides = [loss(values.detach() + sign * step * direction) for sign in (1, -1)]
+    slope = ((sides[0] - sides[1]) / (2 * step)).item()
+    assert slope == pytest.approx((values.grad * direction).sum().item(), rel=3e-3)
 
 
 def test_statistics_are_the_sums_of_the_blend_weights():
@@ -258,7 +301,7 @@ def test_absolute_gradients_on_screen_sum_absolute_values_over_pixels(inputs, dy
     radii = torch.full(means2d.shape, 1000, dtype=torch.int32)
     rows, order = pack(Projection(means2d, conics, depths, opacities, radii), features, with_depth=False)
     tiles = bin_splats(rows, order, size, None if dynamic is None else dynamic.view(torch.uint8))
-    _, traversal = composite_fwd(rows, tiles, size, background, statistics=False)
+    _, traversal = composite_fwd(rows, tiles, size, background, statistics=False, max_alpha=0.999)
     v_layers = [*v_outputs, *[None] * len(images)]
     for kind, per_gaussian in ((None, gradients), ("absolute", gradients.abs())):
         v_rows = composite_bwd(rows, background, traversal, v_layers, kind)

@@ -6,12 +6,16 @@ import torch
 from torch import Tensor
 
 ALPHA_MIN = 1.0 / 255.0
-ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 
 
 def composite(
-    splats: Sequence[Tensor], features: Tensor, is_visible: Tensor, size: tuple[int, int], background: Tensor
+    splats: Sequence[Tensor],
+    features: Tensor,
+    is_visible: Tensor,
+    size: tuple[int, int],
+    background: Tensor,
+    max_alpha: float = 0.999,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """image [H, W, C], alpha [H, W], blend weights [N, H, W] of the Gaussians for which ``is_visible`` [N] is true.
 
@@ -32,7 +36,7 @@ def composite(
         dx, dy = means2d[g, 0] - x[None, :], means2d[g, 1] - y[:, None]
         a, b, c = conics[g]
         alpha = opacities[g] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-        alpha = alpha.clamp(max=ALPHA_MAX)
+        alpha = alpha.clamp(max=max_alpha)
         seen = running & (alpha >= ALPHA_MIN)
         T_next = T * (1 - alpha)
         running = running & ~(seen & (T_next <= TRANSMITTANCE_MIN))

@@ -14,6 +14,7 @@ def render(
     background: Tensor,
     selected: Tensor | None = None,
     antialias: bool = False,
+    max_alpha: float = 0.999,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """image, alpha, weights for a dict of ``Splats`` tensors; ``selected`` [N] restricts the splats to a branch."""
     dtype = tensors["means"].dtype
@@ -26,7 +27,7 @@ def render(
         degree = round(tensors["sh"].shape[1] ** 0.5) - 1
         features = sh.spherical_harmonics(tensors["means"], tensors["sh"], viewmat, degree)
     visible = visible if selected is None else visible & selected
-    return compositing.composite(splats, features, visible, camera.size, background)
+    return compositing.composite(splats, features, visible, camera.size, background, max_alpha)
 
 
 def as_dict(splats: Splats, **changes: Tensor) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import error
-from warpgs.config import MaskPerturbation, TrainConfig, scaled
+from warpgs.config import MaskPerturbation, RenderSettings, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
@@ -95,6 +95,12 @@ def test_what_a_kill_in_the_first_write_leaves_is_an_empty_folder(tmp_path, capt
     assert read_config(folder).out == folder
     with pytest.raises(ValueError, match="exists and is not empty"):
         new_folder(config, capture)
+
+
+def test_earlier_runs_keep_the_maximum_alpha_that_they_were_trained_with(tmp_path, capture):
+    run = create(dataclasses.replace(PRESETS["paper"], out=tmp_path / "run"), capture)
+    edit(run, lambda values: values.pop("max_alpha"))
+    assert read_config(run).render_settings == RenderSettings(max_alpha=0.999)
 
 
 def fail_locked(run):

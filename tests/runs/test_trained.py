@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from tests.export import scenes
+from warpgs.config import RenderSettings
+from warpgs.rendering import render
 from warpgs.runs.trained import MAX_GRAPHS, TrainedScene
 from warpgs.runtime import graphs
 
@@ -48,6 +50,15 @@ def test_a_time_of_numpy_is_rendered_like_one_of_python(trained):
     (time,) = np.linspace(0.25, 1.0, 1)
     assert torch.equal(trained.render(scenes.camera(), time=time).joint.image, expected)
     assert torch.equal(trained.splats(time).means, trained.splats(0.25).means)
+
+
+def test_images_are_rendered_as_the_config_says(trained):
+    config = dataclasses.replace(trained.config, antialias=True, max_alpha=0.3)
+    own = TrainedScene(trained.scene, config, trained.metadata).render(scenes.camera()).joint.image
+    settings = RenderSettings(antialias=True, max_alpha=0.3)
+    assert torch.equal(own, render(trained.splats(0.0), scenes.camera(), settings=settings).joint.image)
+    for other in (RenderSettings(antialias=True), RenderSettings(max_alpha=0.3)):
+        assert not torch.equal(own, render(trained.splats(0.0), scenes.camera(), settings=other).joint.image)
 
 
 def test_each_size_is_captured_once(trained, captured):

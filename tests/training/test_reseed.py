@@ -9,6 +9,7 @@ from tests import tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
 from tests.scenes import error, select
+from warpgs.config import RenderSettings
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training import optimizer as optim
 from warpgs.training.dynamic_points import DynamicPoints
@@ -54,7 +55,7 @@ def lose_half(trainer):
 
 def test_lost_are_the_dynamic_pixels_that_dynamic_gaussians_alone_leave_transparent(trainer):
     lose_half(trainer)
-    mask_of = lost_pixels(trainer.scene, PHASE, antialias=False)
+    mask_of = lost_pixels(trainer.scene, PHASE, RenderSettings())
     view = trainer.views[2]
     with torch.no_grad():
         splats = trainer.scene.splats(view.time, sh_degree=1)
@@ -66,7 +67,7 @@ def test_lost_are_the_dynamic_pixels_that_dynamic_gaussians_alone_leave_transpar
 
 
 def test_the_fraction_of_lost_pixels_grows_with_what_is_lost(trainer):
-    mask_of = lost_pixels(trainer.scene, PHASE, antialias=False)
+    mask_of = lost_pixels(trainer.scene, PHASE, RenderSettings())
     before = lost_fraction(trainer.views, mask_of)
     lose_half(trainer)
     half = lost_fraction(trainer.views, mask_of)
@@ -124,7 +125,7 @@ def test_an_object_whose_gaussians_are_lost_gets_new_ones(trainer, capsys, lost)
     assert not trainer.protocol.at(12).reseed
     if lost:
         lose_half(trainer)
-    num, mask_of = len(trainer.scene.dynamic), lost_pixels(trainer.scene, PHASE, antialias=False)
+    num, mask_of = len(trainer.scene.dynamic), lost_pixels(trainer.scene, PHASE, RenderSettings())
     with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
         trainer._reseed(plan.phase, logger)
     added = len(trainer.scene.dynamic) - num

@@ -99,8 +99,8 @@ def test_an_image_of_one_pixel_is_rendered(layer):
 
 
 def test_another_layer_takes_one_entry(monkeypatch):
-    def inverted(splats, camera, antialias):
-        return 255 - LAYERS["joint"](splats, camera, antialias)
+    def inverted(splats, camera, settings):
+        return 255 - LAYERS["joint"](splats, camera, settings)
 
     monkeypatch.setitem(LAYERS, "inverted", inverted)
     assert (render_layer("inverted", splats(), CAMERA) == 255 - render_layer("joint", splats(), CAMERA)).all()

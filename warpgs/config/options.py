@@ -12,6 +12,10 @@ NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
 
+MAX_ALPHA = Bounds(positive=True, max=0.9998)
+"""Range of ``max_alpha``: a Gaussian with an alpha of 0.9999 would end a pixel instead of contributing to it."""
+
+
 @dataclass(frozen=True)
 class RenderSettings:
     """What a render computes in addition to the joint image.
@@ -23,6 +27,7 @@ class RenderSettings:
         absgrad: The gradient of ``screen_offsets`` is the sum of its absolute values over the pixels (AbsGS).
         imagegrad: The gradient of ``screen_offsets`` is that of the images alone, without depth; not with absgrad.
         antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
+        max_alpha: Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS.
         near: Near plane [scene units].
         max_intersections: Size of the buffers for intersections of Gaussians with tiles; learned if None.
     """
@@ -33,12 +38,14 @@ class RenderSettings:
     absgrad: bool = False
     imagegrad: bool = False
     antialias: bool = False
+    max_alpha: float = 0.999
     near: float = 0.01
     max_intersections: int | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.near < math.inf:
             raise ValueError(f"near must be positive and finite, got {self.near}")
+        MAX_ALPHA.check("max_alpha", self.max_alpha)
         if self.absgrad and self.imagegrad:
             raise ValueError("expected absgrad or imagegrad, got both: both are the gradient of screen_offsets")
         if self.max_intersections is not None and not 0 < self.max_intersections < 1 << 30:
@@ -307,6 +314,8 @@ class TrainConfig:
     """Divide jumps of exposure and white balance between frames out of the training images."""
     antialias: bool = False
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
+    max_alpha: Annotated[float, MAX_ALPHA] = RenderSettings.max_alpha
+    """Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS (paper)."""
     graph: bool = True
     """On CUDA, replay iterations and the steps of ``schedule.fit_motion`` as CUDA graphs."""
     masks: MaskPerturbation = field(default_factory=MaskPerturbation)
@@ -328,6 +337,11 @@ class TrainConfig:
     """Network of LPIPS: vgg (3DGS), alex (DyCheck's mLPIPS) or squeeze."""
     as_taken: bool = False
     """Whether the evaluation at the end compares frames as they were taken, with the distortion of their lens."""
+
+    @property
+    def render_settings(self) -> RenderSettings:
+        """How all images of the run are rendered."""
+        return RenderSettings(antialias=self.antialias, max_alpha=self.max_alpha)
 
 
 def validate(config: TrainConfig) -> None:

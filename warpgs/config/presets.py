@@ -7,6 +7,7 @@ from .options import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedu
 PAPER = TrainConfig(
     preset="paper",
     vrig_factor=4,
+    max_alpha=0.99,
     model=ModelConfig(
         raw_input=False,
         skip=5,

@@ -52,7 +52,7 @@ def alignment(scene: TrainedScene, unit: float) -> Align:
             return camera
         truth = frame.image.to(scene.device).float() / 255.0
         region = None if frame.covisible is None else frame.covisible.to(scene.device)
-        return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.antialias, region)
+        return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.render_settings, region)
 
     return align
 
@@ -63,7 +63,7 @@ def aligned_camera(
     camera: Camera,
     truth: Float[Tensor, "H W 3"],
     unit: float,
-    antialias: bool,
+    settings: RenderSettings,
     region: Bool[Tensor, "H W"] | None = None,
 ) -> Camera:
     """The camera, moved to where the rendered image is nearest to the ground truth, by the Huber loss.
@@ -75,10 +75,10 @@ def aligned_camera(
         camera: On the device of the splats.
         truth: [H, W, 3] in [0, 1].
         unit: Length of a unit of translation [scene units].
-        antialias: As in ``RenderSettings``.
+        settings: How images are rendered.
         region: [H, W] the pixels that are compared; all if None.
     """
-    settings, device = RenderSettings(antialias=antialias), camera.viewmat.device
+    device = camera.viewmat.device
     poses, index = PoseCorrections(1, unit).to(device), torch.zeros(1, dtype=torch.int64, device=device)
 
     def moved(pose: Float[Tensor, "6"]) -> Camera:

@@ -9,7 +9,6 @@ from jaxtyping import Int64
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.config import RenderSettings
 from warpgs.rendering import render
 from warpgs.runs.trained import TrainedScene
 
@@ -46,7 +45,7 @@ class Clouds:
         """
         if count < 1:
             raise ValueError(f"expected at least 1 Gaussian to keep, got {count}")
-        settings = RenderSettings(statistics=True, antialias=self.scene.config.antialias)
+        settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
         weight = np.zeros(len(self.at(0.0)))
         if len(weight) <= count:
             return self

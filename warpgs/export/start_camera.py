@@ -33,7 +33,7 @@ class StartView:
         pivot: Distance from the camera to the point that it orbits [scene units].
         track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
         seconds: Duration of the scene [s].
-        antialias: Whether opacities compensate for the low-pass filter.
+        antialias, max_alpha: As in ``RenderSettings``.
         background: Colour behind everything, in [0, 1].
     """
 
@@ -45,6 +45,7 @@ class StartView:
     track: list[list[list[float]]]
     seconds: float
     antialias: bool
+    max_alpha: float
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -87,6 +88,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         track=[c.viewmat.tolist() for c in track],
         seconds=seconds,
         antialias=config.antialias,
+        max_alpha=config.max_alpha,
         background=background_color(config.background),
     )
 

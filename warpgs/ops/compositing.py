@@ -66,6 +66,7 @@ class Traversal(NamedTuple):
     Attributes:
         tiles: Lists of the Gaussians of each tile.
         size: (width, height) [px].
+        max_alpha: As in ``RenderSettings``.
         depth: [pixels of all images, in any shape] rendered depth; None without.
         transmittance: [the same] at the end of each pixel.
         last: [the same] int32 number of Gaussians of the list until the last one that contributed.
@@ -74,6 +75,7 @@ class Traversal(NamedTuple):
 
     tiles: Tiles
     size: tuple[int, int]
+    max_alpha: float
     depth: Tensor | None
     transmittance: Tensor
     last: Tensor
@@ -117,7 +119,7 @@ def _launch(
     pixels, blocks, lanes = _layout(size, tiles)
     stride = 0 if background is None or background.ndim == 1 else rows.num_features
     lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
-    inputs = (*lists, rows.packed, background, stride, *size)
+    inputs = (*lists, rows.packed, background, stride, *size, traversal.max_alpha)
     kernel = make_kernel(rows.num_features, rows.with_depth, num_images, pixels, variant)
     work = TILE_SIZE * TILE_SIZE
     dim = num_images * blocks * lanes
@@ -125,7 +127,7 @@ def _launch(
 
 
 def composite_fwd(
-    rows: Rows, tiles: Tiles, size: tuple[int, int], background: Tensor | None, statistics: bool
+    rows: Rows, tiles: Tiles, size: tuple[int, int], background: Tensor | None, statistics: bool, max_alpha: float
 ) -> tuple[Composite, Traversal]:
     """Composites packed rows: three images if the tiles have branches, otherwise one.
 
@@ -135,6 +137,7 @@ def composite_fwd(
         size: (width, height) [px].
         background: [features], or [images, features] with one for each image; None is black. Depth has none.
         statistics: Whether to report the contribution of each Gaussian.
+        max_alpha: As in ``RenderSettings``.
 
     Raises:
         ValueError: If all images together have too many pixels to be counted.
@@ -150,11 +153,11 @@ def composite_fwd(
     depth = new(shape) if rows.with_depth else None
     joint_state = None if num_images == 1 else new_int(_layout(size, tiles)[1]).zero_()
     own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
-    traversal = Traversal(tiles, size, own_depth, new(shape), new_int(shape), joint_state)
+    traversal = Traversal(tiles, size, max_alpha, own_depth, new(shape), new_int(shape), joint_state)
     N, shards = rows.packed.shape[0], num_shards(image.device)
     contributed = new(N, dtype=torch.uint8).zero_() if statistics else None
     weights = new(shards, N).zero_() if statistics else None
-    outputs = (image, depth, alpha, *traversal[3:], contributed)
+    outputs = (image, depth, alpha, *traversal[4:], contributed)
     _launch(make_composite_fwd, statistics, rows, background, traversal, *outputs, per_shard=weights)
     found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
     images, alphas, depths = (_layers(t, num_images) for t in (image, alpha, depth))
@@ -191,7 +194,7 @@ def composite_bwd(
             images_with_gradient |= 1 << (k % num_images)
     packed = rows.packed
     v_rows = packed.new_zeros(num_shards(packed.device), packed.shape[0], gradient_stride(rows.num_channels))
-    inputs = (*traversal[2:], *v_arrays, images_with_gradient)
+    inputs = (*traversal[3:], *v_arrays, images_with_gradient)
     _launch(make_composite_bwd, offset_gradient, rows, background, traversal, *inputs, per_shard=v_rows)
     return v_rows
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.config import RenderSettings, TrainConfig
+from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture, background_color
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
@@ -124,5 +124,5 @@ class TrainedScene:
 
     @torch.no_grad()
     def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
-        settings = RenderSettings(branches=branches, antialias=self.config.antialias)
+        settings = replace(self.config.render_settings, branches=branches)
         return render(self._splats(time), camera, settings=settings)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,7 @@ from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
-from warpgs.rendering import render
+from warpgs.rendering import DEFAULTS, render
 
 from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .losses import DepthTrust
@@ -169,11 +170,15 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
 
 @torch.no_grad()
 def align_to_rendering(
-    alignments: Float[Tensor, "T 2"], views: Views, scene: SplitScene, sh_degree: int, antialias: bool = False
+    alignments: Float[Tensor, "T 2"],
+    views: Views,
+    scene: SplitScene,
+    sh_degree: int,
+    settings: RenderSettings = DEFAULTS,
 ) -> Float[Tensor, "T 2"]:
     """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
     splats = scene.static_splats(sh_degree)
-    settings = RenderSettings(depth=True, antialias=antialias)
+    settings = replace(settings, depth=True)
     found = []
     for batch in _batches(views, views.num_pixels // len(views)):
         samples = []

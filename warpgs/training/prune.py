@@ -1,6 +1,7 @@
 """Pruning: of static Gaussians by visibility (paper Eq. 15), and of both branches by contribution to the images."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -11,7 +12,7 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
-from warpgs.rendering import render
+from warpgs.rendering import DEFAULTS, render
 
 from . import optimizer as optim
 from .schedule import Phase
@@ -46,7 +47,7 @@ class Pruned(NamedTuple):
 
 @torch.no_grad()
 def visibility(
-    scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, antialias: bool = False
+    scene: SplitScene, cameras: Iterable[Camera], sh_degree: int, settings: RenderSettings = DEFAULTS
 ) -> Float[Tensor, " N"]:
     """V̄ of paper Eq. 15 for every static Gaussian: 1/T Σ_t 1[rendered at t] (1 − α(t)), over T cameras.
 
@@ -57,14 +58,14 @@ def visibility(
         scene: The scene.
         cameras: Cameras on the scene's device.
         sh_degree: Maximum degree of spherical harmonics in use.
-        antialias: As in ``RenderSettings``.
+        settings: How images are rendered.
     """
-    static = scene.static
+    static, settings = scene.static, replace(settings, statistics=True)
     splats = scene.static_splats(sh_degree)
     num_rendered = torch.zeros(len(static), device=static.means.device)
     num = 0
     for camera in cameras:
-        rendering = render(splats, camera, settings=RenderSettings(statistics=True, antialias=antialias))
+        rendering = render(splats, camera, settings=settings)
         assert rendering.contributed is not None
         num_rendered += rendering.contributed
         num += 1
@@ -78,10 +79,10 @@ def prune_invisible(
     cameras: Iterable[Camera],
     sh_degree: int,
     threshold: float,
-    antialias: bool = False,
+    settings: RenderSettings = DEFAULTS,
 ) -> Pruned:
     """Removes the static Gaussians with V̄ < ``threshold``; returns their numbers. Arguments as for ``visibility``."""
-    scores = visibility(scene, cameras, sh_degree, antialias)
+    scores = visibility(scene, cameras, sh_degree, settings)
     pruned, is_opaque = scores < threshold, scene.static.opacities >= MIN_OPAQUE_OPACITY
     unseen = pruned & (scores == 0)  # 1 − α is at least 1 − MAX_ALPHA
     opaque = pruned & ~unseen & is_opaque
@@ -92,17 +93,19 @@ def prune_invisible(
 
 
 @torch.no_grad()
-def blend_weights(scene: SplitScene, views: Views, phase: Phase, antialias: bool = False) -> Float[Tensor, " N"]:
+def blend_weights(
+    scene: SplitScene, views: Views, phase: Phase, settings: RenderSettings = DEFAULTS
+) -> Float[Tensor, " N"]:
     """Sum of alpha times transmittance of every Gaussian, static ones first, over the joint images of all views.
 
     Args:
         scene: The scene.
         views: Training views, on the scene's device.
         phase: Says which networks and which degree of spherical harmonics are in use.
-        antialias: As in ``RenderSettings``.
+        settings: How images are rendered.
     """
     total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
-    settings = RenderSettings(statistics=True, antialias=antialias)
+    settings = replace(settings, statistics=True)
     for view in views:
         splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
         weights = render(splats, view.camera, settings=settings).weights

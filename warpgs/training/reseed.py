@@ -5,6 +5,7 @@ were, no Gaussian receives a gradient any more, so the object stays lost.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool
@@ -28,15 +29,15 @@ MAX_INVERSION_ERROR = 0.01
 """Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
 
 
-def lost_pixels(scene: SplitScene, phase: Phase, antialias: bool) -> Callable[[View], Bool[Tensor, "H W"]]:
+def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Callable[[View], Bool[Tensor, "H W"]]:
     """The function that finds the pixels of a view that are dynamic, and that no dynamic Gaussian shows.
 
     Args:
         scene: The scene.
         phase: Says which networks and which degree of spherical harmonics are in use.
-        antialias: As in ``RenderSettings``.
+        settings: How images are rendered.
     """
-    settings = RenderSettings(branches=True, antialias=antialias)
+    settings = replace(settings, branches=True)
 
     @torch.no_grad()
     def mask_of(view: View) -> Bool[Tensor, "H W"]:

@@ -1,5 +1,6 @@
 """One training step: render the three images, compare them with the ground truth, take one step of Adam."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -168,9 +169,9 @@ class Step:
 
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase; without depth all gradients are those of images."""
-        options = {"depth": phase.with_depth, "antialias": self.config.antialias}
         imagegrad = phase.with_depth and not self.config.densify.depth_gradients
-        return RenderSettings(branches=True, imagegrad=imagegrad, **options)
+        settings = self.config.render_settings
+        return replace(settings, branches=True, depth=phase.with_depth, imagegrad=imagegrad)
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""

@@ -169,24 +169,21 @@ class Trainer:
 
     def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
         """Changes the alignment of depth and the sets of Gaussians as planned."""
-        scene, sh_degree = self.scene, plan.phase.sh_degree
+        scene, sh_degree, settings = self.scene, plan.phase.sh_degree, self.config.render_settings
         if plan.realign and not self.capture.metric_depth:
             # In place, because CUDA graphs read them.
-            aligned = initialize.align_to_rendering(
-                self.alignments, self.views, scene, sh_degree, self.config.antialias
-            )
+            aligned = initialize.align_to_rendering(self.alignments, self.views, scene, sh_degree, settings)
             self.alignments.copy_(torch.where(self.depth_trust.weight[:, None] > 0, aligned, torch.nan))
         if plan.densify:
             self._densify(plan.remove_large)
         if plan.prune:
             cameras, threshold = self.views.cameras(), self.config.densify.visibility
-            options = (sh_degree, threshold, self.config.antialias)
-            if any(removed := prune_invisible(scene, self.step.optimizer, cameras, *options)):
+            if any(removed := prune_invisible(scene, self.step.optimizer, cameras, sh_degree, threshold, settings)):
                 logger.log(f"iteration {self.iteration + 1}: {removed}")
         if plan.reseed:
             self._reseed(plan.phase, logger)
         if plan.prune_weakest:
-            weights = blend_weights(scene, self.views, plan.phase, self.config.antialias)
+            weights = blend_weights(scene, self.views, plan.phase, settings)
             number = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
             logger.log(f"iteration {self.iteration + 1}: {number:,} Gaussians pruned that contribute least")
         if plan.reset:
@@ -217,7 +214,7 @@ class Trainer:
         if self.capture.assumption == "dynamic":
             return  # the masks do not say what moves then: they mark all that is seen
         config, scene, views = self.config, self.scene, self.views
-        mask_of = lost_pixels(scene, phase, config.antialias)
+        mask_of = lost_pixels(scene, phase, config.render_settings)
         fraction = lost_fraction(views, mask_of)
         count = min(self._capacity(), round(fraction * config.model.dynamic_points))
         if fraction < config.densify.reseed or count <= 0:

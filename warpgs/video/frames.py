@@ -1,6 +1,7 @@
 """The images along a camera path: layers side by side, supersampled, beside the ground truth, or transparent."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,7 +10,6 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.rendering import Layer, render
@@ -97,7 +97,7 @@ def _depth_image(scene: TrainedScene, camera: Camera, depths: tuple[float, float
 @torch.no_grad()
 def _inverse_depth(scene: TrainedScene, camera: Camera) -> Float[np.ndarray, "H W"]:
     """[H, W], NaN where empty."""
-    settings = RenderSettings(depth=True, antialias=scene.config.antialias)
+    settings = replace(scene.config.render_settings, depth=True)
     layer = render(scene.splats(camera.time), camera, settings=settings).joint
     assert layer.depth is not None
     visible = (layer.alpha >= MIN_ALPHA) & (layer.depth > 0)

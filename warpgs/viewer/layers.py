@@ -1,7 +1,7 @@
 """The images that the viewer can show of a scene."""
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
-from warpgs.rendering import Layer, render
+from warpgs.rendering import DEFAULTS, Layer, render
 from warpgs.visualize.depth import depth_image
 from warpgs.visualize.images import to_bytes
 
@@ -21,42 +21,42 @@ MIN_ALPHA = 0.5
 """A pixel has a depth where it is at least this opaque."""
 
 
-def joint(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def joint(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """All Gaussians."""
-    return to_bytes(render(splats, camera, settings=RenderSettings(antialias=antialias)).joint.image)
+    return to_bytes(render(splats, camera, settings=settings).joint.image)
 
 
-def static(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def static(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """The static Gaussians alone."""
-    return _branch_image(render(splats, camera, settings=RenderSettings(branches=True, antialias=antialias)).static)
+    return _branch_image(render(splats, camera, settings=replace(settings, branches=True)).static)
 
 
-def dynamic(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def dynamic(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """The dynamic Gaussians alone."""
-    return _branch_image(render(splats, camera, settings=RenderSettings(branches=True, antialias=antialias)).dynamic)
+    return _branch_image(render(splats, camera, settings=replace(settings, branches=True)).dynamic)
 
 
-def depth(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def depth(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """Inverse depth in colours: red is near, blue is far, black is empty."""
-    image = render(splats, camera, settings=RenderSettings(depth=True, antialias=antialias)).joint
+    image = render(splats, camera, settings=replace(settings, depth=True)).joint
     assert image.depth is not None
     visible = (image.alpha >= MIN_ALPHA) & (image.depth > 0)
     return depth_image(torch.where(visible, 1.0 / image.depth, torch.nan).cpu().numpy())
 
 
-def alpha(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def alpha(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """Opacity, in grey."""
-    return _grey(render(splats, camera, settings=RenderSettings(antialias=antialias)).joint.alpha[..., None])
+    return _grey(render(splats, camera, settings=settings).joint.alpha[..., None])
 
 
-def dynamic_mask(splats: Splats, camera: Camera, antialias: bool) -> Image:
+def dynamic_mask(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """Blend weight of the dynamic Gaussians in the joint image, in grey: those hidden by static ones have none."""
     assert splats.is_dynamic is not None
-    weights = dataclasses.replace(splats, colors=splats.is_dynamic.float()[:, None], sh=None, sh_degree=None)
-    return _grey(render(weights, camera, settings=RenderSettings(antialias=antialias)).joint.image)
+    weights = replace(splats, colors=splats.is_dynamic.float()[:, None], sh=None, sh_degree=None)
+    return _grey(render(weights, camera, settings=settings).joint.image)
 
 
-LAYERS: dict[str, Callable[[Splats, Camera, bool], Image]] = {
+LAYERS: dict[str, Callable[[Splats, Camera, RenderSettings], Image]] = {
     "joint": joint,
     "static": static,
     "dynamic": dynamic,
@@ -68,16 +68,16 @@ LAYERS: dict[str, Callable[[Splats, Camera, bool], Image]] = {
 
 
 @torch.no_grad()
-def render_layer(name: str, splats: Splats, camera: Camera, antialias: bool = False) -> Image:
+def render_layer(name: str, splats: Splats, camera: Camera, settings: RenderSettings = DEFAULTS) -> Image:
     """An 8-bit RGB image of a layer.
 
     Args:
         name: Key of ``LAYERS``.
         splats: The Gaussians at the time to show.
         camera: The camera, on any device.
-        antialias: Whether opacities compensate for the low-pass filter.
+        settings: How images are rendered.
     """
-    return LAYERS[name](splats, camera.to(splats.means.device), antialias)
+    return LAYERS[name](splats, camera.to(splats.means.device), settings)
 
 
 def _branch_image(branch: Layer | None) -> Image:

@@ -89,7 +89,7 @@ class Renderer:
             return Rendered(image, time.perf_counter() - start, is_warm_up)
 
     def _render_layer(self, request: RenderRequest, camera: Camera) -> Image:
-        return render_layer(request.layer, self._splats_of(request), camera, request.scene.config.antialias)
+        return render_layer(request.layer, self._splats_of(request), camera, request.scene.config.render_settings)
 
     def _splats_of(self, request: RenderRequest) -> Splats:
         """The Gaussians of a request, kept while only the camera moves, so that the networks need not run again."""

@@ -175,6 +175,7 @@ async function upload() {
   }
   gl.uniform1i(uniform('lastKey'), lastKey);
   gl.uniform1i(uniform('compensate'), START.antialias);
+  gl.uniform1f(uniform('maxAlpha'), START.max_alpha);
   return means;
 }
 
