@@ -20,6 +20,8 @@ NETWORK = ModelConfig(
     position_bands=1, time_bands=1, depth=1, width=2, max_static_points=20, dynamic_points=30
 )  # networks do not matter here
 CONFIG = TrainConfig(model=NETWORK)
+GREY = TrainConfig(model=dataclasses.replace(NETWORK, point_colors="grey"))
+UNBOUNDED = TrainConfig(model=dataclasses.replace(NETWORK, bound_sizes=False))
 DEPTH = 2.5
 BLOCK = (slice(10, 20), slice(15, 35))
 """The dynamic region: 200 pixels."""
@@ -78,41 +80,52 @@ def test_the_size_of_a_gaussian_is_the_root_mean_square_distance_to_three_neighb
     points = random_points(40)
     distances = (points[:, None].double() - points[None].double()).norm(dim=2).sort(1).values
     expected = (distances[:, 1:4] ** 2).mean(1).sqrt()
-    gaussians = gaussians_at(points, torch.rand(40, 3))
+    gaussians = gaussians_at(points, torch.rand(40, 3), NETWORK)
     assert error(gaussians.scales.detach(), expected[:, None].expand(40, 3)) < 1e-6
 
 
 def test_sizes_scale_with_the_points():
-    small, large = (gaussians_at(grid(spacing), torch.rand(27, 3)).scales for spacing in (0.1, 10.0))
+    small, large = (gaussians_at(grid(spacing), torch.rand(27, 3), NETWORK).scales for spacing in (0.1, 10.0))
     assert error(large, 100 * small) < 1e-4
 
 
 def test_gaussians_start_at_their_points_with_an_opacity_of_a_tenth():
     points = random_points(20)
-    gaussians = gaussians_at(points, torch.rand(20, 3))
+    gaussians = gaussians_at(points, torch.rand(20, 3), NETWORK)
     assert torch.equal(gaussians.means, points)
     assert error(gaussians.opacities, torch.full((20,), 0.1)) < 1e-6
 
 
 def test_coincident_points_have_a_positive_size():
     points = torch.cat([random_points(20), torch.zeros(5, 3)])
-    gaussians = gaussians_at(points, torch.rand(25, 3))
+    gaussians = gaussians_at(points, torch.rand(25, 3), NETWORK)
     assert gaussians.log_scales.isfinite().all()
     assert (gaussians.scales > 0).all()
 
 
 def test_the_size_of_a_distant_point_is_limited():
     points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]])])
-    assert gaussians_at(points, torch.rand(28, 3)).scales.max() <= 10.0 * 0.1 * 1.001
+    assert gaussians_at(points, torch.rand(28, 3), NETWORK).scales.max() <= 10.0 * 0.1 * 1.001
 
 
 def test_all_points_coincident_give_finite_sizes():
-    assert gaussians_at(torch.ones(9, 3), torch.rand(9, 3)).log_scales.isfinite().all()
+    assert gaussians_at(torch.ones(9, 3), torch.rand(9, 3), NETWORK).log_scales.isfinite().all()
+
+
+def test_sizes_without_bounds_are_those_of_3dgs():
+    """sqrt(clamp_min(mean squared distance to three neighbours, 1e-7))."""
+    points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]]), torch.zeros(4, 3)])
+    squared = (points[:, None].double() - points[None].double()).square().sum(2).sort(1).values[:, 1:4].mean(1)
+    expected = squared.clamp_min(1e-7).sqrt()
+    assert expected.max() > 999
+    assert expected[-4:].tolist() == [1e-7**0.5] * 4
+    gaussians = gaussians_at(points, torch.rand(32, 3), UNBOUNDED.model, max_scale=0.5)
+    assert (gaussians.scales.detach() / expected[:, None] - 1).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("num", range(5))
 def test_few_points_are_enough(num):
-    gaussians = gaussians_at(random_points(num), torch.rand(num, 3))
+    gaussians = gaussians_at(random_points(num), torch.rand(num, 3), NETWORK)
     assert len(gaussians) == num
     assert gaussians.log_scales.isfinite().all()
 
@@ -122,6 +135,21 @@ def test_initial_static_gaussians_have_the_colours_of_the_points():
     static = initialize.initial_scene(CONFIG, make_capture(points, colors), generator()).static
     assert torch.equal(static.means, points)
     assert error(0.5 + 0.28209479 * static.sh_dc[:, 0].double(), colors.double() / 255.0) < 1e-6
+
+
+@pytest.mark.parametrize("has_colors", [False, True])
+@pytest.mark.parametrize("assumption", ["masks", "dynamic"])
+def test_initial_colours_can_be_those_of_deformable_3dgs(assumption, has_colors):
+    """SH2RGB(random / 255): 0.5 + SH_C0 · random / 255."""
+    points = random_points(9)
+    colors = torch.randint(0, 256, (9, 3), generator=generator(), dtype=torch.uint8) if has_colors else None
+    capture = make_capture(points, colors).assuming(assumption)
+    static = initialize.initial_scene(GREY, capture, generator()).static
+    gaussians = dynamic_gaussians(capture, ALIGNMENT, GREY) if assumption == "dynamic" else static
+    assert torch.equal(gaussians.means, points)
+    assert gaussians.sh_dc.min() >= -1e-7
+    assert 1 / 510 < gaussians.sh_dc.max() <= 1 / 255
+    assert len(gaussians.sh_dc.unique()) > 9
 
 
 def test_many_points_are_subsampled_at_random():
@@ -428,6 +456,11 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
 def test_gaussians_of_unknown_depth_are_small_enough_to_be_kept():
     gaussians = dynamic_gaussians(capture := make_capture(100.0 * random_points(50)), ALIGNMENT)
     assert gaussians.scales.max() < CONFIG.densify.max_size * capture.extent
+
+
+def test_gaussians_of_unknown_depth_have_any_size_without_bounds():
+    gaussians = dynamic_gaussians(capture := make_capture(100.0 * random_points(50)), ALIGNMENT, UNBOUNDED)
+    assert gaussians.scales.max() > CONFIG.densify.max_size * capture.extent
 
 
 def test_if_everything_is_assumed_dynamic_the_points_become_dynamic_gaussians():

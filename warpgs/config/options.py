@@ -93,6 +93,13 @@ class ModelConfig:
     """On CUDA, multiply the networks' matrices in half precision and sum in single; only if 8 divides ``width``."""
     max_static_points: int = 100_000
     """Maximum number of initial static Gaussians."""
+    point_colors: Literal["capture", "grey"] = "capture"
+    """Initial colours of Gaussians at the sparse points: those of the points, or without any the mean of the pixels
+    that show them (capture), or mid-grey within 0.0011, as Deformable-3DGS starts captures in the layouts of NeRF-DS
+    and HyperNeRF (grey)."""
+    bound_sizes: bool = True
+    """Whether initial sizes, which are distances to neighbours, are between 1/1000 and 10 times their median, and those
+    of dynamic Gaussians of unknown depth under ``densify.max_size``; 3DGS has no such bounds."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
     tracks: bool = True

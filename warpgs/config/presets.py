@@ -17,6 +17,8 @@ PAPER = TrainConfig(
         dynamic_points=100_000,
         dynamic_start="uniform",
         tracks=False,
+        point_colors="grey",
+        bound_sizes=False,
     ),
     loss=LossConfig(dynamic_background="black", depth=1.0, depth_dynamic=0.0, depth_end=0.01, depth_gate=False),
     optim=OptimConfig(means_scale=5.0, means_anneal="trained"),

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from warpgs.config import LossConfig, RenderSettings, TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
-from warpgs.model.gaussians import Gaussians
+from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import DEFAULTS, render
@@ -43,19 +43,21 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
     degree = config.model.sh_degree
     static = Gaussians.empty(0, degree)
     if capture.assumption != "dynamic":
-        static = gaussians_at(*_colored_points(config, capture, generator), degree)
+        static = gaussians_at(*_colored_points(config, capture, generator), config.model)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """A random subset of the capture's points with colours in [0, 1], from the static region where they have none."""
+    """A random subset of the capture's points with colours in [0, 1]; see ``model.point_colors``."""
     points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
     if len(points) == 0:
         points, colors = random_points(points, max_count, generator), None
     chosen = subsample(points, max_count, generator)
     points = points[chosen]
+    if config.model.point_colors == "grey":
+        return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, generator=generator)
     if colors is not None:
         return points, colors[chosen].float() / 255.0
     views = []
@@ -95,7 +97,7 @@ def dynamic_gaussians(
     if isinstance(deformation, SplineDeformation):
         return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
-        return gaussians_at(*_colored_points(config, capture, generator), degree)
+        return gaussians_at(*_colored_points(config, capture, generator), config.model)
     count = max(max_count, MAX_POINTS) if protocol.fits_motion else max_count
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
@@ -110,9 +112,9 @@ def dynamic_gaussians(
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
         positions = random_points(capture.points, max_count, generator)
-        return gaussians_at(positions, torch.full_like(positions, 0.5), degree, max_scale(config, capture.extent))
+        return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, max_scale(config, capture.extent))
     largest = math.inf if found.depth_known else max_scale(config, capture.extent)
-    return gaussians_at(found.positions, found.colors, degree, largest)
+    return gaussians_at(found.positions, found.colors, config.model, largest)
 
 
 class DepthAlignment(NamedTuple):

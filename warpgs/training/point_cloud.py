@@ -9,10 +9,15 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.model.gaussians import MAX_SH_DEGREE, Gaussians
+from warpgs.config import ModelConfig
+from warpgs.model.gaussians import Gaussians
 
 INITIAL_OPACITY = 0.1
 NUM_NEIGHBOURS = 3
+
+MIN_SCALE = 1e-7**0.5
+"""Standard deviation of Gaussians at coincident points where sizes are not bounded; as in 3DGS [scene units]."""
+
 BOX_MARGIN = 1.2
 """Size of the scene's box relative to that of its points."""
 
@@ -20,7 +25,7 @@ BOX_MARGIN = 1.2
 def gaussians_at(
     points: Float[Tensor, "N 3"],
     colors: Float[Tensor, "N 3"],
-    sh_degree: int = MAX_SH_DEGREE,
+    model: ModelConfig,
     max_scale: float = math.inf,
 ) -> Gaussians:
     """Isotropic Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
@@ -28,19 +33,22 @@ def gaussians_at(
     Args:
         points: [N, 3] positions on the CPU.
         colors: [N, 3] in [0, 1].
-        sh_degree: Maximum degree of spherical harmonics.
-        max_scale: Maximum standard deviation [scene units].
+        model: Degree of spherical harmonics, and whether sizes are bounded.
+        max_scale: Maximum standard deviation, if sizes are bounded [scene units].
     """
     N = points.shape[0]
     if N <= NUM_NEIGHBOURS:
         scales = torch.full((N,), min(0.01, max_scale))
-        return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, sh_degree)
+        return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
     distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NUM_NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
-    # Coincident points would get scale 0, a few distant ones the size of the scene.
-    typical = scales.median().clamp_min(1e-7)
-    scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(max_scale)
-    return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, sh_degree)
+    if model.bound_sizes:
+        # Coincident points would get scale 0, a few distant ones the size of the scene.
+        typical = scales.median().clamp_min(1e-7)
+        scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(max_scale)
+    else:
+        scales = scales.clamp_min(MIN_SCALE)
+    return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

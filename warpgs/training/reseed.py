@@ -80,4 +80,4 @@ def gaussians_that_show(
         x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * extent)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
     largest = max_scale(config, extent)
-    return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, largest)
+    return gaussians_at(canonical[kept], found.colors[kept], config.model, largest)

@@ -59,7 +59,7 @@ def start_from_tracks(
     positions = torch.cat([points for points, _ in parts]) + starts[label]
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
-    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model.sh_degree, max_scale(config, extent))
+    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, max_scale(config, extent))
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
     deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))
