@@ -93,6 +93,7 @@ PAPER = {
     "3DGS: rasterization": {"max_alpha": 0.99},
     "3DGS: initial Gaussians": {"model.bound_sizes": False},
     "Deformable-3DGS: initial Gaussians, in the layouts of NeRF-DS and HyperNeRF": {"model.point_colors": "grey"},
+    "Deformable-3DGS: cameras and frames as they are": {"undistort": False},
     "Deformable-3DGS: frames of HyperNeRF": {"vrig_factor": 4},
     "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
     "code of the authors": {"model.dynamic_points": 100_000, "model.dynamic_start": "uniform", "model.tracks": False},

@@ -308,6 +308,32 @@ def test_fisheye_images_of_nerfstudio_are_undistorted(edited, fields):
         capture.read_taken(name)
 
 
+@LAYOUTS
+def test_without_undistortion_cameras_look_at_the_centre_of_the_image(written, layout):
+    capture, undistorted = load_capture(written[layout], undistort=False), load_capture(written[layout])
+    name = capture.train[1]
+    frame, other = capture.frame(name), undistorted.frame(name)
+    expected = [[layouts.FOCAL, 0, layouts.SIZE[0] / 2], [0, layouts.FOCAL, layouts.SIZE[1] / 2], [0, 0, 1]]
+    assert torch.allclose(frame.camera.K, torch.tensor(expected, dtype=torch.float32), atol=1e-4)
+    assert torch.equal(frame.camera.viewmat, other.camera.viewmat)
+    assert torch.equal(frame.image, other.image)
+
+
+@pytest.mark.parametrize("fields", [{"k1": 0.6, "p1": 0.02}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
+def test_without_undistortion_frames_of_nerfstudio_are_those_of_the_files(edited, written, fields):
+    root = edited("nerfstudio")
+    edit_json(root / "transforms.json", **fields)
+    capture, plain = load_capture(root, undistort=False), load_capture(written["nerfstudio"])
+    assert capture.read_taken is None
+    for name in layouts.NAMES:
+        frame, expected = capture.frame(name), plain.frame(name)
+        assert np.array_equal(frame.image.numpy(), layouts.image(INDEX[name]))
+        for part in ("static_mask", "inverse_depth"):
+            assert torch.equal(getattr(frame, part), getattr(expected, part))
+        assert frame.camera.K[0, 0] == layouts.FOCAL
+        assert frame.camera.K[:2, 2].tolist() == [layouts.SIZE[0] / 2, layouts.SIZE[1] / 2]
+
+
 @pytest.mark.parametrize(
     ("model", "bent"),
     [("OPENCV_FISHEYE", (0.1, 0.02, 0.03, 0.01)), ("RADIAL_FISHEYE", (0.1, 0.02)), ("SIMPLE_RADIAL_FISHEYE", (0.1,))],

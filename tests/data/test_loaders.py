@@ -18,7 +18,7 @@ from warpgs.config import MaskPerturbation
 from warpgs.config.presets import PRESETS
 from warpgs.data import loaders
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.loaders import LOADERS, load_capture, recognize
+from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize
 from warpgs.runs.run import open_capture
 
 DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
@@ -138,6 +138,31 @@ def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
     assert torch.equal(distorted.camera.K[:2, 2], pinhole.camera.K[:2, 2])
     assert distorted.static_mask.dtype == torch.bool
     assert not torch.equal(distorted.static_mask, pinhole.static_mask)
+
+
+@pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
+def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_their_centre(tmp_path, dataset):
+    plain, bent = (write_capture(tmp_path / name, dataset) for name in ("plain", "bent"))
+    for path in (bent / "camera").iterdir():
+        edit_json(path, radial_distortion=[0.8, 0.1, 0.0], tangential_distortion=[0.02, 0.01])
+    depth = np.linspace(0.1, 0.9, SIZE[0] * SIZE[1]).reshape(SIZE[1], SIZE[0])
+    if dataset != "iphone":
+        for root in (plain, bent):
+            captures.write_array(root / "depth/1x/left_000000.npy", depth)
+    capture, expected = load_capture(bent, undistort=False), load_capture(plain)
+    assert capture.read_taken is None
+    assert load_capture(bent).read_taken is not None
+    for name, camera in capture.cameras.items():
+        factor, (width, height) = captures.FACTORS[dataset], camera.size
+        K = [[50.0 / factor, 0, width / 2], [0, 50.0 / factor, height / 2], [0, 0, 1]]
+        assert torch.equal(camera.K, torch.tensor(K, dtype=torch.float32))
+        assert torch.equal(camera.viewmat, expected.cameras[name].viewmat)
+        frame, other = capture.frame(name), expected.frame(name)
+        assert np.array_equal(frame.image.numpy(), image_of(name, camera.size))
+        for part in ("static_mask", "inverse_depth", "covisible"):
+            a, b = getattr(frame, part), getattr(other, part)
+            assert a is b is None or torch.equal(a, b)
+    assert capture.frame(capture.train[0]).inverse_depth is not None
 
 
 def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
@@ -326,8 +351,8 @@ class TextLoader:
     def recognizes(self, root):
         return (root / "capture.txt").is_file()
 
-    def load(self, root, *, factor, perturbation, cache_frames):
-        self.arguments = factor, perturbation, cache_frames
+    def load(self, root, options):
+        self.options = options
         camera = Camera(torch.eye(4), torch.eye(3), 4, 2)
         frame = Frame("a", camera, torch.zeros(2, 4, 3, dtype=torch.uint8))
         name = (root / "capture.txt").read_text()
@@ -340,9 +365,10 @@ def test_a_dataset_is_added_by_one_entry(tmp_path, monkeypatch):
     (tmp_path / "capture.txt").write_text("mine")
     assert recognize(tmp_path) == "text"
     assert load_capture(tmp_path).name == "mine"
-    assert loader.arguments == (None, MaskPerturbation(), 256)
-    load_capture(tmp_path, "text", factor=3, perturbation=MaskPerturbation(erode=1), cache_frames=7)
-    assert loader.arguments == (3, MaskPerturbation(erode=1), 7)
+    assert loader.options == LoadOptions()
+    options = {"factor": 3, "perturbation": MaskPerturbation(erode=1), "cache_frames": 7, "undistort": False}
+    load_capture(tmp_path, "text", **options)
+    assert loader.options == LoadOptions(**options)
 
 
 def test_a_folder_that_no_loader_recognizes_is_read_as_the_fallback(tmp_path):

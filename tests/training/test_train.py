@@ -20,9 +20,11 @@ import torch
 
 import warpgs
 from tests import tiny
+from tests.data.captures import edit_json
 from warpgs import cli
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
+from warpgs.data.images import read_image
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
@@ -361,6 +363,23 @@ def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
     )
     evaluate_run.evaluate_run(config.out, quiet=True)
     assert taken == [True]
+
+
+@pytest.mark.parametrize("undistort", [True, False])
+def test_a_run_without_undistortion_is_trained_and_evaluated_on_frames_as_they_were_taken(config, tmp_path, undistort):
+    data = shutil.copytree(config.data, tmp_path / "bent")
+    for path in (data / "camera").iterdir():
+        edit_json(path, radial_distortion=[0.5, 0.0, 0.0], principal_point=[14.0, 13.0])
+    config, shown = dataclasses.replace(config, data=data, undistort=undistort), []
+    run = warpgs.train(config, callbacks=[lambda progress: shown.append(progress.capture)])
+    metrics = json.loads((run.folder / "metrics.json").read_text())
+    assert metrics["frames"] == ("undistorted" if undistort else "as taken")
+    name = shown[0].val[0]
+    taken = read_image(data / f"rgb/1x/{name}.png", (32, 24))
+    for capture in (shown[0], warpgs.open_run(run.folder, "cpu").open_capture(quiet=True)):
+        is_centred = capture.cameras[name].K[:2, 2].tolist() == [16.0, 12.0]
+        is_taken = np.array_equal(capture.frame(name).image.numpy(), taken)
+        assert is_centred == is_taken == (not undistort)
 
 
 def test_train_raises_on_an_unknown_dataset_or_model(config):

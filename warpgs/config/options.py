@@ -282,6 +282,10 @@ class TrainConfig:
     vrig_factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images of HyperNeRF's captures of two cameras (vrig), if ``factor`` is omitted;
     Deformable-3DGS reads them at 4."""
+    undistort: bool = True
+    """Undistort frames, masks and depth, and keep each camera's principal point. Without it the run is trained and
+    evaluated on frames as they are, with pinhole cameras whose principal point is the centre, as in Deformable-3DGS
+    (paper)."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None

@@ -7,6 +7,7 @@ from .options import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedu
 PAPER = TrainConfig(
     preset="paper",
     vrig_factor=4,
+    undistort=False,
     max_alpha=0.99,
     model=ModelConfig(
         raw_input=False,

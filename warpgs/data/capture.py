@@ -50,7 +50,7 @@ class Frame:
 
     Attributes:
         name: Id in the capture.
-        camera: Undistorted pinhole camera in scene units, with the frame's time in [0, 1].
+        camera: Pinhole camera in scene units, with the frame's time in [0, 1].
         image: [H, W, 3] 8-bit RGB.
         static_mask: [H, W] true where the scene is static; None if the frame has no mask.
         inverse_depth: [H, W] inverse depth up to a scale and an offset per frame, NaN where unknown; None if the frame
@@ -97,7 +97,7 @@ class Capture:
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
         cache_frames: Maximum number of frames to keep in memory, of which large ones are fewer: ``MAX_CACHE_BYTES``.
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
-        read_taken: Reads a frame with the distortion of its lens; None if no lens of the capture distorts.
+        read_taken: Reads a frame with the distortion of its lens; None if ``read`` undistorts no frame.
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.

@@ -14,14 +14,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.command_line.progress import progress
-from warpgs.config import MaskPerturbation
 from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import LOADERS, load_capture, recognize
+from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
@@ -78,8 +77,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     loader = LOADERS[layout]
     if not isinstance(loader, NerfiesLoader):
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
-    unchanged = MaskPerturbation()
-    capture = loader.load(root, factor=None, perturbation=unchanged, cache_frames=256, incomplete_masks=True)
+    capture = loader.load(root, LoadOptions(), incomplete_masks=True)
     job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
     for part in PARTS:
         if part in options.parts:

@@ -20,8 +20,14 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         root = builtin_folder(config.data, quiet)
     else:
         root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    factor, vrig_factor = config.factor, config.vrig_factor
-    capture = load_capture(root, config.dataset, factor=factor, vrig_factor=vrig_factor, perturbation=config.masks)
+    capture = load_capture(
+        root,
+        config.dataset,
+        factor=config.factor,
+        vrig_factor=config.vrig_factor,
+        perturbation=config.masks,
+        undistort=config.undistort,
+    )
     return capture if config.background == "capture" else capture.over(config.background)
 
 

@@ -22,9 +22,10 @@ from .llff import LlffLoader
 from .megasam import MegaSamLoader
 from .nerfds import NerfDsLoader
 from .nerfstudio import NerfstudioLoader
+from .options import LoadOptions
 from .vipe import VipeLoader
 
-__all__ = ["LOADERS", "Loader", "is_capture", "load_capture", "recognize", "require_capture"]
+__all__ = ["LOADERS", "LoadOptions", "Loader", "is_capture", "load_capture", "recognize", "require_capture"]
 
 
 class Loader(Protocol):
@@ -34,8 +35,8 @@ class Loader(Protocol):
         """Whether the files in ``root`` look like a capture of this dataset."""
         ...
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``, which has checked the arguments."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         ...
 
 
@@ -64,6 +65,7 @@ def load_capture(
     vrig_factor: int | None = None,
     perturbation: MaskPerturbation | None = None,
     cache_frames: int = 256,
+    undistort: bool = True,
 ) -> Capture:
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
@@ -74,6 +76,8 @@ def load_capture(
         vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.
         perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
         cache_frames: Number of frames to keep in memory.
+        undistort: Whether to undistort frames, masks and depth; if not, they are those of the files, and cameras are
+            pinholes of the lens's focal length with the principal point at the centre of the image.
 
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
@@ -90,7 +94,7 @@ def load_capture(
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
         factor = vrig_factor
-    return loader.load(root, factor=factor, perturbation=perturbation, cache_frames=cache_frames)
+    return loader.load(root, LoadOptions(factor, perturbation, cache_frames, undistort))
 
 
 def is_capture(root: Path) -> bool:

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.images import is_transparent
 from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resized_over_white
 from warpgs.data.units import SceneUnits
 from warpgs.files import read_numbers
 
-from .posed import LoadOptions, PosedFrame, World, posed_capture
+from .options import LoadOptions
+from .posed import PosedFrame, World, posed_capture
 from .transforms import Transforms
 
 TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
@@ -36,8 +36,8 @@ class BlenderLoader:
         """Whether there is a transforms_train.json."""
         return (root / TRAIN).is_file()
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
         transforms = Transforms(root / TRAIN)
         train = _frames(transforms, "train")
@@ -52,7 +52,6 @@ class BlenderLoader:
             own_times=True,
             background="white" if is_white else "black",
         )
-        options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
 
 

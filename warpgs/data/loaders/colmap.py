@@ -3,15 +3,14 @@
 from functools import partial
 from pathlib import Path
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import MODEL_FOLDERS, ModelImage, find_model, load_model
 from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.files import first_file, natural_order
 
+from .options import LoadOptions
 from .posed import (
-    LoadOptions,
     PosedFrame,
     World,
     every_eighth,
@@ -34,8 +33,8 @@ class ColmapLoader:
             find_model(root) is not None and (root / "images").is_dir() and not any((root / o).exists() for o in others)
         )
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         folder = find_model(root)
         if folder is None:
             raise ValueError(f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}")
@@ -43,10 +42,9 @@ class ColmapLoader:
         images = sorted(model.images, key=lambda image: natural_order(image.name))
         names = plain_names([image.name for image in images])
         times = times_of_names(names)
-        files = _Files(root, factor or 1)
+        files = _Files(root, options.factor or 1)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
         world = World(model.points, model.colors)
-        options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, every_eighth(names), world, options)
 
 

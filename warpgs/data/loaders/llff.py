@@ -6,6 +6,7 @@ and focal length [px]. Rows belong to the images in the order of their names.
 """
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model, load_model
 from warpgs.data.images import image_size, read_depth
@@ -22,7 +22,8 @@ from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.data.units import scene_units
 from warpgs.files import first_file, natural_order, read_array
 
-from .posed import LoadOptions, PosedFrame, World, every_eighth, posed_capture, world_to_camera
+from .options import LoadOptions
+from .posed import PosedFrame, World, every_eighth, posed_capture, world_to_camera
 
 INDEX = "poses_bounds.npy"
 
@@ -44,10 +45,10 @@ class LlffLoader:
         dynamic = any((root / name).is_dir() for name in (MASKS, EVALUATION))
         return (root / INDEX).is_file() and (dynamic or find_model(root) is None)
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         poses, bounds, sizes = _read_poses(root / INDEX)
-        paths = _images(_image_folder(root, factor))
+        paths = _images(_image_folder(root, options.factor))
         if len(paths) != len(poses):
             raise ValueError(f"{root / INDEX} has {len(poses)} poses, but {paths[0].parent} has {len(paths)} images")
         lenses = [_lens(root, path, size) for path, size in zip(paths, sizes, strict=True)]
@@ -60,7 +61,7 @@ class LlffLoader:
         ]
         others = list(_other_cameras(root, frames))
         val = [frame.name for frame in others] if others else every_eighth(names)
-        options = LoadOptions(1, perturbation, cache_frames)
+        options = replace(options, factor=1)  # that of the folder
         return posed_capture(root, [*frames, *others], frozenset(val), _world(root, poses, bounds), options)
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.images import MAX_SIDE
 from warpgs.data.lens import Lens
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import inverse_of, resize
 
-from .posed import LoadOptions, PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
+from .options import LoadOptions
+from .posed import PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
 
 SUFFIXES = ("_sgd_cvd_hr.npz", "_droid.npz")
 """Ends of the names of the files that MegaSaM writes, the better one first."""
@@ -31,8 +31,8 @@ class MegaSamLoader:
         """Whether there is a file of MegaSaM."""
         return any(any(root.glob(f"*{suffix}")) for suffix in SUFFIXES)
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         path = _file(root)
         arrays = read_npz(path, ARRAYS)
         images, depths, K, matrices = (arrays[name] for name in ARRAYS)
@@ -65,7 +65,6 @@ class MegaSamLoader:
             for k in range(count)
         ]
         val = every_eighth([frame.name for frame in frames])
-        options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, val, World(*points_of_depth(frames)), options)
 
 

@@ -8,7 +8,7 @@ covisible/<factor>x/val/<id>.png.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +21,15 @@ from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.lens import Lens, undistort
+from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN
 from warpgs.files import first_file, read_json
+
+from .options import LoadOptions
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
 
@@ -68,32 +70,27 @@ class NerfiesLoader(ABC):
         """Whether the inverse depth of files has scene units and no offset."""
         return False
 
-    def load(
-        self,
-        root: Path,
-        *,
-        factor: int | None,
-        perturbation: MaskPerturbation,
-        cache_frames: int,
-        incomplete_masks: bool = False,
-    ) -> Capture:
+    def load(self, root: Path, options: LoadOptions, incomplete_masks: bool = False) -> Capture:
         """Opens a capture, as ``load_capture`` does; ``incomplete_masks``: training frames may lack masks."""
         dataset = read_json(root / "dataset.json", LAYOUT)
         metadata, units = read_json(root / "metadata.json", LAYOUT), read_units(root / "scene.json")
         split = self.split(root, dataset, metadata)
         _check_split(split)
         times = _times(root / "metadata.json", metadata, [*split.train, *split.val])
-        factor = factor or self.default_factor
+        factor = options.factor or self.default_factor
         files = _find_files(root, factor, split, incomplete_masks)
         cameras, lenses = {}, {}
         for name, time in times.items():
-            cameras[name], lenses[name] = read_camera(root / f"camera/{name}.json", units, factor, time)
+            camera, lens = read_camera(root / f"camera/{name}.json", units, factor, time)
+            lenses[name] = options.lens(lens)
+            K = torch.tensor(pinhole_matrix(lenses[name]), dtype=torch.float32)
+            cameras[name] = replace(camera, K=K)
         points, colors = read_points(root, units)
 
         def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
             return self.inverse_depth(path, size, units)
 
-        reader = _FrameReader(cameras, lenses, files, frozenset(split.train), perturbation, read_depth)
+        reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
         depths = [files[name].depth for name in split.train]
         return Capture(
             root.resolve().name,
@@ -103,7 +100,7 @@ class NerfiesLoader(ABC):
             points,
             colors,
             reader.read,
-            cache_frames,
+            options.cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
             estimated_masks=_has_estimated_masks(root / "dataset.json", dataset),
             read_taken=taken_reader(reader.read_with, lenses),

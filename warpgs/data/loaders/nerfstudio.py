@@ -5,14 +5,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.ply import read_ply_points
 from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
 from warpgs.files import natural_order, read_numbers
 
+from .options import LoadOptions
 from .posed import (
-    LoadOptions,
     PosedFrame,
     World,
     every_eighth,
@@ -40,8 +39,8 @@ class NerfstudioLoader:
         """Whether there is a transforms.json."""
         return (root / INDEX).is_file()
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         transforms = Transforms(root / INDEX)
         entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
         images = [transforms.image(entry) for entry in entries]
@@ -63,7 +62,6 @@ class NerfstudioLoader:
                 )
             )
         val = _evaluated(transforms, {image.resolve(): name for image, name in zip(images, names, strict=True)})
-        options = LoadOptions(factor, perturbation, cache_frames)
         kept = [frame for frame in frames if frame.name not in val.ignored]
         return posed_capture(root, kept, val.names, _world(root, transforms, kept), options)
 

@@ -24,6 +24,8 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, scene_units
 
+from .options import LoadOptions
+
 HOLDOUT = 8
 """Every eighth frame is for evaluation where the files do not say which ones are."""
 
@@ -83,26 +85,17 @@ class World:
     background: Background = "black"
 
 
-@dataclass(frozen=True)
-class LoadOptions:
-    """Arguments of ``load_capture`` that every loader passes on."""
-
-    factor: int | None
-    perturbation: MaskPerturbation
-    cache_frames: int
-
-
 def posed_capture(
     root: Path, frames: Sequence[PosedFrame], val: Collection[str], world: World, options: LoadOptions
 ) -> Capture:
-    """The capture of posed frames: undistorted, in scene units, with times in [0, 1].
+    """The capture of posed frames, in scene units, with times in [0, 1].
 
     Args:
         root: Folder of the capture, for messages.
         frames: All frames.
         val: Names of those to evaluate on.
         world: Points and units.
-        options: ``factor`` scales images down (1 if None).
+        options: How they are read; ``factor`` is 1 if None.
 
     Raises:
         ValueError: If there are no frames, two have one name, or a camera is invalid.
@@ -115,7 +108,7 @@ def posed_capture(
         raise ValueError(f"{root}: two frames are called {next(name for name in names if names.count(name) > 1)}")
     centers = np.array([frame.center for frame in frames])
     units = world.units or scene_units(world.points if len(world.points) else centers, centers)
-    cameras, lenses = _cameras(root, frames, units, world.own_times, options.factor or 1)
+    cameras, lenses = _cameras(root, frames, units, world.own_times, options)
     train = [name for name in by_name if name not in val]
     reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
     return Capture(
@@ -134,14 +127,14 @@ def posed_capture(
 
 
 def _cameras(
-    root: Path, frames: Sequence[PosedFrame], units: SceneUnits, own_times: bool, factor: int
+    root: Path, frames: Sequence[PosedFrame], units: SceneUnits, own_times: bool, options: LoadOptions
 ) -> tuple[dict[str, Camera], dict[str, Lens]]:
     """The pinhole camera of each frame, and the lens of its distorted image."""
     times = [frame.time for frame in frames]
     start, length = (0.0, 1.0) if own_times else (min(times), (max(times) - min(times)) or 1.0)
     cameras, lenses = {}, {}
     for frame in frames:
-        lenses[frame.name] = reduced(frame.lens, factor)
+        lenses[frame.name] = options.lens(reduced(frame.lens, options.factor or 1))
         try:
             cameras[frame.name] = _camera(frame, lenses[frame.name], units, (frame.time - start) / length)
         except ValueError as error:

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.config import MaskPerturbation
 from warpgs.data.capture import Capture
 from warpgs.data.exr import read_exr_channel
 from warpgs.data.images import decode_bytes
@@ -24,7 +23,8 @@ from warpgs.data.resized import check_shape, inverse_of, resize, resize_mask
 from warpgs.data.video_frames import VideoFrames
 from warpgs.files import read_bounded, require_file
 
-from .posed import LoadOptions, PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
+from .options import LoadOptions
+from .posed import PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
 
 PINHOLE = "PINHOLE"
 
@@ -50,8 +50,8 @@ class VipeLoader:
         """Whether there are poses, intrinsics and a video of one name."""
         return any((root / f"rgb/{path.stem}.mp4").is_file() for path in (root / "pose").glob("*.npz"))
 
-    def load(self, root: Path, *, factor: int | None, perturbation: MaskPerturbation, cache_frames: int) -> Capture:
-        """Opens a capture; arguments and errors as for ``load_capture``."""
+    def load(self, root: Path, options: LoadOptions) -> Capture:
+        """Opens a capture; errors as for ``load_capture``."""
         name = _video_name(root)
         poses = _poses(root / f"pose/{name}.npz")
         video = VideoFrames(root / f"rgb/{name}.mp4")
@@ -78,7 +78,6 @@ class VipeLoader:
                 )
             )
         val = every_eighth([frame.name for frame in frames])
-        options = LoadOptions(factor, perturbation, cache_frames)
         return posed_capture(root, frames, val, World(*points_of_depth(frames)), options)
 
 
