@@ -8,7 +8,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator, relative_error
-from tests.training.test_motion_fit import UNEVEN, fit, max_error, new_deformation
+from tests.training.test_motion_fit import EXTENT, TIMES, UNEVEN, fit, max_error, new_deformation
 from warpgs.model.fields import FIELDS
 from warpgs.ops.encoding import aligned
 from warpgs.ops.mlp import num_values, perceptron, split
@@ -18,6 +18,8 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
 from warpgs.runtime.profiling import profile
 from warpgs.training import motion_fit
+from warpgs.training.prune import blend_weights
+from warpgs.training.reseed import lost_fraction, lost_pixels
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -123,6 +125,34 @@ def test_graphs_that_are_captured_again_reuse_the_memory(data, tmp_path):
         torch.cuda.synchronize()
         reserved.append(torch.cuda.memory_reserved())
     assert reserved[-1] <= reserved[2]
+
+
+def test_work_on_all_views_is_the_same_in_a_graph(data, tmp_path):
+    trainer = trainer_on_cuda(data, tmp_path / "run")
+    tiny.train(trainer)
+    phase = trainer.protocol.phase_at(tiny.LENGTH - 1)
+
+    def results():
+        mask_of = lost_pixels(trainer.scene, phase, trainer.config.render_settings)
+        return blend_weights(trainer.scene, trainer.views, phase), lost_fraction(trainer.views, mask_of)
+
+    assert trainer.views.uses_graphs
+    weights, lost = results()
+    trainer.views.uses_graphs = False
+    expected, expected_lost = results()
+    assert expected.count_nonzero() > 1
+    assert relative_error(weights, expected) < 1e-5
+    assert lost == pytest.approx(expected_lost)
+
+
+@pytest.mark.parametrize("model", FIELDS)
+def test_canonical_positions_are_the_same_in_a_graph(model):
+    deformation = new_deformation("cuda", deformation=model)
+    fit(UNEVEN, deformation, 50)
+    points = motion_fit._PointsByView(UNEVEN, TIMES, EXTENT, torch.device("cuda"), generator())
+    eager, replayed = (points.canonical(deformation, UNEVEN, is_replayed) for is_replayed in (False, True))
+    assert torch.equal(eager.views, replayed.views)
+    assert relative_error(replayed.positions, eager.positions) < 1e-3
 
 
 @pytest.mark.parametrize("model", FIELDS)

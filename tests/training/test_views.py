@@ -79,6 +79,13 @@ def test_the_selected_view_is_that_of_the_index(capture, resident_bytes):
         assert views.index.tolist() == [index]
 
 
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_work_is_done_on_every_view_in_order(capture, resident_bytes):
+    views = views_of(capture, resident_bytes)
+    found = [(image.clone(), time.clone()) for image, time in views.map(lambda view: (view.image.sum(), view.time))]
+    assert found == [(views[index].image.sum(), views[index].time) for index in range(len(views))]
+
+
 def test_a_view_has_the_image_time_and_mask_of_its_frame(capture):
     views = views_of(capture)
     for index, name in enumerate(capture.train):

@@ -89,7 +89,8 @@ def to_canonical(
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
     """Canonical positions x that a deformation d moves to points p at a time: x + d(x, time) = p.
 
-    Newton's method, which also follows rotations; no gradient flows to positions, so derivatives are differences.
+    Newton's method, which also follows rotations; no gradient flows to positions, so derivatives are differences. All
+    points take all steps, those that are there of length 0, so that a CUDA graph can be captured.
 
     Args:
         deformation: As ``fields.FIELDS`` says.
@@ -101,25 +102,21 @@ def to_canonical(
     Returns:
         The positions, and which of them the deformation moves to within this distance.
     """
-    found, reached = start.clone(), torch.zeros(len(start), dtype=torch.bool, device=start.device)
-    left, step = torch.arange(len(start), device=start.device), torch.zeros_like(start)
+    found, step = start, torch.zeros_like(start)
     axes, width = torch.eye(3, device=start.device)[:, None], max_error / 3.0
     for _ in range(NEWTON_STEPS + 1):
-        found[left] += step
-        probes = torch.cat([found[left][None], found[left] + width * axes])
+        found = found + step
+        probes = torch.cat([found[None], found + width * axes])
         at_probes = probes + deformation(probes.flatten(0, 1), time)[:, :3].view_as(probes)
-        missing = seen[left] - at_probes[0]
+        missing = seen - at_probes[0]
         distances = missing.norm(dim=1, keepdim=True)
-        reached[left] = distances[:, 0] <= max_error
+        reached = distances <= max_error
         derivatives = (at_probes[1:] - at_probes[0]) / width  # by axis
         cofactors = torch.linalg.cross(derivatives.roll(-1, 0), derivatives.roll(-2, 0))
         step = (cofactors * missing).sum(2).T / (cofactors * derivatives).sum(2)[0][:, None]  # Cramer's rule
-        step *= (MAX_STEP * distances / step.norm(dim=1, keepdim=True)).clamp_max(1.0)
-        going_on = ~reached[left]
-        left, step = left[going_on], step[going_on]
-        if not len(left):
-            break
-    return found, reached
+        step = step * (MAX_STEP * distances / step.norm(dim=1, keepdim=True)).clamp_max(1.0)
+        step = torch.where(reached, 0.0, step)
+    return found, reached[:, 0]
 
 
 def max_scale(config: TrainConfig, extent: float) -> float:

@@ -88,7 +88,7 @@ def fit_motion(
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
-    return points.canonical(deformation, found)
+    return points.canonical(deformation, found, config.graph and device.type == "cuda")
 
 
 def _fit(
@@ -189,30 +189,44 @@ class _PointsByView:
         return torch.cat([positions + offsets / self.unit, colors], 1)
 
     @torch.no_grad()
-    def canonical(self, deformation: nn.Module, found: DynamicPoints) -> DynamicPoints:
+    def canonical(self, deformation: nn.Module, found: DynamicPoints, is_replayed: bool = False) -> DynamicPoints:
         """The points that are deformed to where they were seen, each at its place beside the nearest canonical point.
 
         That is where the offset of this canonical point leads. Where the object turns, the place is searched from the
         canonical point itself, and not farther from it than the point was seen, or else it might be found on another
-        object. What no canonical point shows is searched from where the offset leads.
+        object. What no canonical point shows is searched from where the offset leads. ``is_replayed`` says whether to
+        capture the search in a CUDA graph.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
-        max_error = MAX_ERROR * self.extent
-        for view, time in zip(self.views, self.times, strict=True):
-            deformed = self.deformed(deformation, time)
-            for part in (found.views == view).nonzero()[:, 0].split(PIXELS_PER_CHUNK):
-                seen = self._features(found.chosen(part)).to(deformed.device)
-                distances, nearest = torch.cdist(seen, deformed).min(1)
-                is_shown = distances.square() <= MAX_SQUARED_DISTANCE
-                goal, home = seen[:, :3] * self.unit, self.home[nearest, :3] * self.unit
-                away = goal - deformed[nearest, :3] * self.unit
-                start = home + away
-                is_there = (goal - start - deformation(start, time)[:, :3]).norm(dim=1) <= max_error
-                start = torch.where((is_shown & ~is_there)[:, None], home, start)
-                moved, reached = to_canonical(deformation, goal, time, start, max_error)
-                is_near = (moved - home).norm(dim=1) <= MAX_STRETCH * away.norm(dim=1) + max_error
-                positions[part], kept[part] = moved.cpu(), (reached & (is_near | ~is_shown)).cpu()
+        graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=True) if is_replayed else None
+        size = min(PIXELS_PER_CHUNK, int(found.views.bincount().max()))
+        seen, time = self.home.new_zeros(size, 6), torch.empty_like(self.times[0])
+        for view, time_of_view in zip(self.views, self.times, strict=True):
+            time.copy_(time_of_view)
+            for part in (found.views == view).nonzero()[:, 0].split(size):
+                seen[: len(part)] = self._features(found.chosen(part)).to(seen.device)
+                # A graph needs one shape for all views. On the CPU rows without a point would only cost time.
+                rows = seen if is_replayed else seen[: len(part)]
+                search = partial(self._search, deformation, time, rows)
+                moved, is_kept = graphs.run("search", search) if graphs else search()
+                positions[part], kept[part] = moved[: len(part)].cpu(), is_kept[: len(part)].cpu()
         return found._replace(positions=positions).chosen(kept)
+
+    def _search(
+        self, deformation: nn.Module, time: Float[Tensor, "1"], seen: Float[Tensor, "P 6"]
+    ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
+        """Canonical positions of points that were seen at a time, and which of them to keep; see ``canonical``."""
+        deformed, max_error = self.deformed(deformation, time), MAX_ERROR * self.extent
+        distances, nearest = torch.cdist(seen, deformed).min(1)
+        is_shown = distances.square() <= MAX_SQUARED_DISTANCE
+        goal, home = seen[:, :3] * self.unit, self.home[nearest, :3] * self.unit
+        away = goal - deformed[nearest, :3] * self.unit
+        start = home + away
+        is_there = (goal - start - deformation(start, time)[:, :3]).norm(dim=1) <= max_error
+        start = torch.where((is_shown & ~is_there)[:, None], home, start)
+        moved, reached = to_canonical(deformation, goal, time, start, max_error)
+        is_near = (moved - home).norm(dim=1) <= MAX_STRETCH * away.norm(dim=1) + max_error
+        return moved, reached & (is_near | ~is_shown)
 
 
 def _start_time(times: Float[Tensor, " V"], counts: Int64[Tensor, " V"]) -> float:

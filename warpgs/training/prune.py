@@ -16,7 +16,7 @@ from warpgs.rendering import DEFAULTS, render
 
 from . import optimizer as optim
 from .schedule import Phase
-from .views import Views
+from .views import View, Views
 
 MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
@@ -104,12 +104,16 @@ def blend_weights(
         phase: Says which networks and which degree of spherical harmonics are in use.
         settings: How images are rendered.
     """
-    total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
     settings = replace(settings, statistics=True)
-    for view in views:
+
+    def weights_in(view: View) -> tuple[Tensor]:
         splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
         weights = render(splats, view.camera, settings=settings).weights
         assert weights is not None
+        return (weights,)
+
+    total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
+    for (weights,) in views.map(weights_in):
         total += weights
     return total
 

@@ -52,10 +52,10 @@ def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Ca
 
 def lost_fraction(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) -> float:
     """Fraction of all views' dynamic pixels that are lost, in [0, 1]; 0 if nothing is dynamic."""
-    lost = dynamic = 0
-    for view in views:
-        lost, dynamic = lost + int(mask_of(view).sum()), dynamic + int((~view.static_mask).sum())
-    return lost / max(1, dynamic)
+    lost, dynamic = torch.zeros(2, dtype=torch.int64, device=views.device)
+    for lost_here, dynamic_here in views.map(lambda view: (mask_of(view).sum(), (~view.static_mask).sum())):
+        lost, dynamic = lost + lost_here, dynamic + dynamic_here
+    return int(lost) / max(1, int(dynamic))
 
 
 @torch.no_grad()

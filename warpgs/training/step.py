@@ -95,7 +95,7 @@ class Step:
         self._zero, self._one = torch.zeros((), device=device), torch.ones((), device=device)
         self.optimizer = optim.make_optimizer(self.parameters(), self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
-        if config.graph and views.have_one_size and device.type == "cuda":
+        if views.uses_graphs:
             self._graphs = GraphCache(max_graphs=1, repeatable=False, shared_memory=device)
         self.reset_statistics()
 
@@ -152,8 +152,8 @@ class Step:
         config = self.config.loss
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
         terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
-        # The weights are the gradients of the weighted sum, whose value is not needed.
-        torch.autograd.backward(list(terms.values()), [self._inputs.scale[name] for name in terms])
+        weights = torch.stack([self._inputs.scale[name] for name in terms])
+        (torch.stack(list(terms.values())) * weights).sum().backward()
         optim.average_gradients(self.optimizer)
         self.optimizer.step()
         self.optimizer.zero_grad()

@@ -81,7 +81,9 @@ class Trainer:
         poses = None
         if config.optim.poses:
             poses = PoseCorrections(len(self.capture.train), self.capture.extent).to(self.device)
-        self.views = Views(self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses)
+        self.views = Views(
+            self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph
+        )
         self.iteration, self.rollbacks = 0, 0
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()

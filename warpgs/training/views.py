@@ -12,6 +12,7 @@ from warpgs.data.builtin_cache import cache_folder
 from warpgs.data.capture import Capture
 from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
+from warpgs.runtime.graphs import GraphCache
 
 from .stored_views import ReadAhead, Slot, StoredView, ViewReader
 from .view_cache import ViewCache
@@ -54,13 +55,14 @@ class Views:
             frames are not empty have none: they are exact.
         gains: [T, 3] what images are divided by, per channel; nothing if None.
         poses: Corrections of the cameras; none if None.
+        graph: Whether work on the views may be captured in CUDA graphs.
 
     Attributes:
         poses: The corrections.
         background: Colour behind everything.
         resident: Whether all views are on the device.
         cache: The file of those that are not resident, so that each is decoded once; None if all are.
-        have_one_size: Whether all views are of one size.
+        uses_graphs: Whether work on the selected view is captured in CUDA graphs; only if all views are of one size.
         index: [1] index of the selected view, on the device.
         num_pixels: Number of pixels of all views.
 
@@ -76,6 +78,7 @@ class Views:
         mask_margin: float = 0.0,
         gains: Float[Tensor, "T 3"] | None = None,
         poses: PoseCorrections | None = None,
+        graph: bool = True,
     ) -> None:
         self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
@@ -84,9 +87,10 @@ class Views:
         self.index = torch.zeros(1, dtype=torch.int64, device=device)
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
-        self.have_one_size = len(set(sizes)) == 1
+        have_one_size = len(set(sizes)) == 1
+        self.uses_graphs = graph and have_one_size and device.type == "cuda"
         first = self._reader.read(0)
-        self.resident = self.have_one_size and len(self) * first.nbytes() <= resident_bytes
+        self.resident = have_one_size and len(self) * first.nbytes() <= resident_bytes
         self.cache = None if self.resident else ViewCache(cache_folder(), sizes)
         self._reader.cache = self.cache
         if self.resident:
@@ -115,6 +119,19 @@ class Views:
             self.announce(indices[position:])
             yield self[index]
 
+    @torch.no_grad()
+    def map(self, work: Callable[[View], tuple[Tensor, ...]]) -> Iterator[tuple[Tensor, ...]]:
+        """The results of work on every view, without gradients; each is valid until the next.
+
+        Args:
+            work: Returns tensors, and has no other effect: it may be captured in a CUDA graph.
+        """
+        graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=True) if self.uses_graphs else None
+        for index in range(len(self)):
+            self.announce(range(index, len(self)))
+            self.select(index)
+            yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
+
     def announce(self, indices: Iterable[int]) -> None:
         """Says which views come next, so that those that are not resident are read ahead."""
         if not self.resident:
@@ -127,7 +144,7 @@ class Views:
             self._slot.fill(self._read_ahead.take(index))
 
     def selected(self) -> View:
-        """The selected view, read from addresses that stay the same if ``have_one_size``."""
+        """The selected view, read from addresses that stay the same if ``uses_graphs``."""
         if not self.resident:
             return self._view(self._slot.view, self.index)
         return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
