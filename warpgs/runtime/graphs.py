@@ -118,7 +118,7 @@ def record(
     graph = torch.cuda.CUDAGraph()
     with _one_capture:
         torch.cuda.synchronize()
-        # ``torch.cuda.graph`` always frees what torch caches, which takes longer than the rest of a capture.
+        # ``torch.cuda.graph`` always frees what torch caches, which then has to be allocated anew.
         if torch.cuda.mem_get_info()[0] < torch.cuda.memory_reserved() - torch.cuda.memory_allocated():
             torch.cuda.empty_cache()
         with torch.cuda.stream(stream):
