@@ -43,6 +43,12 @@ def test_only_the_last_frames_are_cached():
     assert read == ["f0", "f1", "f2", "f0"]
 
 
+def test_frames_come_in_the_order_of_their_names():
+    capture, read = make_capture()
+    assert [frame.name for frame in capture.frames(("f2", "f0", "f1"))] == ["f2", "f0", "f1"]
+    assert sorted(read) == ["f0", "f1", "f2"]
+
+
 def test_the_cache_of_frames_has_a_maximum_size(monkeypatch):
     frame_bytes = capture_module.BYTES_PER_PIXEL * make_capture()[0].cameras["f0"].width * 2
     monkeypatch.setattr(capture_module, "MAX_CACHE_BYTES", 2 * frame_bytes)

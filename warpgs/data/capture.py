@@ -1,7 +1,7 @@
 """A capture: posed images of a dynamic scene, read frame by frame."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal
@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
+
+from .read_ahead import ReadAhead
 
 MIN_EXTENT = 0.05
 """Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
@@ -203,3 +205,7 @@ class Capture:
             return frame
         static = torch.full(frame.image.shape[:2], self.assumption == "static")
         return replace(frame, static_mask=static if frame.empty is None else static | frame.empty)
+
+    def frames(self, names: Sequence[str]) -> Iterator[Frame]:
+        """Frames one after the other, read ahead by threads; raises as ``frame``."""
+        return ReadAhead(self.frame).each(names)

@@ -34,8 +34,8 @@ def exposure_gains(capture: Capture) -> Float[Tensor, "T 3"]:
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     logs, log, before = torch.zeros(len(order), 3), torch.zeros(3), None
-    for k in order:
-        after = _log_intensities(capture.frame(capture.train[k]))
+    for k, frame in zip(order, capture.frames([capture.train[k] for k in order]), strict=True):
+        after = _log_intensities(frame)
         if before is not None:
             log = log + _jump(before, after)
         logs[k], before = log, after

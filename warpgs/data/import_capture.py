@@ -1,6 +1,6 @@
 """Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,7 @@ def import_capture(
     names = sorted((*capture.train, *capture.val), key=lambda name: (capture.cameras[name].time, name))
     val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
     with complete_or_absent(target) as folder:
-        counts = _write_frames(folder, capture, progress(names, "importing", log is None))
+        counts = _write_frames(folder, capture, names, quiet=log is None)
         _write_index(folder, capture, names, val)
     if log is not None:
         log(
@@ -65,11 +65,10 @@ def import_capture(
         log(f"{target} is finished: next run warpgs check {target}")
 
 
-def _write_frames(folder: Path, capture: Capture, names: Iterable[str]) -> tuple[int, int]:
+def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: bool) -> tuple[int, int]:
     """Writes the frames; returns the numbers of those with masks and with depth."""
     num_masks = num_depths = 0
-    for name in names:
-        frame = capture.frame(name)
+    for name, frame in zip(progress(names, "importing", quiet), capture.frames(names), strict=True):
         if frame.static_mask is not None and capture.assumption == "masks":
             writer.write_mask(folder, name, frame.static_mask.numpy(), FACTORS)
             num_masks += 1

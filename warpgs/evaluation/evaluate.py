@@ -143,8 +143,8 @@ def evaluate(
     device = scene.device
     read_taken = capture.read_taken if as_taken else None
     views = []
-    for index, name in enumerate(progress(capture.val, "evaluating", quiet)):
-        frame = capture.frame(name)
+    names = progress(capture.val, "evaluating", quiet)
+    for index, (name, frame) in enumerate(zip(names, capture.frames(capture.val), strict=True)):
         camera = frame.camera.to(device) if align is None else align(frame)
         if read_taken is None:
             rendering = scene.render(camera, branches=True)

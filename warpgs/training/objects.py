@@ -64,8 +64,8 @@ def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
         order: Indices of training frames, by time or backward in time.
     """
     follower = _Follower()
-    for index in order:
-        follower.add(index, capture.frame(capture.train[index]))
+    for index, frame in zip(order, capture.frames([capture.train[index] for index in order]), strict=True):
+        follower.add(index, frame)
     return follower.objects
 
 

@@ -51,7 +51,7 @@ class Region(NamedTuple):
 
 def find_regions(capture: Capture) -> list[list[Region]]:
     """The regions of each training frame."""
-    return [_regions(capture.frame(name)) for name in capture.train]
+    return [_regions(frame) for frame in capture.frames(capture.train)]
 
 
 def _regions(frame: Frame) -> list[Region]:

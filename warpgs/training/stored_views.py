@@ -1,11 +1,7 @@
 """Views as they are stored, read before they are needed and brought to the device while the step before still runs."""
 
-import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
-from itertools import islice
+from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -16,14 +12,7 @@ from torch import Tensor
 
 from warpgs.data.capture import MASKS_REMEDY, Capture
 
-from . import ranks
 from .view_cache import Pixels, ViewCache
-
-MAX_THREADS = 16
-"""Maximum number of threads that read views; each holds one or two in memory."""
-
-SPARE = 2
-"""Number of views that may be ready beyond those that the threads are reading."""
 
 
 class StoredView(NamedTuple):
@@ -121,45 +110,6 @@ class ViewReader:
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
         return Pixels(frame.image, frame.static_mask, depth, border)
-
-
-class ReadAhead:
-    """Reads views by index in threads, before they are taken.
-
-    Threads suffice: OpenCV, torch and large numpy operations release the interpreter's lock. Every rank has its part of
-    the machine's cores.
-
-    Args:
-        read: Reads the view of an index; called by several threads at once.
-        device: Device of training.
-    """
-
-    def __init__(self, read: Callable[[int], StoredView], device: torch.device) -> None:
-        # New threads would use the first GPU, whatever the rank.
-        setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
-        threads = max(1, min(MAX_THREADS, (os.cpu_count() or 1) // ranks.num_local_ranks()))
-        self._read, self._max_pending = read, threads + SPARE
-        self._pool = ThreadPoolExecutor(threads, "views", initializer=setup)
-        self._pending: dict[int, Future[StoredView]] = {}
-
-    def announce(self, indices: Iterable[int]) -> None:
-        """Begins to read the first of these views, as many as there is room for, and forgets all others."""
-        wanted = list(islice(indices, self._max_pending))
-        for index in self._pending.keys() - wanted:
-            self.forget(index)
-        for index in wanted:
-            if index not in self._pending:
-                self._pending[index] = self._pool.submit(self._read, index)
-
-    def forget(self, index: int) -> None:
-        """Drops what was read ahead of a view, which is read again when it is taken."""
-        if index in self._pending:
-            self._pending.pop(index).cancel()
-
-    def take(self, index: int) -> StoredView:
-        """The view of an index, read ahead or now; raises what reading it raised."""
-        future = self._pending.pop(index, None)
-        return self._read(index) if future is None else future.result()
 
 
 class Slot:

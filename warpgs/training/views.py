@@ -1,6 +1,7 @@
 """Training views on the device."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -10,11 +11,13 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.data.builtin_cache import cache_folder
 from warpgs.data.capture import Capture
+from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
-from .stored_views import ReadAhead, Slot, StoredView, ViewReader
+from . import ranks
+from .stored_views import Slot, StoredView, ViewReader
 from .view_cache import ViewCache
 
 
@@ -83,7 +86,9 @@ class Views:
         self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
         self._reader = ViewReader(capture, mask_margin, gains, pinned=device.type == "cuda")
-        self._read_ahead, self._slot = ReadAhead(self._reader.read, device), Slot(device)
+        # New threads would use the first GPU, whatever the rank.
+        setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
+        self._read_ahead, self._slot = ReadAhead(self._reader.read, ranks.num_local_ranks(), setup), Slot(device)
         self.index = torch.zeros(1, dtype=torch.int64, device=device)
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -95,9 +100,8 @@ class Views:
         self._reader.cache = self.cache
         if self.resident:
             self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
-            for index in range(len(self)):
-                self._read_ahead.announce(range(index, len(self)))
-                self._at(index).copy_(self._read_ahead.take(index))
+            for index, stored in enumerate(self._read_ahead.each(range(len(self)))):
+                self._at(index).copy_(stored)
 
     def __len__(self) -> int:
         return len(self._capture.train)
