@@ -180,8 +180,9 @@ def test_the_disc_contains_a_fifth_of_the_gaussians():
 # Training -----------------------------------------------------------------------------------------------------------
 
 
-def test_steps_of_both_stages_are_measured():
-    measured = measure_steps(300, (48, 32), "cpu", repeats=1)
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_steps_of_both_stages_are_measured(preset):
+    measured = measure_steps(300, (48, 32), "cpu", 1, preset)
     assert (measured["gaussians"], measured["width"], measured["height"]) == (300, 48, 32)
     assert measured["stage1_ms"] > 0
     assert measured["stage2_ms"] > 0
@@ -203,7 +204,7 @@ def test_a_plain_step_has_neither_networks_nor_depth():
 
 def test_the_scene_for_step_times_has_both_branches_and_the_networks_of_the_paper():
     splats, camera = random_splats(1000, 64, 48, 3.0, 0)
-    scene = random_scene(splats, in_disc(splats.means, camera))
+    scene = random_scene(splats, in_disc(splats.means, camera), PRESETS["paper"].model)
     assert 100 < len(scene.dynamic) < 300
     assert len(scene.static) + len(scene.dynamic) == 1000
     assert len(scene.deformation.trunk.sizes) == 9

@@ -34,6 +34,8 @@ class Bench:
     """File for a Chrome trace (chrome://tracing) of the kernels of one forward and backward pass."""
     steps: bool = False
     """Measure whole training steps instead, for several numbers of Gaussians and image sizes."""
+    preset: Literal["paper", "best", "patient", "quick"] = "paper"
+    """Preset whose networks and losses the training steps have."""
     fps: Path | None = None
     """Measure the frames per second of this run folder instead."""
 

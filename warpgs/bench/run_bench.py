@@ -78,7 +78,7 @@ def bench_training(options: Bench, device: str) -> list[Path]:
     print_machine(head)
     report: Measurements = {"machine": head, "repeats": options.repeats}
     if options.steps:
-        report["steps"] = bench_steps(device, options.repeats)
+        report["steps"] = bench_steps(device, options.repeats, options.preset)
     if options.fps is not None:
         report["fps"] = bench_fps(options.fps, device)
     return write((options.json, report))

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.config import ModelConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.evaluation.evaluate import frame_rate
@@ -64,9 +65,8 @@ def random_capture(splats: Splats, camera: Camera) -> Capture:
     return Capture("noise", cameras, list(cameras), [], splats.means, None, read)
 
 
-def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"]) -> SplitScene:
-    """The Gaussians before activation, with the networks of the paper."""
-    config = PRESETS["paper"].model
+def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"], config: ModelConfig) -> SplitScene:
+    """The Gaussians before activation, with networks."""
     assert splats.colors is not None
     parts = []
     for part in (~dynamic, dynamic):
@@ -83,27 +83,29 @@ def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"]) -> SplitScene:
     return SplitScene(parts[0], parts[1], config, *scene_box(splats.means))
 
 
-def bench_steps(device: str, repeats: int) -> list[dict[str, Any]]:
+def bench_steps(device: str, repeats: int, preset: str = "paper") -> list[dict[str, Any]]:
     """Measures training steps (render, loss, backward pass, Adam) of both stages; prints and returns the results."""
-    rows = [measure_steps(num, size, device, repeats) for num, size in STEPS[device]]
-    print_rows("whole training steps, medians", rows)
+    rows = [measure_steps(num, size, device, repeats, preset) for num, size in STEPS[device]]
+    print_rows(f"whole training steps of {preset}, medians", rows)
     return rows
 
 
-def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int) -> dict[str, Any]:
+def measure_steps(
+    num_gaussians: int, size: tuple[int, int], device: str, repeats: int, preset: str = "paper"
+) -> dict[str, Any]:
     """Median time [ms] of a step of stage I, of stage II and of 3DGS, and on CUDA the maximum memory of tensors [MB].
 
     That of 3DGS has no networks, no depth and no dynamic Gaussians, and compares the joint image alone; the static and
     the dynamic image are rendered, too.
     """
     splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / MIN_SIZE[0], SEED)
-    config = dataclasses.replace(PRESETS["paper"], device="cuda" if device == "cuda" else "cpu")
+    config = dataclasses.replace(PRESETS[preset], device="cuda" if device == "cuda" else "cpu")
     capture = random_capture(splats, camera)
     views = Views(capture, torch.device(device), config.resident_bytes)
     alignments = torch.tensor([[1.0, 0.0]], device=device).repeat(NUM_VIEWS, 1)
     trust = DepthTrust(torch.ones(NUM_VIEWS, device=device), torch.zeros(NUM_VIEWS, device=device))
     dynamic = in_disc(splats.means, camera)
-    scene = random_scene(splats, dynamic).to(device)
+    scene = random_scene(splats, dynamic, config.model).to(device)
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
     protocol = Protocol(config, has_depth=True)
@@ -112,7 +114,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
         step = Step(config, scene, views, alignments, trust, capture.extent)
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
-    scene = random_scene(splats, torch.zeros_like(dynamic)).to(device)
+    scene = random_scene(splats, torch.zeros_like(dynamic), config.model).to(device)
     loss = dataclasses.replace(config.loss, branches_in_stage2="no")
     plain_config = dataclasses.replace(config, static_geometry=True, loss=loss)
     step = Step(plain_config, scene, views, alignments, trust, capture.extent)
