@@ -66,6 +66,18 @@ def test_an_earlier_frame_is_decoded_again_and_no_more_are_kept(video, index_of)
     assert len(frames._kept) == NUM_KEPT
 
 
+def test_damage_is_the_same_error_for_earlier_frames(path, tmp_path):
+    data = path.read_bytes()
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(data)
+    frames = VideoFrames(cut)
+    cut.write_bytes(b"no video")
+    frames._restart()
+    for index in (11, 10):
+        with pytest.raises(ValueError, match="is damaged or not a video"):
+            frames.read(index)
+
+
 def test_a_frame_after_the_end_is_an_error(video, index_of):
     with pytest.raises(ValueError, match=f"has {NUM} frames, no frame {NUM}"):
         video[0].read(NUM)

@@ -127,8 +127,9 @@ def test_graphs_that_are_captured_again_reuse_the_memory(data, tmp_path):
     assert reserved[-1] <= reserved[2]
 
 
-def test_work_on_all_views_is_the_same_in_a_graph(data, tmp_path):
-    trainer = trainer_on_cuda(data, tmp_path / "run")
+@pytest.mark.parametrize("resident_bytes", [1 << 30, 0])
+def test_work_on_all_views_is_the_same_in_a_graph(data, tmp_path, resident_bytes):
+    trainer = trainer_on_cuda(data, tmp_path / "run", resident_bytes=resident_bytes)
     tiny.train(trainer)
     phase = trainer.protocol.phase_at(tiny.LENGTH - 1)
 

@@ -421,5 +421,5 @@ def test_views_that_do_not_fit_on_the_device_are_announced(data, tmp_path, monke
     lines = []
     config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=tmp_path / "run", resident_bytes=1000)
     script._describe(script.make_trainer(config, lines.append), lines.append)
-    expected = "decoded once into a file in" if free else "decoded again and again, for which a file has no room in"
+    expected = "read from a file in" if free else "decoded in every iteration: there is no space for a file in"
     assert any("--resident-bytes" in line and expected in line for line in lines)

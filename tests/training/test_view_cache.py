@@ -85,6 +85,15 @@ def test_a_disk_without_room_stores_nothing(tmp_path, monkeypatch):
     assert cache.load(0, pinned=False) is None
 
 
+def test_what_must_stay_free_is_kept_while_the_disk_fills(tmp_path, monkeypatch):
+    cache = ViewCache(tmp_path, SIZES)
+    cache.store(0, pixels(0))
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=SPARE_BYTES))
+    cache.store(1, pixels(1))
+    assert cache.load(1, pinned=False) is None
+    assert_equal(cache.load(0, pinned=False), pixels(0))
+
+
 def test_a_cut_file_is_an_error(tmp_path):
     cache = ViewCache(tmp_path, SIZES)
     cache.store(0, pixels(0))

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from warpgs.files import require_file
 
 from .images import MAX_PIXELS
+from .read_ahead import MAX_THREADS, SPARE
 
 MAX_BYTES = 64 << 30
 """Maximum size of a video [bytes]."""
@@ -19,7 +20,7 @@ READ_LOCAL_FILES = {"protocol_whitelist": "file"}
 """Options of FFmpeg, with which playlists cannot make it open addresses."""
 
 
-NUM_KEPT = 20
+NUM_KEPT = MAX_THREADS + SPARE
 """Number of decoded frames to keep: threads that read frames in their order ask for some a little late."""
 
 
@@ -53,13 +54,20 @@ class VideoFrames:
         """
         with self._lock:
             if index not in self._kept:
-                self._decode_to(index)
+                try:
+                    self._decode_to(index)
+                except ValueError:
+                    self._restart()  # so that the threads that ask for frames before it get the same error
+                    raise
             return self._kept[index]
+
+    def _restart(self) -> None:
+        self._next, self._frames = 0, self._decoded()
+        self._kept.clear()
 
     def _decode_to(self, index: int) -> None:
         if index < self._next:
-            self._next, self._frames = 0, self._decoded()
-            self._kept.clear()
+            self._restart()
         while self._next <= index:
             image = next(self._frames, None)
             if image is None:

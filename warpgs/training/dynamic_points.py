@@ -90,7 +90,8 @@ def to_canonical(
     """Canonical positions x that a deformation d moves to points p at a time: x + d(x, time) = p.
 
     Newton's method, which also follows rotations; no gradient flows to positions, so derivatives are differences. All
-    points take all steps, those that are there of length 0, so that a CUDA graph can be captured.
+    points take all steps, those that are there of length 0, so that a CUDA graph can be captured; on the CPU the search
+    ends when all are there.
 
     Args:
         deformation: As ``fields.FIELDS`` says.
@@ -116,6 +117,8 @@ def to_canonical(
         step = (cofactors * missing).sum(2).T / (cofactors * derivatives).sum(2)[0][:, None]  # Cramer's rule
         step = step * (MAX_STEP * distances / step.norm(dim=1, keepdim=True)).clamp_max(1.0)
         step = torch.where(reached, 0.0, step)
+        if not start.is_cuda and bool(reached.all()):
+            break
     return found, reached[:, 0]
 
 

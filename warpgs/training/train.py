@@ -158,9 +158,9 @@ def _describe(trainer: Trainer, log: Log) -> None:
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     log(f"{name}{layout}: {num_views} views, on {config.device}{together}, into {trainer.run}")
     if (cache := trainer.views.cache) is not None:
-        read = "decoded once into a file" if cache.fits else "decoded again and again, for which a file has no room"
+        read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
         log(
-            f"not all views are on the device (--resident-bytes): {cache.nbytes / 1e9:.1f} GB, {read} in {cache.folder}"
+            f"views of {cache.nbytes / 1e6:,.0f} MB exceed --resident-bytes or differ in size; {read} in {cache.folder}"
         )
     if jumps := int((trainer.gains != 1.0).any(1).sum()):
         low, high = trainer.gains.min().item(), trainer.gains.max().item()

@@ -67,6 +67,8 @@ class ViewCache:
         parts = [pixels.image.numpy(), *(np.packbits(mask.numpy()) for mask in masks)]
         parts += [pixels.inverse_depth.numpy()] * has_depth
         data = b"".join(part.tobytes() for part in parts)
+        if shutil.disk_usage(self.folder).free < len(data) + SPARE_BYTES:  # others write there, too
+            return
         with self._lock:
             self._file.seek(self._starts[index])
             with contextlib.suppress(OSError):  # a full disk: the view is decoded again
