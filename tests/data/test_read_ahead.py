@@ -82,8 +82,9 @@ def test_an_error_is_raised_where_the_item_is_taken(reader):
     assert ahead.take(14) == 10 * 14
 
 
-def test_processes_share_the_cores(reader):
-    ahead = ReadAhead(reader, processes=2)
+def test_processes_share_the_cores(reader, monkeypatch):
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    ahead = ReadAhead(reader)
     ahead.announce(count())
     ahead._pool.shutdown(wait=True)
     assert sorted(reader.read) == [0, 1, 2]

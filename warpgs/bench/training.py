@@ -83,16 +83,14 @@ def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"], config: ModelConfi
     return SplitScene(parts[0], parts[1], config, *scene_box(splats.means))
 
 
-def bench_steps(device: str, repeats: int, preset: str = "paper") -> list[dict[str, Any]]:
+def bench_steps(device: str, repeats: int, preset: str) -> list[dict[str, Any]]:
     """Measures training steps (render, loss, backward pass, Adam) of both stages; prints and returns the results."""
     rows = [measure_steps(num, size, device, repeats, preset) for num, size in STEPS[device]]
     print_rows(f"whole training steps of {preset}, medians", rows)
     return rows
 
 
-def measure_steps(
-    num_gaussians: int, size: tuple[int, int], device: str, repeats: int, preset: str = "paper"
-) -> dict[str, Any]:
+def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int, preset: str) -> dict[str, Any]:
     """Median time [ms] of a step of stage I, of stage II and of 3DGS, and on CUDA the maximum memory of tensors [MB].
 
     That of 3DGS has no networks, no depth and no dynamic Gaussians, and compares the joint image alone; the static and

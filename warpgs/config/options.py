@@ -12,7 +12,7 @@ NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
 
-MAX_ALPHA = Bounds(positive=True, max=0.9998)
+ALPHA_BOUNDS = Bounds(positive=True, max=0.9998)
 """Range of ``max_alpha``: a Gaussian with an alpha of 0.9999 would end a pixel instead of contributing to it."""
 
 
@@ -45,7 +45,7 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if not 0 < self.near < math.inf:
             raise ValueError(f"near must be positive and finite, got {self.near}")
-        MAX_ALPHA.check("max_alpha", self.max_alpha)
+        ALPHA_BOUNDS.check("max_alpha", self.max_alpha)
         if self.absgrad and self.imagegrad:
             raise ValueError("expected absgrad or imagegrad, got both: both are the gradient of screen_offsets")
         if self.max_intersections is not None and not 0 < self.max_intersections < 1 << 30:
@@ -325,7 +325,7 @@ class TrainConfig:
     """Divide jumps of exposure and white balance between frames out of the training images."""
     antialias: bool = False
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
-    max_alpha: Annotated[float, MAX_ALPHA] = RenderSettings.max_alpha
+    max_alpha: Annotated[float, ALPHA_BOUNDS] = RenderSettings.max_alpha
     """Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS (paper)."""
     graph: bool = True
     """On CUDA, replay iterations and the steps of ``schedule.fit_motion`` as CUDA graphs."""

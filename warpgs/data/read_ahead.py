@@ -19,17 +19,16 @@ Item = TypeVar("Item")
 class ReadAhead(Generic[Key, Item]):
     """Reads items by key in threads, before they are taken.
 
-    Threads suffice for frames: OpenCV, torch and large numpy operations release the interpreter's lock.
+    Threads suffice for frames: OpenCV, torch and large numpy operations release the interpreter's lock. Processes that
+    torchrun started share the cores of their machine.
 
     Args:
         read: Reads the item of a key; called by several threads at once.
-        processes: Number of processes that share the cores of this machine.
         setup: Called in each thread before it reads.
     """
 
-    def __init__(
-        self, read: Callable[[Key], Item], processes: int = 1, setup: Callable[[], object] | None = None
-    ) -> None:
+    def __init__(self, read: Callable[[Key], Item], setup: Callable[[], object] | None = None) -> None:
+        processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
         threads = max(1, min(MAX_THREADS, (os.cpu_count() or 1) // processes))
         self._read, self._max_pending = read, threads + SPARE
         self._pool = ThreadPoolExecutor(threads, "read-ahead", initializer=setup)

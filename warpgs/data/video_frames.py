@@ -40,8 +40,8 @@ class VideoFrames:
     def __init__(self, path: Path) -> None:
         self.path = path
         require_file(path, MAX_BYTES)
-        self._next, self._frames = 0, self._decoded()
         self._kept: dict[int, np.ndarray] = {}
+        self._restart()
         self._lock = threading.Lock()
         first = self.read(0)
         self.size = first.shape[1], first.shape[0]

@@ -94,11 +94,6 @@ def num_ranks() -> int:
     return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
-def num_local_ranks() -> int:
-    """Number of ranks on this machine."""
-    return int(os.environ["LOCAL_WORLD_SIZE"]) if num_ranks() > 1 else 1
-
-
 def rank() -> int:
     """Index of this process among the ranks of all machines."""
     return dist.get_rank() if num_ranks() > 1 else 0
@@ -117,7 +112,7 @@ def use_device(device: str) -> None:
     """
     if device != "cuda" or num_ranks() == 1:
         return
-    here, gpus = num_local_ranks(), torch.cuda.device_count()
+    here, gpus = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
     if here > gpus:
         raise ValueError(
             f"torchrun started {here} processes on this machine, where torch sees {gpus} GPU{'s' * (gpus != 1)}: "

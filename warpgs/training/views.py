@@ -16,7 +16,6 @@ from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
-from . import ranks
 from .stored_views import Slot, StoredView, ViewReader
 from .view_cache import ViewCache
 
@@ -88,7 +87,7 @@ class Views:
         self._reader = ViewReader(capture, mask_margin, gains, pinned=device.type == "cuda")
         # New threads would use the first GPU, whatever the rank.
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
-        self._read_ahead, self._slot = ReadAhead(self._reader.read, ranks.num_local_ranks(), setup), Slot(device)
+        self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
         self.index = torch.zeros(1, dtype=torch.int64, device=device)
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -119,9 +118,13 @@ class Views:
 
     def some(self, indices: Sequence[int]) -> Iterator[View]:
         """The views of these indices, one after the other."""
+        return (self[index] for index in self._announced(indices))
+
+    def _announced(self, indices: Sequence[int]) -> Iterator[int]:
+        """These indices, one after the other, while the views of the next ones are read ahead."""
         for position, index in enumerate(indices):
             self.announce(indices[position:])
-            yield self[index]
+            yield index
 
     @torch.no_grad()
     def map(self, work: Callable[[View], tuple[Tensor, ...]]) -> Iterator[tuple[Tensor, ...]]:
@@ -131,8 +134,7 @@ class Views:
             work: Returns tensors, and has no other effect: it may be captured in a CUDA graph.
         """
         graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=True) if self.uses_graphs else None
-        for index in range(len(self)):
-            self.announce(range(index, len(self)))
+        for index in self._announced(range(len(self))):
             self.select(index)
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
 

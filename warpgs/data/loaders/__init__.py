@@ -64,8 +64,8 @@ def load_capture(
     factor: int | None = None,
     vrig_factor: int | None = None,
     perturbation: MaskPerturbation | None = None,
-    cache_frames: int = 256,
-    undistort: bool = True,
+    cache_frames: int = LoadOptions.cache_frames,
+    undistort: bool = LoadOptions.undistort,
 ) -> Capture:
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
