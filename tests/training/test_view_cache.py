@@ -3,7 +3,10 @@
 import dataclasses
 import errno
 import shutil
+import threading
+import weakref
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -54,12 +57,20 @@ def test_the_file_has_no_name(tmp_path):
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_forgotten_view_and_one_that_was_never_stored_are_missing(tmp_path):
+def test_a_view_that_was_never_stored_is_missing(tmp_path):
     cache = ViewCache(tmp_path, SIZES)
-    cache.store(0, pixels(0))
-    cache.forget(0)
-    assert cache.load(0, pinned=False) is None
+    assert cache.store(0, pixels(0))
     assert cache.load(1, pinned=False) is None
+
+
+def test_a_stored_view_is_only_overwritten_on_request(tmp_path):
+    cache = ViewCache(tmp_path, SIZES)
+    first, second = pixels(0), pixels(2)._replace(inverse_depth=pixels(0).inverse_depth * 2)
+    cache.store(0, first)
+    assert cache.store(0, second)
+    assert_equal(cache.load(0, pinned=False), first)
+    assert cache.store(0, second, replace=True)
+    assert_equal(cache.load(0, pinned=False), second)
 
 
 def test_a_disk_that_becomes_full_keeps_what_was_stored_before(tmp_path, monkeypatch):
@@ -71,7 +82,7 @@ def test_a_disk_that_becomes_full_keeps_what_was_stored_before(tmp_path, monkeyp
 
     file = cache._file
     monkeypatch.setattr(cache, "_file", SimpleNamespace(write=write, seek=file.seek, readinto=file.readinto))
-    cache.store(1, pixels(1))
+    assert not cache.store(1, pixels(1))
     assert cache.load(1, pinned=False) is None
     assert_equal(cache.load(0, pinned=False), pixels(0))
 
@@ -102,22 +113,103 @@ def test_a_cut_file_is_an_error(tmp_path):
         cache.load(0, pinned=False)
 
 
-def test_frames_are_decoded_once_until_their_depth_changes(tmp_path):
-    source = load_capture(tiny.write(tmp_path), cache_frames=1)
-    decoded = Counter()
+# Changes of depth -----------------------------------------------------------------------------------------------------
 
-    def read(name):
-        decoded[name] += 1
-        return source.read(name)
 
-    capture = dataclasses.replace(source, read=read, cache_frames=1)
-    views = Views(capture, torch.device("cpu"), resident_bytes=0)
-    for _ in range(3):
-        assert len([*views]) == len(capture.train)
-    assert set(decoded.values()) <= {1, 2}  # the first one also tells how large views are
-    assert sum(decoded.values()) <= len(capture.train) + 1
+class Decoder:
+    """The frames of a capture with depth, and how often each was decoded."""
 
-    before = views[0].inverse_depth
-    factor = torch.full_like(before, 2.0)
+    def __init__(self, folder):
+        self.source, self.count = load_capture(tiny.write(folder), cache_frames=1), Counter()
+        self.capture = dataclasses.replace(self.source, read=self, cache_frames=1)
+
+    def __call__(self, name):
+        self.count[name] += 1
+        return self.source.read(name)
+
+    def views(self, resident_bytes=0):
+        return Views(self.capture, torch.device("cpu"), resident_bytes, mask_margin=0.05)
+
+
+@pytest.fixture
+def decoder(tmp_path):
+    return Decoder(tmp_path)
+
+
+def change_twice(views):
+    """Changes the depth of every view: the known one by a factor, and then that of dynamic pixels without it."""
+    alignment = torch.tensor([2.0, 0.5])
+    for index, view in enumerate(views):
+        height, width = view.inverse_depth.shape
+        factor = torch.linspace(0.8, 1.2, height * width).view(height, width)
+        views.set_depth_factor(index, alignment, factor.where(view.static_mask, torch.nan))
+        views.set_object_depth(index, alignment, torch.rand(height // 2, width // 2, generator=generator(index)) + 0.5)
+
+
+def test_frames_are_decoded_once_even_if_their_depth_changes(decoder):
+    views = decoder.views()
+    change_twice(views)
+    for _ in range(2):
+        assert len([*views]) == len(decoder.capture.train)
+    assert sum(decoder.count.values()) <= len(decoder.capture.train) + 1  # the first one also tells how large views are
+    assert decoder.count.keys() == set(decoder.capture.train)
+
+
+@pytest.mark.parametrize("disk", ["has space", "becomes full", "is full"])
+def test_changed_depth_is_that_of_resident_views_bit_for_bit(decoder, monkeypatch, disk):
+    plain, resident = decoder.views(1 << 30), decoder.views(1 << 30)
+    change_twice(resident)
+    free = {"has space": 1 << 50, "becomes full": 1 << 50, "is full": 0}[disk]
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
+    views = decoder.views()
+    assert len([*views]) == len(resident)
+    if disk == "becomes full":
+        free = SPARE_BYTES
+    change_twice(views)
+    for index in range(len(views)):
+        assert_equal(views[index][1:], resident[index][1:])
+        assert not torch.equal(views[index].inverse_depth, plain[index].inverse_depth)
+
+
+def test_factors_of_depth_do_not_stay_in_memory(decoder):
+    views = decoder.views()
+    factor = torch.full(views[0].inverse_depth.shape, 2.0).half()
+    alive = weakref.ref(factor)
     views.set_depth_factor(0, torch.tensor([1.0, 0.0]), factor)
-    torch.testing.assert_close(views[0].inverse_depth, 2.0 * before, rtol=1e-3, atol=0.0, equal_nan=True)
+    del factor
+    assert alive() is None
+    assert not views._reader._changed_depth
+
+
+@pytest.mark.parametrize("step", ["load", "store"])
+def test_depth_that_changes_while_a_thread_reads_the_view_is_not_lost(decoder, monkeypatch, step):
+    """The thread stops before or after it decodes the view; the depth changes; then the thread goes on."""
+    views, has_begun, go_on = decoder.views(), threading.Event(), threading.Event()
+    before, act = decoder.views()[1].inverse_depth, getattr(ViewCache, step)
+
+    def stopped(cache, *arguments, **options):
+        if threading.current_thread() is not threading.main_thread():
+            has_begun.set()
+            assert go_on.wait(10.0)
+        return act(cache, *arguments, **options)
+
+    monkeypatch.setattr(ViewCache, step, stopped)
+    views.announce([1])
+    assert has_begun.wait(10.0)
+    views.set_depth_factor(1, torch.tensor([1.0, 0.0]), torch.full_like(before, 2.0))
+    go_on.set()
+    views._read_ahead._pool.shutdown(wait=True)
+    assert_equal([views._reader.read(1).inverse_depth], [(2.0 * before).half()])
+    assert_equal([views._read_ahead.take(1).inverse_depth], [(2.0 * before).half()])
+
+
+def test_a_view_that_is_being_replaced_is_read_before_or_after(tmp_path):
+    """Never in part, whatever the depth: one of the two has none."""
+    cache, views = ViewCache(tmp_path, SIZES), [pixels(0), pixels(0, depth=False)]
+    cache.store(0, views[0])
+    with ThreadPoolExecutor(2) as pool:
+        writes = [pool.submit(cache.store, 0, views[k % 2], replace=True) for k in range(200)]
+        for _ in range(200):
+            found = cache.load(0, pinned=False)
+            assert_equal(found, views[int(found.inverse_depth.isnan().all())])
+    assert all(write.result() for write in writes)

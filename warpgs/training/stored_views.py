@@ -1,6 +1,5 @@
 """Views as they are stored, read before they are needed and brought to the device while the step before still runs."""
 
-from collections import defaultdict
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -68,7 +67,7 @@ class ViewReader:
 
     def __init__(self, capture: Capture, mask_margin: float, gains: Float[Tensor, "T 3"] | None, pinned: bool) -> None:
         self._capture, self._mask_margin, self._gains, self._pinned = capture, mask_margin, gains, pinned
-        self._depth_changes: dict[int, list[Callable[[Tensor, Tensor], Tensor]]] = defaultdict(list)
+        self._changed_depth: dict[int, Tensor] = {}  # of views for which the disk has no space
         self.cache: ViewCache | None = None
 
     def read(self, index: int) -> StoredView:
@@ -77,11 +76,7 @@ class ViewReader:
         Raises:
             ValueError: If the frame is damaged or has no mask; the message names it.
         """
-        pixels = self.cache.load(index, self._pinned) if self.cache else None
-        if pixels is None:
-            pixels = self._decoded(index)
-            if self.cache:
-                self.cache.store(index, pixels)
+        pixels = self._pixels(index)
         camera = self._capture.cameras[self._capture.train[index]]
         time = torch.tensor([camera.time], dtype=torch.float32)
         gain = None if self._gains is None else self._gains[index]
@@ -89,10 +84,24 @@ class ViewReader:
         return stored.map(Tensor.pin_memory) if self._pinned else stored
 
     def change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
-        """Replaces the inverse depth of a view by a function of it and of the mask, whenever it is read."""
-        self._depth_changes[index].append(change)
-        if self.cache:
-            self.cache.forget(index)
+        """Replaces the inverse depth of a view by a function of it and of the mask, in the cache if that has space.
+
+        Called by one thread at a time. Others may read meanwhile: what they begin to read afterwards has the new depth.
+        """
+        pixels = self._pixels(index)
+        depth = change(pixels.inverse_depth.float(), pixels.static_mask).half()
+        self._changed_depth[index] = depth
+        if self.cache and self.cache.store(index, pixels._replace(inverse_depth=depth), replace=True):
+            del self._changed_depth[index]
+
+    def _pixels(self, index: int) -> Pixels:
+        pixels = self.cache.load(index, self._pinned) if self.cache else None
+        if pixels is None:
+            pixels = self._decoded(index)
+            if self.cache:
+                self.cache.store(index, pixels)
+        depth = self._changed_depth.get(index)
+        return pixels if depth is None else pixels._replace(inverse_depth=depth)
 
     def _decoded(self, index: int) -> Pixels:
         frame = self._capture.frame(self._capture.train[index])
@@ -103,13 +112,10 @@ class ViewReader:
                 f"make masks {MASKS_REMEDY}"
             )
         depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
-        depth = depth.half()
-        for change in self._depth_changes.get(index, ()):
-            depth = change(depth.float(), frame.static_mask).half()
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
-        return Pixels(frame.image, frame.static_mask, depth, border)
+        return Pixels(frame.image, frame.static_mask, depth.half(), border)
 
 
 class Slot:

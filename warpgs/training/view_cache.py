@@ -58,22 +58,37 @@ class ViewCache:
         self._lock = threading.Lock()
         self._stored: dict[int, tuple[bool, bool]] = {}
 
-    def store(self, index: int, pixels: Pixels) -> None:
-        """Keeps the pixels of a view, unless the disk is full."""
+    def store(self, index: int, pixels: Pixels, replace: bool = False) -> bool:
+        """Writes the pixels of a view, unless the disk is full.
+
+        Args:
+            index: Of the view.
+            pixels: Of the view.
+            replace: Whether to overwrite a stored view. If not, it stays: a thread that decoded the view before its
+                depth changed may store it after the change.
+
+        Returns:
+            Whether the view is stored.
+        """
         if not self.fits:
-            return
+            return False
         has_depth = not bool(pixels.inverse_depth.isnan().all())
         masks = [mask for mask in (pixels.static_mask, pixels.mask_border) if mask is not None]
         parts = [pixels.image.numpy(), *(np.packbits(mask.numpy()) for mask in masks)]
         parts += [pixels.inverse_depth.numpy()] * has_depth
-        data = b"".join(part.tobytes() for part in parts)
-        if shutil.disk_usage(self.folder).free < len(data) + SPARE_BYTES:  # others write there, too
-            return
+        parts = [np.ascontiguousarray(part) for part in parts]
         with self._lock:
+            if index in self._stored and not replace:
+                return True
+            # Others write there, too.
+            if shutil.disk_usage(self.folder).free < sum(part.nbytes for part in parts) + SPARE_BYTES:
+                return False
+            self._stored.pop(index, None)
             self._file.seek(self._starts[index])
             with contextlib.suppress(OSError):  # a full disk: the view is decoded again
-                if self._file.write(data) == len(data):
+                if all(self._file.write(part.data) == part.nbytes for part in parts):
                     self._stored[index] = len(masks) > 1, has_depth
+            return index in self._stored
 
     def load(self, index: int, pinned: bool) -> Pixels | None:
         """The pixels of a view; None if they are not stored.
@@ -82,15 +97,15 @@ class ViewCache:
             index: Of the view.
             pinned: Whether to read into pinned memory, from which CUDA copies without waiting.
         """
-        if index not in self._stored:
-            return None
-        has_border, has_depth = self._stored[index]
         width, height = self._sizes[index]
-        image = torch.empty(height, width, 3, dtype=torch.uint8, pin_memory=pinned)
-        depth = torch.empty(height, width, dtype=torch.half, pin_memory=pinned)
-        bits = np.empty((1 + has_border, -(-width * height // 8)), np.uint8)
-        parts = [image.numpy(), bits, *[depth.numpy()] * has_depth]
         with self._lock:
+            if index not in self._stored:
+                return None
+            has_border, has_depth = self._stored[index]
+            image = torch.empty(height, width, 3, dtype=torch.uint8, pin_memory=pinned)
+            depth = torch.empty(height, width, dtype=torch.half, pin_memory=pinned)
+            bits = np.empty((1 + has_border, -(-width * height // 8)), np.uint8)
+            parts = [image.numpy(), bits, *[depth.numpy()] * has_depth]
             self._file.seek(self._starts[index])
             for part in parts:
                 if self._file.readinto(part.data) != part.nbytes:
@@ -100,7 +115,3 @@ class ViewCache:
         masks = torch.from_numpy(np.unpackbits(bits, axis=1, count=height * width)).view(torch.bool)
         static, *border = (masks.pin_memory() if pinned else masks).view(-1, height, width).unbind()
         return Pixels(image, static, depth, border[0] if border else None)
-
-    def forget(self, index: int) -> None:
-        """Removes a view, because what is made of its files changed."""
-        self._stored.pop(index, None)

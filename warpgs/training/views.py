@@ -178,7 +178,7 @@ class Views:
         self._change_depth(index, change)
 
     def _change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
-        """Replaces the inverse depth of a view by a function of it and of the mask, now or whenever it is read."""
+        """Replaces the inverse depth of a view by a function of it and of the mask."""
         if self.resident:
             depth, static_mask = (values[index].cpu() for values in (self._all.inverse_depth, self._all.static_mask))
             self._all.inverse_depth[index] = change(depth.float(), static_mask).half()
