@@ -50,7 +50,7 @@ def test_frames_come_in_the_order_of_their_names():
 
 
 def test_the_cache_of_frames_has_a_maximum_size(monkeypatch):
-    frame_bytes = capture_module.BYTES_PER_PIXEL * make_capture()[0].cameras["f0"].width * 2
+    frame_bytes = capture_module.FRAME_BYTES_PER_PIXEL * make_capture()[0].cameras["f0"].width * 2
     monkeypatch.setattr(capture_module, "MAX_CACHE_BYTES", 2 * frame_bytes)
     capture, read = make_capture()
     for name in ("f0", "f1", "f2", "f2", "f1", "f0"):

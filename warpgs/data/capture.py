@@ -27,8 +27,8 @@ def extent_of(cameras: Sequence[Camera]) -> float:
 MAX_CACHE_BYTES = 1 << 30
 """Maximum memory of a capture's cache of frames."""
 
-BYTES_PER_PIXEL = 8
-"""Of a cached frame: an image, a mask and depth."""
+FRAME_BYTES_PER_PIXEL = 3 + 1 + 4
+"""Memory of a cached frame per pixel [bytes]: 8-bit RGB, a mask and depth in single precision."""
 
 
 Assumption = Literal["masks", "static", "dynamic"]
@@ -139,7 +139,7 @@ class Capture:
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()
         largest = max(camera.width * camera.height for camera in self.cameras.values())
-        fitting = max(1, MAX_CACHE_BYTES // (BYTES_PER_PIXEL * largest))
+        fitting = max(1, MAX_CACHE_BYTES // (FRAME_BYTES_PER_PIXEL * largest))
         self._cached = lru_cache(maxsize=min(self.cache_frames, fitting))(self.read)
 
     @property

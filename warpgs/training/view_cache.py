@@ -15,9 +15,6 @@ import torch
 from jaxtyping import Bool, Float16, UInt8
 from torch import Tensor
 
-BYTES_PER_PIXEL = 3 + 2 + 2 / 8
-"""Colour, depth in half precision, and one bit each of the mask and its border."""
-
 SPARE_BYTES = 4 << 30
 """What must stay free on the disk [bytes]."""
 
@@ -29,6 +26,16 @@ class Pixels(NamedTuple):
     static_mask: Bool[Tensor, "H W"]
     inverse_depth: Float16[Tensor, "H W"]
     mask_border: Bool[Tensor, "H W"] | None
+
+
+def packed_bytes(num_pixels: int) -> int:
+    """Size of a mask in the file [bytes]: one bit per pixel, in whole bytes."""
+    return -(-num_pixels // 8)
+
+
+def max_stored_bytes(width: int, height: int) -> int:
+    """Maximum size of a view in the file [bytes]: 8-bit RGB, depth in half precision, the mask and its border."""
+    return (3 + 2) * width * height + 2 * packed_bytes(width * height)
 
 
 class ViewCache:
@@ -48,10 +55,7 @@ class ViewCache:
 
     def __init__(self, folder: Path, sizes: Sequence[tuple[int, int]]) -> None:
         self.folder, self._sizes = folder, sizes
-        # Bits are stored in whole bytes.
-        *self._starts, self.nbytes = accumulate(
-            (int(BYTES_PER_PIXEL * width * height) + 2 for width, height in sizes), initial=0
-        )
+        *self._starts, self.nbytes = accumulate((max_stored_bytes(*size) for size in sizes), initial=0)
         self.fits = shutil.disk_usage(folder).free > self.nbytes + SPARE_BYTES
         self._file = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115  # open as long as this lives
         weakref.finalize(self, self._file.close)
@@ -104,7 +108,7 @@ class ViewCache:
             has_border, has_depth = self._stored[index]
             image = torch.empty(height, width, 3, dtype=torch.uint8, pin_memory=pinned)
             depth = torch.empty(height, width, dtype=torch.half, pin_memory=pinned)
-            bits = np.empty((1 + has_border, -(-width * height // 8)), np.uint8)
+            bits = np.empty((1 + has_border, packed_bytes(width * height)), np.uint8)
             parts = [image.numpy(), bits, *[depth.numpy()] * has_depth]
             self._file.seek(self._starts[index])
             for part in parts:
