@@ -63,10 +63,10 @@ def test_another_order_replaces_the_one_before(reader):
     assert not {3, 4} & set(reader.read)  # no thread had begun to read these
 
 
-def test_a_forgotten_item_is_read_again(reader):
+def test_a_discarded_item_is_read_again(reader):
     ahead = ReadAhead(reader)
     ahead.announce([5])
-    ahead.forget(5)
+    ahead.discard(5)
     ahead.take(5)
     ahead._pool.shutdown(wait=True)
     assert 1 <= reader.read.count(5) <= 2

@@ -174,7 +174,7 @@ class Capture:
         return capture
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> "Capture":
-        """The same capture with other cameras of some frames; the captures have one cache of frames."""
+        """The same capture with other cameras of the frames named; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.cameras, capture._moved = self.cameras | dict(cameras), self._moved | set(cameras)
         return capture

@@ -35,16 +35,16 @@ class ReadAhead(Generic[Key, Item]):
         self._pending: dict[Key, Future[Item]] = {}
 
     def announce(self, keys: Iterable[Key]) -> None:
-        """Begins to read the first of these items, as many as there is room for, and forgets all others."""
+        """Begins to read the first of these items, up to the maximum number of pending ones; discards all others."""
         wanted = list(islice(keys, self._max_pending))
         for key in self._pending.keys() - wanted:
-            self.forget(key)
+            self.discard(key)
         for key in wanted:
             if key not in self._pending:
                 self._pending[key] = self._pool.submit(self._read, key)
 
-    def forget(self, key: Key) -> None:
-        """Drops what was read ahead of an item, which is read again when it is taken."""
+    def discard(self, key: Key) -> None:
+        """Drops an item that was read ahead; it is read again when it is taken."""
         if key in self._pending:
             self._pending.pop(key).cancel()
 

@@ -63,7 +63,7 @@ class DynamicPoints(NamedTuple):
     depth_known: bool
 
     def chosen(self, points: Int64[Tensor, " N"] | Bool[Tensor, " S"]) -> "DynamicPoints":
-        """Some of the points."""
+        """The points with these indices, or those marked true."""
         return DynamicPoints(self.positions[points], self.colors[points], self.views[points], self.depth_known)
 
 
@@ -95,13 +95,13 @@ def to_canonical(
 
     Args:
         deformation: As ``fields.FIELDS`` says.
-        seen: [P, 3] the points p.
+        seen: [P, 3] the points p [scene units].
         time: [1] in [0, 1].
-        start: [P, 3] positions from which each is searched.
+        start: [P, 3] positions from which each is searched [scene units].
         max_error: Distance from p at which a search ends [scene units].
 
     Returns:
-        The positions, and which of them the deformation moves to within this distance.
+        The [P, 3] positions [scene units], and [P] which of them the deformation moves to within this distance.
     """
     found, step = start, torch.zeros_like(start)
     axes, width = torch.eye(3, device=start.device)[:, None], max_error / 3.0

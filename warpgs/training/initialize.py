@@ -157,7 +157,7 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
     points = capture.points.to(views.device)
     for batch in _batches(views, len(points)):
         samples = []
-        for view in views.some(batch):
+        for view in views.each(batch):
             samples.append(depth_alignment.sample_points(view.inverse_depth, view.static_mask, view.camera, points))
         alignments[batch] = depth_alignment.align_to_points(samples, capture.metric_depth)
         for index, part in zip(batch, samples, strict=True):
@@ -184,7 +184,7 @@ def align_to_rendering(
     found = []
     for batch in _batches(views, views.num_pixels // len(views)):
         samples = []
-        for view in views.some(batch):
+        for view in views.each(batch):
             layer = render(splats, view.camera, settings=settings).joint
             assert layer.depth is not None
             sources = view.inverse_depth, view.static_mask, layer.depth, layer.alpha

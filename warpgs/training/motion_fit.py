@@ -157,12 +157,12 @@ class _PointsByView:
         start = _start_time(times[views], counts)
         self.gaps, order = (times[views] - start).abs().sort(stable=True)
 
-        def some(chosen: Bool[Tensor, " S"]) -> Float[Tensor, "P 6"]:
+        def sampled(chosen: Bool[Tensor, " S"]) -> Float[Tensor, "P 6"]:
             indices = chosen.nonzero()[:, 0]
             return features[indices[subsample(indices, MAX_POINTS_PER_VIEW, generator)]]
 
-        seen = [some(found.views == view) for view in views.tolist()]
-        self.home = some((times[found.views] - start).abs() <= WINDOW).to(device)
+        seen = [sampled(found.views == view) for view in views.tolist()]
+        self.home = sampled((times[found.views] - start).abs() <= WINDOW).to(device)
         self.views, self.times = views[order].tolist(), times[views[order], None].to(device)
         self.counts = counts[order].clamp_max(MAX_POINTS_PER_VIEW).to(device)
         rows = torch.arange(max(len(points) for points in seen))
@@ -190,12 +190,20 @@ class _PointsByView:
 
     @torch.no_grad()
     def canonical(self, deformation: nn.Module, found: DynamicPoints, is_replayed: bool = False) -> DynamicPoints:
-        """The points that are deformed to where they were seen, each at its place beside the nearest canonical point.
+        """Moves points to canonical space, each next to the nearest canonical point.
 
-        That is where the offset of this canonical point leads. Where the object turns, the place is searched from the
+        Its position is where the offset of this canonical point leads. Where the object turns, it is searched from the
         canonical point itself, and not farther from it than the point was seen, or else it might be found on another
-        object. What no canonical point shows is searched from where the offset leads. ``is_replayed`` says whether to
-        capture the search in a CUDA graph.
+        object. What no canonical point shows is searched from where the offset leads.
+
+        Args:
+            deformation: Maps [N, 3] positions [scene units] and a [1] time in [0, 1] to [N, 10] offsets.
+            found: The S points, on the CPU.
+            is_replayed: Whether to capture the search in a CUDA graph.
+
+        Returns:
+            Those of the points that are deformed to where they were seen, in their order and on the CPU, with canonical
+            positions [scene units] in single precision.
         """
         positions, kept = found.positions.clone(), torch.zeros(len(found.views), dtype=torch.bool)
         graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=True) if is_replayed else None
@@ -215,7 +223,7 @@ class _PointsByView:
     def _search(
         self, deformation: nn.Module, time: Float[Tensor, "1"], seen: Float[Tensor, "P 6"]
     ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
-        """Canonical positions of points that were seen at a time, and which of them to keep; see ``canonical``."""
+        """Canonical positions [scene units] of points seen at a time, and which of them to keep; see ``canonical``."""
         deformed, max_error = self.deformed(deformation, time), MAX_ERROR * self.extent
         distances, nearest = torch.cdist(seen, deformed).min(1)
         is_shown = distances.square() <= MAX_SQUARED_DISTANCE

@@ -3,7 +3,7 @@
 One camera does not determine how far away something is that moves: twice as large, twice as far away and twice as fast
 looks the same. But the distance of an object that keeps its size is inversely proportional to the size at which it is
 seen, and the factor is bounded, because the object hides the static surfaces around it. Most objects stand on something
-or come close to it at some time, so the largest factor that the bound allows is a good one.
+or come close to it at least once, so the largest factor that the bound allows is a good one.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ MIN_POINTS = 3
 
 NEAREST, TIGHTEST = 0.02, 0.05
 """Quantile of these points' depths that is the bound in a frame; quantile of the frames' bounds that is the bound of
-the factor. Both leave room for outliers."""
+the factor. Both tolerate outliers."""
 
 MAX_POINTS = 10_000
 """Maximum number of static points that are projected into each frame."""

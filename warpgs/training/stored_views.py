@@ -1,4 +1,4 @@
-"""Views as they are stored, read before they are needed and brought to the device while the step before still runs."""
+"""Views as they are stored, read before they are needed and copied to the device while the previous step runs."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from torch import Tensor
 
 from warpgs.data.capture import MASKS_REMEDY, Capture
@@ -15,16 +15,27 @@ from .view_cache import Pixels, ViewCache
 
 
 class StoredView(NamedTuple):
-    """A view as it is stored: bytes for images, half precision for depth. Tensors may have a leading view axis."""
+    """A view as it is stored, in host memory or on the device; all T views of one size have T as a leading axis.
 
-    viewmat: Tensor
-    K: Tensor
-    time: Tensor
-    image: Tensor
-    static_mask: Tensor
-    inverse_depth: Tensor
-    mask_border: Tensor | None
-    gain: Tensor | None
+    Attributes:
+        viewmat: [4, 4] world-to-camera transform of the capture, without correction; translation in scene units.
+        K: [3, 3] intrinsics [px].
+        time: [1] time in [0, 1].
+        image: [H, W, 3] 8-bit RGB, with jumps of exposure.
+        static_mask: [H, W] true where static.
+        inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
+        mask_border: [H, W] true within the margin of a border of the mask; None without a margin.
+        gain: [3] what the image in [0, 1] is divided by, per channel; None if nothing is.
+    """
+
+    viewmat: Float32[Tensor, "*T 4 4"]
+    K: Float32[Tensor, "*T 3 3"]
+    time: Float32[Tensor, "*T 1"]
+    image: UInt8[Tensor, "*T H W 3"]
+    static_mask: Bool[Tensor, "*T H W"]
+    inverse_depth: Float16[Tensor, "*T H W"]
+    mask_border: Bool[Tensor, "*T H W"] | None
+    gain: Float32[Tensor, "*T 3"] | None
 
     def nbytes(self) -> int:
         """Memory of all tensors [bytes]."""
@@ -57,12 +68,12 @@ class ViewReader:
 
     Args:
         capture: Source of the frames.
-        mask_margin: As of ``Views``.
-        gains: As of ``Views``.
-        pinned: Whether into pinned memory, from which CUDA copies without waiting.
+        mask_margin: Half width of the borders of masks; see ``Views``.
+        gains: [T, 3] what images are divided by, per channel; nothing if None.
+        pinned: Whether to read into pinned memory, from which CUDA copies without waiting.
 
     Attributes:
-        cache: Keeps decoded views, if they are to be read again and again.
+        cache: The file of decoded views; None if they are read only once.
     """
 
     def __init__(self, capture: Capture, mask_margin: float, gains: Float[Tensor, "T 3"] | None, pinned: bool) -> None:
@@ -121,8 +132,8 @@ class ViewReader:
 class Slot:
     """One view on the device, at addresses that stay the same as long as its size does.
 
-    On CUDA a view is copied twice: on a stream of its own from the host, while the step before still runs, and then on
-    the device to where the graph of a step reads it, which takes microseconds. So the host is at most one step ahead.
+    On CUDA a view is copied twice: on a stream of its own from the host, while the previous step runs, and then on
+    the device to where the graph of a step reads it, in microseconds. So the host is at most one step ahead.
 
     Args:
         device: The device.

@@ -50,7 +50,7 @@ class ViewCache:
     Attributes:
         folder: The folder.
         nbytes: Maximum size of the file [bytes].
-        fits: Whether the disk has room for it; if not, nothing is stored.
+        fits: Whether the disk has space for it; if not, nothing is stored.
     """
 
     def __init__(self, folder: Path, sizes: Sequence[tuple[int, int]]) -> None:
@@ -66,8 +66,8 @@ class ViewCache:
         """Writes the pixels of a view, unless the disk is full.
 
         Args:
-            index: Of the view.
-            pixels: Of the view.
+            index: Index of the view.
+            pixels: Its pixels, in host memory.
             replace: Whether to overwrite a stored view. If not, it stays: a thread that decoded the view before its
                 depth changed may store it after the change.
 
@@ -98,7 +98,7 @@ class ViewCache:
         """The pixels of a view; None if they are not stored.
 
         Args:
-            index: Of the view.
+            index: Index of the view.
             pinned: Whether to read into pinned memory, from which CUDA copies without waiting.
         """
         width, height = self._sizes[index]

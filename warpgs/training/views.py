@@ -114,9 +114,9 @@ class Views:
         return self._all.map(lambda tensors: tensors[index])
 
     def __iter__(self) -> Iterator[View]:
-        return self.some(range(len(self)))
+        return self.each(range(len(self)))
 
-    def some(self, indices: Sequence[int]) -> Iterator[View]:
+    def each(self, indices: Sequence[int]) -> Iterator[View]:
         """The views of these indices, one after the other."""
         return (self[index] for index in self._announced(indices))
 
@@ -164,8 +164,8 @@ class Views:
         """Sets the aligned depth of a view's dynamic pixels whose depth is unknown.
 
         Args:
-            index: Of the view.
-            alignment: [2] of its inverse depth; it stays the same.
+            index: Index of the view.
+            alignment: [2] scale and offset of its inverse depth; they stay the same.
             depths: [h, w] depth [scene units] of any size, NaN where unknown.
         """
         scale, offset = alignment.cpu()
@@ -184,7 +184,7 @@ class Views:
             self._all.inverse_depth[index] = change(depth.float(), static_mask).half()
         else:
             self._reader.change_depth(index, change)
-            self._read_ahead.forget(index)
+            self._read_ahead.discard(index)
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
