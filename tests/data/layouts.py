@@ -8,7 +8,7 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import av
@@ -105,9 +105,9 @@ def write_text_model(folder: Path) -> None:
     (folder / "points3D.txt").write_text("# comment\n" + "".join(points))
 
 
-def write_binary_model(folder: Path) -> None:
+def write_binary_model(folder: Path, params: Sequence[float] = PARAMS) -> None:
     opencv_id = 4
-    data = struct.pack("<QIiQQ8d", 1, 3, opencv_id, *SIZE, *PARAMS)
+    data = struct.pack("<QIiQQ8d", 1, 3, opencv_id, *SIZE, *params)
     (folder / "cameras.bin").write_bytes(data)
     parts = [struct.pack("<Q", COUNT)]
     for k in range(COUNT):

@@ -319,7 +319,15 @@ def test_without_undistortion_cameras_look_at_the_centre_of_the_image(written, l
     assert torch.equal(frame.image, other.image)
 
 
-@pytest.mark.parametrize("fields", [{"k1": 0.6, "p1": 0.02}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"k1": 0.6, "p1": 0.02},
+        {"k1": -50.0},  # too strong to undistort, as is the last one
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
+        {"camera_model": "OPENCV_FISHEYE", "k1": -3.0},
+    ],
+)
 def test_without_undistortion_frames_of_nerfstudio_are_those_of_the_files(edited, written, fields):
     root = edited("nerfstudio")
     edit_json(root / "transforms.json", **fields)
@@ -332,6 +340,37 @@ def test_without_undistortion_frames_of_nerfstudio_are_those_of_the_files(edited
             assert torch.equal(getattr(frame, part), getattr(expected, part))
         assert frame.camera.K[0, 0] == layouts.FOCAL
         assert frame.camera.K[:2, 2].tolist() == [layouts.SIZE[0] / 2, layouts.SIZE[1] / 2]
+
+
+def test_without_undistortion_points_of_depth_are_those_of_pinhole_cameras(edited, tmp_path):
+    plain = edited("nerfstudio")
+    edit_json(plain / "transforms.json", ply_file_path=None)
+    bent = shutil.copytree(plain, tmp_path / "bent")
+    edit_json(bent / "transforms.json", k1=-50.0)
+    points = load_capture(bent, undistort=False).points
+    assert len(points)
+    assert torch.equal(points, load_capture(plain).points)
+
+
+@pytest.mark.parametrize(
+    ("layout", "path"),
+    [
+        ("colmap", "sparse/0/cameras.bin"),
+        ("blender", "transforms_train.json"),
+        ("blender", "transforms_test.json"),
+        ("llff", "sparse/0/cameras.bin"),
+    ],
+)
+def test_without_undistortion_no_distortion_is_too_strong(edited, layout, path):
+    root = edited(layout)
+    if path.endswith(".json"):
+        edit_json(root / path, k1=-50.0)
+    else:
+        (root / "sparse/0").mkdir(parents=True, exist_ok=True)
+        layouts.write_binary_model(root / "sparse/0", [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0])
+    capture = load_capture(root, layout, undistort=False)
+    assert capture.cameras[capture.val[0]].K[0, 0].item() == pytest.approx(layouts.FOCAL)
+    assert len(capture.frame(capture.val[0]).image)
 
 
 @pytest.mark.parametrize(

@@ -140,18 +140,23 @@ def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
     assert not torch.equal(distorted.static_mask, pinhole.static_mask)
 
 
+@pytest.mark.parametrize("k1", [0.8, -500.0])
 @pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
-def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_their_centre(tmp_path, dataset):
+def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_their_centre(tmp_path, dataset, k1):
     plain, bent = (write_capture(tmp_path / name, dataset) for name in ("plain", "bent"))
     for path in (bent / "camera").iterdir():
-        edit_json(path, radial_distortion=[0.8, 0.1, 0.0], tangential_distortion=[0.02, 0.01])
+        edit_json(path, radial_distortion=[k1, 0.1, 0.0], tangential_distortion=[0.02, 0.01])
     depth = np.linspace(0.1, 0.9, SIZE[0] * SIZE[1]).reshape(SIZE[1], SIZE[0])
     if dataset != "iphone":
         for root in (plain, bent):
             captures.write_array(root / "depth/1x/left_000000.npy", depth)
     capture, expected = load_capture(bent, undistort=False), load_capture(plain)
     assert capture.read_taken is None
-    assert load_capture(bent).read_taken is not None
+    if k1 > 0:
+        assert load_capture(bent).read_taken is not None
+    else:
+        with pytest.raises(ValueError, match="too strong to undistort"):
+            load_capture(bent)
     for name, camera in capture.cameras.items():
         factor, (width, height) = captures.FACTORS[dataset], camera.size
         K = [[50.0 / factor, 0, width / 2], [0, 50.0 / factor, height / 2], [0, 0, 1]]

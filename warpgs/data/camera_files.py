@@ -1,6 +1,7 @@
 """Camera files of the layout of Nerfies: camera/<id>.json."""
 
 import reprlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
     return not (np.abs(matrix @ matrix.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(matrix) < 0)
 
 
-def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tuple[Camera, Lens]:
-    """The pinhole camera of a frame, and the lens of its distorted image.
+def read_camera(
+    path: Path, units: SceneUnits, factor: int, time: float, used: Callable[[Lens], Lens] = lambda lens: lens
+) -> tuple[Camera, Lens]:
+    """The pinhole camera of a frame, and the lens that its image is undistorted for.
 
     In the file, ``orientation`` is the world-to-camera rotation (OpenCV axes) and ``position`` the camera centre in the
     world. Focal length and principal point are in pixels of the full size.
@@ -34,12 +37,13 @@ def read_camera(path: Path, units: SceneUnits, factor: int, time: float) -> tupl
         units: Scene units of the capture.
         factor: Downscaling factor of the image.
         time: Time of the frame in [0, 1].
+        used: The lens that an image is undistorted for, from that of the file.
 
     Raises:
         ValueError: If the file is missing or damaged, or a field is missing or invalid.
     """
     fields = read_json(path, "every frame needs its camera")
-    lens = _lens(path, fields, factor)
+    lens = used(_lens(path, fields, factor))
     rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
     if not is_rotation(rotation):
         raise ValueError(f"{path}: orientation is not a rotation")

@@ -54,8 +54,12 @@ def find_model(root: Path) -> Path | None:
     return next((path for path in found if any((path / f"cameras.{s}").is_file() for s in ("bin", "txt"))), None)
 
 
-def load_model(folder: Path) -> Model:
+def load_model(folder: Path, undistort: bool = True) -> Model:
     """The model of a folder.
+
+    Args:
+        folder: Folder of the model.
+        undistort: Whether its images are to be undistorted; if not, lenses may distort too strongly for that.
 
     Raises:
         ValueError: If a file is missing or damaged, or a camera model cannot be represented.
@@ -66,7 +70,7 @@ def load_model(folder: Path) -> Model:
         if image.has_pose:
             camera = model.cameras[image.camera_id]
             try:
-                lens = lens_of(camera)
+                lens = lens_of(camera, undistort)
             except ValueError as error:
                 raise ValueError(f"{folder}: camera {image.camera_id}: {error}") from error
             images.append(ModelImage(image.name, lens, image.cam_from_world().matrix()))
@@ -76,13 +80,19 @@ def load_model(folder: Path) -> Model:
     return Model(images, points, colors)
 
 
-def lens_of(camera: pycolmap.Camera) -> Lens:
-    """The lens of a camera of a model; raises as ``lens_of_parameters``."""
-    return lens_of_parameters(camera.model.name, (camera.width, camera.height), camera.params.tolist())
+def lens_of(camera: pycolmap.Camera, undistort: bool = True) -> Lens:
+    """The lens of a camera of a model; as ``lens_of_parameters``."""
+    return lens_of_parameters(camera.model.name, (camera.width, camera.height), camera.params.tolist(), undistort)
 
 
-def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
+def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float], undistort: bool = True) -> Lens:
     """The lens of a camera model, the (width, height) of its images, and its parameters.
+
+    Args:
+        model: Name of the camera model.
+        size: Width and height of the images [px].
+        params: Parameters of the camera model.
+        undistort: Whether the images are to be undistorted; if not, the lens may distort too strongly for that.
 
     Raises:
         ValueError: If the camera model cannot be represented, or a number is missing or out of range.
@@ -95,9 +105,9 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
     distortion = [*distortion, *[0.0] * 5]
     if model.endswith("FISHEYE"):
         k1, k2, k3, k4 = distortion[:4]
-        return Lens(*size, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked()
+        return Lens(*size, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked(undistort)
     k1, k2, p1, p2, k3 = distortion[:5]
-    return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked()
+    return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked(undistort)
 
 
 def parameters_of_lens(lens: Lens) -> tuple[str, list[float]]:

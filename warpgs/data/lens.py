@@ -60,12 +60,15 @@ class Lens:
     tangential: tuple[float, float] = (0.0, 0.0)
     fisheye: tuple[float, float, float, float] | None = None
 
-    def checked(self) -> "Lens":
+    def checked(self, undistort: bool = True) -> "Lens":
         """This lens, if it can be used.
+
+        Args:
+            undistort: Whether its images are to be undistorted.
 
         Raises:
             ValueError: If a number is not finite, a focal length is below ``MIN_FOCAL``, the size is out of range, or
-                the distortion is too strong to undistort.
+                the distortion is too strong to undistort and ``undistort`` is true.
         """
         values = (*self.focal, *self.center, *self.radial, *self.tangential, *(self.fisheye or ()))
         if not np.isfinite(values).all() or min(self.focal) < MIN_FOCAL:
@@ -74,7 +77,8 @@ class Lens:
             raise ValueError(f"image size {self.width}×{self.height}, expected 1 to {MAX_SIDE} pixels per side")
         if self.width * self.height > MAX_PIXELS:
             raise ValueError(f"image size {self.width}×{self.height}, expected at most {MAX_PIXELS:,} pixels together")
-        filling_zoom(self)
+        if undistort:
+            filling_zoom(self)
         return self
 
     def resized(self, width: int, height: int) -> "Lens":

@@ -39,9 +39,11 @@ class BlenderLoader:
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
-        transforms = Transforms(root / TRAIN)
+        transforms = Transforms(root / TRAIN, options.undistort)
         train = _frames(transforms, "train")
-        val = [] if evaluated is None else _frames(Transforms(evaluated), evaluated.stem.split("_")[1])
+        val = []
+        if evaluated is not None:
+            val = _frames(Transforms(evaluated, options.undistort), evaluated.stem.split("_")[1])
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
         is_white = any(_is_transparent(transforms.image(entry)) for entry in transforms.frames)

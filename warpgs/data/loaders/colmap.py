@@ -38,7 +38,7 @@ class ColmapLoader:
         folder = find_model(root)
         if folder is None:
             raise ValueError(f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}")
-        model = load_model(folder)
+        model = load_model(folder, options.undistort)
         images = sorted(model.images, key=lambda image: natural_order(image.name))
         names = plain_names([image.name for image in images])
         times = times_of_names(names)

@@ -164,7 +164,7 @@ def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarr
     """Points of a COLMAP model, if there is one; otherwise units that contain what lies between the bounds."""
     model = find_model(root)
     if model is not None:
-        _, points, colors = load_model(model)
+        _, points, colors = load_model(model, undistort=False)
         if len(points):
             return World(points, colors)
     centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])

@@ -8,7 +8,7 @@ covisible/<factor>x/val/<id>.png.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
@@ -81,10 +81,8 @@ class NerfiesLoader(ABC):
         files = _find_files(root, factor, split, incomplete_masks)
         cameras, lenses = {}, {}
         for name, time in times.items():
-            camera, lens = read_camera(root / f"camera/{name}.json", units, factor, time)
-            lenses[name] = options.lens(lens)
-            K = torch.tensor(pinhole_matrix(lenses[name]), dtype=torch.float32)
-            cameras[name] = replace(camera, K=K)
+            path = root / f"camera/{name}.json"
+            cameras[name], lenses[name] = read_camera(path, units, factor, time, options.lens)
         points, colors = read_points(root, units)
 
         def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:

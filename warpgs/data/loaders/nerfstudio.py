@@ -41,7 +41,7 @@ class NerfstudioLoader:
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
-        transforms = Transforms(root / INDEX)
+        transforms = Transforms(root / INDEX, options.undistort)
         entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
         images = [transforms.image(entry) for entry in entries]
         names = plain_names([entry["file_path"] for entry in entries])
@@ -63,7 +63,7 @@ class NerfstudioLoader:
             )
         val = _evaluated(transforms, {image.resolve(): name for image, name in zip(images, names, strict=True)})
         kept = [frame for frame in frames if frame.name not in val.ignored]
-        return posed_capture(root, kept, val.names, _world(root, transforms, kept), options)
+        return posed_capture(root, kept, val.names, _world(transforms, kept, options.undistort), options)
 
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:
@@ -110,8 +110,8 @@ def _evaluated(transforms: Transforms, names: dict[Path, str]) -> _Split:
     return _Split([*held_out], [*({*names.values()} - held_out - chosen["train"])])
 
 
-def _world(root: Path, transforms: Transforms, frames: Sequence[PosedFrame]) -> World:
+def _world(transforms: Transforms, frames: Sequence[PosedFrame], undistort: bool) -> World:
     """Points of ply_file_path; without it, points of the depth."""
     path = transforms.file(transforms.fields, "ply_file_path")
-    points, colors = points_of_depth(frames) if path is None else read_ply_points(path)
+    points, colors = points_of_depth(frames, undistort) if path is None else read_ply_points(path)
     return World(points, colors)

@@ -21,7 +21,7 @@ from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.data.taken import taken_reader
+from warpgs.data.taken import taken_reader, without_distortion
 from warpgs.data.units import SceneUnits, scene_units
 
 from .options import LoadOptions
@@ -192,19 +192,27 @@ def plain_names(paths: Sequence[str]) -> list[str]:
     return ["_".join(parts) for parts in found]
 
 
-def points_of_depth(frames: Sequence[PosedFrame]) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+def points_of_depth(
+    frames: Sequence[PosedFrame], undistorted: bool = True
+) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
     """Points and their colours from frames whose depth has the units of their cameras; none without depth.
+
+    Args:
+        frames: The frames.
+        undistorted: Whether to undistort the frames first; if not, they are taken as those of pinhole cameras.
 
     Raises:
         ValueError: If a file of a frame is missing or damaged.
     """
     known = [frame for frame in frames if frame.inverse_depth is not None]
-    return points_of_views([_depth_view(known[k]) for k in evenly_spaced_indices(len(known), MAX_DEPTH_FRAMES)])
+    chosen = evenly_spaced_indices(len(known), MAX_DEPTH_FRAMES)
+    return points_of_views([_depth_view(known[k], undistorted) for k in chosen])
 
 
-def _depth_view(frame: PosedFrame) -> DepthView:
+def _depth_view(frame: PosedFrame, undistorted: bool) -> DepthView:
     assert frame.inverse_depth is not None
-    lens = reduced(frame.lens, max(1, round(max(frame.lens.width, frame.lens.height) / DEPTH_SIDE)))
+    lens = frame.lens if undistorted else without_distortion(frame.lens)
+    lens = reduced(lens, max(1, round(max(lens.width, lens.height) / DEPTH_SIDE)))
     size = lens.width, lens.height
     static = np.ones(size[::-1], bool) if frame.static_mask is None else frame.static_mask(size)
     parts = (undistort(part, lens) for part in (frame.image(size)[..., :3], frame.inverse_depth(size), static))

@@ -32,6 +32,10 @@ SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 class Transforms:
     """A transforms.json file.
 
+    Args:
+        path: The file.
+        undistort: Whether images are to be undistorted; if not, lenses may distort too strongly for that.
+
     Attributes:
         path: The file.
         fields: Its content.
@@ -41,8 +45,8 @@ class Transforms:
         ValueError: If the file is missing, damaged or without frames, or its camera model is not supported.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.fields = path, read_json(path)
+    def __init__(self, path: Path, undistort: bool) -> None:
+        self.path, self.fields, self._undistort = path, read_json(path), undistort
         frames = self.fields.get("frames")
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
@@ -114,7 +118,7 @@ class Transforms:
         elif k4:
             raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
         try:
-            return lens.checked()
+            return lens.checked(self._undistort)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 
