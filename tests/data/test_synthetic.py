@@ -13,7 +13,7 @@ import torch
 
 from warpgs.data import synthetic
 from warpgs.data.bodies import as_tensors, even_samples
-from warpgs.data.builtin_cache import cache_folder
+from warpgs.data.builtin_cache import cache_folder, content_folder
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 
@@ -34,18 +34,21 @@ def capture(folder):
     return load_capture(folder)
 
 
-def test_without_a_home_the_capture_is_kept_in_a_temporary_folder(tmp_path, monkeypatch, capsys):
+def test_without_a_home_the_cache_is_a_temporary_folder(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    folder = cache_folder()
+    folder = content_folder(None, "content").parent
     assert folder.parent == tmp_path
     assert list(folder.iterdir()) == []
     error = capsys.readouterr().err
-    assert error.startswith("warpgs: no cache for the built-in scene (")
+    assert error.startswith("warpgs: no cache for built-in captures (")
+    assert error.endswith(
+        f"they are kept in {folder} until the program ends; set XDG_CACHE_HOME to a folder that can be written\n"
+    )
     assert error.count("\n") == 1
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert cache_folder() == tmp_path / "cache" / "warpgs"
+    assert cache_folder("built-in captures") == tmp_path / "cache" / "warpgs"
     assert capsys.readouterr().err == ""
 
 

@@ -126,6 +126,16 @@ def test_a_frame_without_a_mask_is_refused_by_name_with_advice(capture, resident
         Views(bare, CPU, resident_bytes)
 
 
+def test_without_a_writable_cache_views_that_do_not_fit_say_so(capture, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    views = views_of(capture, resident_bytes=0)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warpgs: no cache for decoded views (")
+    assert str(views.cache.folder) in line
+    assert "set XDG_CACHE_HOME" in line
+
+
 def test_frames_of_different_sizes_are_read_on_demand(tmp_path):
     """They cannot be stacked."""
     whole = load_capture(write_capture(tmp_path))

@@ -34,12 +34,16 @@ def content_folder(cache_dir: Path | None, content: Any) -> Path:
         content: What the capture is made from; another content has another folder.
     """
     if cache_dir is None:
-        cache_dir = cache_folder()
+        cache_dir = cache_folder("built-in captures")
     return cache_dir / hashlib.blake2b(json.dumps(content).encode(), digest_size=6).hexdigest()
 
 
-def cache_folder() -> Path:
-    """The user's cache of warpgs; without a writable home a folder that is removed at exit, with a warning."""
+def cache_folder(content: str) -> Path:
+    """The user's cache of warpgs; if it cannot be written a folder that is removed at exit, with a warning.
+
+    Args:
+        content: What is to be kept there, for the warning.
+    """
     try:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
         folder.mkdir(parents=True, exist_ok=True)
@@ -50,5 +54,8 @@ def cache_folder() -> Path:
         return folder
     folder = Path(tempfile.mkdtemp(prefix="warpgs-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    sys.stderr.write(f"warpgs: no cache for the built-in scene ({reason}): it is made anew; set XDG_CACHE_HOME\n")
+    sys.stderr.write(
+        f"warpgs: no cache for {content} ({reason}): they are kept in {folder} until the program ends; "
+        "set XDG_CACHE_HOME to a folder that can be written\n"
+    )
     return folder

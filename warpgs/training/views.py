@@ -95,7 +95,7 @@ class Views:
         self.uses_graphs = graph and have_one_size and device.type == "cuda"
         first = self._reader.read(0)
         self.resident = have_one_size and len(self) * first.nbytes() <= resident_bytes
-        self.cache = None if self.resident else ViewCache(cache_folder(), sizes)
+        self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
         self._reader.cache = self.cache
         if self.resident:
             self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
