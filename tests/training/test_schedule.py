@@ -408,6 +408,19 @@ def test_without_a_number_of_iterations_nothing_is_rescaled(preset):
     assert scaled(PRESETS[preset]) == PRESETS[preset]
 
 
+@pytest.mark.parametrize(
+    ("preset", "iterations", "reset_every"),
+    [("paper", 12_000, 500), ("best", 6_500, 235), ("paper", 2_400, 100), ("paper", 60, 100), ("best", 60, 100)],
+)
+def test_opacities_of_a_short_run_have_at_least_100_iterations_between_resets(preset, iterations, reset_every):
+    assert scaled(with_iterations(preset, iterations)).schedule.reset_every == reset_every
+
+
+def test_a_shorter_interval_between_resets_is_not_shortened_further():
+    config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(SHORT, reset_every=20), iterations=5)
+    assert scaled(config).schedule.reset_every == 20
+
+
 def test_rescaling_is_idempotent():
     once = scaled(with_iterations("paper", 1234))
     assert scaled(once) == once

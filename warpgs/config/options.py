@@ -15,6 +15,9 @@ NetName = Literal["vgg", "alex", "squeeze"]
 ALPHA_BOUNDS = Bounds(positive=True, max=0.9998)
 """Range of ``max_alpha``: a Gaussian with an alpha of 0.9999 would end a pixel instead of contributing to it."""
 
+MIN_RESET_INTERVAL = 100
+"""Minimum that ``schedule.reset_every`` is shortened to: with fewer iterations opacities never recover from a reset."""
+
 
 @dataclass(frozen=True)
 class RenderSettings:
@@ -230,7 +233,7 @@ class Schedule:
     densify_until: int = 15_000
     """Iteration until which Gaussians are densified."""
     reset_every: Annotated[int, Bounds(min=1)] = 3_000
-    """Iterations between opacity resets during densification."""
+    """Iterations between opacity resets during densification; rescaling shortens it to 100 at least."""
     prune_every: Annotated[int, Bounds(min=1)] = 5_000
     """Iterations between visibility-driven prunings, in stage I."""
     fit_motion: int = 0
@@ -394,6 +397,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
         for name, value in dataclasses.asdict(schedule).items()
     }
     values["warmup"], values["fit_motion"] = schedule.warmup, schedule.fit_motion  # as many steps in a short run
+    values["reset_every"] = max(values["reset_every"], min(schedule.reset_every, MIN_RESET_INTERVAL))
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)
     values[longest] += config.iterations - sum(values[name] for name in stages)
