@@ -75,6 +75,17 @@ def test_help_is_rewrapped_and_names_what_is_expected(command, capsys):
     assert broken == []
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_whether_a_switch_is_on_by_default(command, capsys):
+    text = shown(capsys, command, "--help-all" if command == "train" else "--help")
+    options = re.split(r"^[│ ] (?=-)", text, flags=re.MULTILINE)
+    switches = [
+        " ".join(option.replace("│", "").split()) for option in options if re.match(r"--(\S+), --\S*no-", option)
+    ]
+    assert len(switches) == sum(re.match(r"--(.*\.)?no-", flag) is not None for flag in flags(COMMANDS[command].load()))
+    assert [switch for switch in switches if not re.search(r"\(default: (yes|no)\)", switch)] == []
+
+
 @pytest.mark.parametrize(
     ("command", "metavars"),
     [("prepare", "SOURCE CAPTURE"), ("check", "CAPTURE"), ("eval", "RUN"), ("export", "RUN"), ("render", "RUN")],

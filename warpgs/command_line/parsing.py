@@ -205,7 +205,8 @@ def _repeated(plain: Any) -> str:
 
 def _default_hint(default: str) -> str:
     """What follows the help of an option; many defaults are described by the help itself."""
-    return "" if default in ("None", "False", "") else f"(default: {default})"
+    shown = {"None": "", "True": "yes", "False": "no"}.get(default, default)
+    return f"(default: {shown})" if shown else ""
 
 
 def _settings(hint: Any) -> Any:
