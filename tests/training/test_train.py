@@ -303,6 +303,19 @@ def test_a_preset_for_a_gpu_says_so_on_the_cpu(config, preset, is_slow, monkeypa
     assert any(f"the preset {preset} is for a GPU" in line for line in lines) == is_slow
 
 
+@pytest.mark.parametrize("has_half_size", [True, False])
+def test_on_the_cpu_half_the_size_is_suggested_only_if_the_capture_has_it(config, has_half_size, monkeypatch):
+    monkeypatch.setattr(script, "_train", lambda *arguments, **options: None)
+    monkeypatch.setattr(script, "_evaluate", lambda *arguments: None)
+    for folder in ("rgb", "resized_mask") if has_half_size else ():
+        shutil.copytree(config.data / folder / "1x", config.data / folder / "2x")
+    lines = []
+    warpgs.train(dataclasses.replace(config, preset="paper"), log=lines.append)
+    (line,) = [line for line in lines if "the preset paper is for a GPU" in line]
+    assert "--preset patient" in line
+    assert ("--factor 2" in line) == has_half_size
+
+
 def test_training_says_that_depth_is_switched_off(config):
     lines = []
     warpgs.train(dataclasses.replace(config, depth=False), log=lines.append)

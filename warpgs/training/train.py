@@ -31,10 +31,6 @@ from .trainer import Trainer
 Log = Callable[[str], None]
 """Receives lines for the user, such as ``print``."""
 
-CPU_ADVICE = (
-    "the preset {} is for a GPU; on two CPU cores, --preset patient --factor 2 takes 10 to 20 minutes, and quick 3"
-)
-
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
 
 NO_DEPTH = "training without depth, and without the pretraining that needs it"
@@ -211,7 +207,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     _compare_ranks(config, capture)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
     if config.device == "cpu" and config.preset in ("best", "paper"):
-        log(CPU_ADVICE.format(config.preset))
+        log(f"the preset {config.preset} is for a GPU; {_cpu_advice(config)}")
     config, trial = with_trusted_masks(config, capture, log, quiet)
     config = fitted(config, capture, log)
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
@@ -220,6 +216,15 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
+
+
+def _cpu_advice(config: TrainConfig) -> str:
+    """What to train with on the CPU; --factor 2 only if the capture has, or can be read at, half the size."""
+    try:
+        open_capture(dataclasses.replace(config, factor=2), quiet=True)
+    except ValueError:
+        return "on a CPU, use --preset patient, or quick, which is faster"
+    return "on two CPU cores, --preset patient --factor 2 takes 10 to 20 minutes, and quick 3"
 
 
 def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trainer:
