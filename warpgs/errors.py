@@ -4,6 +4,7 @@ import contextlib
 import functools
 import io
 import os
+import re
 import signal
 import sys
 import threading
@@ -26,6 +27,14 @@ CLOSED = 141
 
 ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a GPU has too little"
 """What to do without enough memory, where a command has no advice of its own."""
+
+OUT_OF_MEMORY = re.compile(
+    r"CUDA error: out of memory"  # torch, outside of its allocator: CUDA graphs and pinned memory
+    r"|can't allocate memory|not enough memory: you tried to allocate"  # torch on the CPU; the second on Windows
+    r"|Failed to allocate \d+ bytes on device '[^']*'$"  # Warp; it says more if a capture forbids the allocation
+    r"|\(-4:Insufficient memory\)"  # OpenCV
+)
+"""Messages of errors that mean lack of memory, but whose types do not say so."""
 
 
 def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str = ADVICE) -> int:
@@ -152,9 +161,10 @@ def visible(text: str) -> str:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error means lack of memory; on the CPU, only the messages of torch, Warp and OpenCV say so."""
+    """Whether an error means lack of memory."""
     # torch.OutOfMemoryError by name, because torch takes a second to import.
-    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or "allocate" in str(error)
+    has_type = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    return has_type or OUT_OF_MEMORY.search(str(error)) is not None
 
 
 def out_of_memory(error: BaseException) -> str:
