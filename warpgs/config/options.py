@@ -11,12 +11,8 @@ from .bounds import Bounds, check_bounds
 NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
-
 ALPHA_BOUNDS = Bounds(positive=True, max=0.9998)
 """Range of ``max_alpha``: a Gaussian with an alpha of 0.9999 would end a pixel instead of contributing to it."""
-
-MIN_RESET_INTERVAL = 100
-"""Minimum that ``schedule.reset_every`` is shortened to: with fewer iterations opacities never recover from a reset."""
 
 
 @dataclass(frozen=True)
@@ -397,7 +393,7 @@ def scaled(config: TrainConfig) -> TrainConfig:
         for name, value in dataclasses.asdict(schedule).items()
     }
     values["warmup"], values["fit_motion"] = schedule.warmup, schedule.fit_motion  # as many steps in a short run
-    values["reset_every"] = max(values["reset_every"], min(schedule.reset_every, MIN_RESET_INTERVAL))
+    values["reset_every"] = max(values["reset_every"], min(schedule.reset_every, 100))  # so that opacities recover
     stages = ("pretrain", "stage1", "stage2")
     longest = max(stages, key=values.__getitem__)
     values[longest] += config.iterations - sum(values[name] for name in stages)
