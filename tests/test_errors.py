@@ -1,6 +1,7 @@
 """Errors of commands end with one line and an exit code."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 
 from warpgs.data.check import Finding
-from warpgs.errors import ADVICE, CLOSED, is_out_of_memory, one_line, run_command
+from warpgs.errors import ADVICE, CLOSED, is_out_of_memory, one_line, run_command, terminable
 
 
 def failing(error):
@@ -55,6 +56,19 @@ def test_what_a_terminal_would_obey_is_escaped(capsys, text, shown):
 def test_ctrl_c_is_one_line_and_exit_code_130(capsys):
     assert run_command(failing(KeyboardInterrupt()), prog="train.py") == 130
     assert capsys.readouterr().err == "train.py: stopped\n"
+
+
+def test_a_second_sigterm_does_not_interrupt_the_end_that_the_first_one_began():
+    before = signal.getsignal(signal.SIGTERM)
+    ended = False
+    with terminable():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            signal.raise_signal(signal.SIGTERM)
+            ended = True
+    assert ended
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 @pytest.mark.parametrize(

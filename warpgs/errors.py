@@ -110,9 +110,13 @@ def ending_at_once(prog: str = "warpgs") -> Iterator[None]:
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Lets SIGTERM end a command as Ctrl-C does, so that its processes end and the message says how to go on."""
+    """Lets SIGTERM end a command as Ctrl-C does, so that its processes end and the message says how to go on.
+
+    Further ones are ignored, so that they do not interrupt this end: ``timeout`` sends two at once.
+    """
 
     def stop(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, stop)
