@@ -64,6 +64,17 @@ def test_ctrl_c_stops_the_pool():
     assert pool.stopped
 
 
+def test_ctrl_c_while_jobs_are_queued_stops_the_pool():
+    class Queueing(Script):
+        def submit(self, job):
+            raise KeyboardInterrupt
+
+    pool = Queueing({})
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(pool, [Job("a", "", "", "", (), "cpu")], lambda event: None, lambda: None)
+    assert pool.stopped
+
+
 def test_a_cluster_that_is_gone_is_not_asked_to_stop():
     pool = Script({"a": [ClusterGoneError("gone")]})
     with pytest.raises(ClusterGoneError):

@@ -90,9 +90,9 @@ def run_jobs(pool: Pool, jobs: Iterable[Job], on_event: Callable[[Event], None],
     waiting = {job.name: job for job in jobs}
     failures: Counter[str] = Counter()
     losses: Counter[str] = Counter()
-    for job in waiting.values():
-        pool.submit(job)
     try:
+        for job in waiting.values():
+            pool.submit(job)
         while waiting:
             for result in pool.wait(POLL_SECONDS):
                 event = _judge(result, failures, losses)
