@@ -55,7 +55,7 @@ def sweep(tmp_path, monkeypatch, finished_run):
             pass
 
         def close(self):
-            pass
+            run.at_close = sorted(path.name for path in (tmp_path / "out").glob("*.*"))
 
     train, trained = finish, []
     monkeypatch.setattr(module, "RayPool", Pretended)
@@ -96,6 +96,14 @@ def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
     assert r"20.50 $\pm$ 0.71" in (tmp_path / "out/table.tex").read_text()
     assert (tmp_path / "out/cells.csv").read_text().count("finished") == 4
     assert "20.50 ± 0.71" in (tmp_path / "out/report.html").read_text()
+
+
+def test_a_sweep_that_stops_writes_its_tables_before_ray_ends_which_takes_seconds(sweep):
+    def stop(job):
+        raise KeyboardInterrupt
+
+    sweep(by=stop)
+    assert {"table.md", "table.tex", "table.csv", "cells.csv", "report.html"} < set(sweep.at_close)
 
 
 def test_the_same_command_trains_nothing_again_and_more_seeds_train_those(sweep):

@@ -137,17 +137,18 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
             code = FAILED
         except KeyboardInterrupt:
             stopped = True
-    if code or stopped:
-        board.stop()
-    log(tables_text(spec, board, peers))  # before they are written: the disk may be full
-    try:
-        write_tables(board.out, spec, board, peers)
-        write_report(board.out, spec, board, peers)
-        log(f"table.md, table.tex, table.csv, cells.csv and report.html are in {board.out}")
-    except OSError as error:
-        if not stopped:
-            raise
-        log(f"warpgs sweep: {one_line(error)}")
+        if code or stopped:
+            board.stop()
+        # Before Ray ends, which takes seconds: whoever sent SIGTERM may soon send SIGKILL.
+        log(tables_text(spec, board, peers))  # before they are written: the disk may be full
+        try:
+            write_tables(board.out, spec, board, peers)
+            write_report(board.out, spec, board, peers)
+            log(f"table.md, table.tex, table.csv, cells.csv and report.html are in {board.out}")
+        except OSError as error:
+            if not stopped:
+                raise
+            log(f"warpgs sweep: {one_line(error)}")
     if stopped:
         raise KeyboardInterrupt("stopped; the same command continues")
     return code or (INCOMPLETE if "failed" in board.states.values() else 0)
