@@ -54,6 +54,7 @@ def test_what_a_system_does_not_have_is_not_done(monkeypatch):
     monkeypatch.delattr(posix.select, "poll")
     posix.lower_priority(10)
     posix.unblock_interrupts()
+    posix.block_termination()
     posix.share_free_memory()
     posix.release_free_memory()
     assert posix.end_with_parent(os.getppid())

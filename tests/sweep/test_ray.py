@@ -129,8 +129,8 @@ def test_ray_prints_nothing_about_workers_that_died():
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
-TERMINATED = """
-import os, signal, sys, time
+SWEEP = """
+import sys, time
 from pathlib import Path
 from warpgs.errors import run_command, terminable
 from warpgs.sweep import ray_pool
@@ -143,28 +143,111 @@ def train(job):
         for _ in range(600):
             time.sleep(0.1)  # in steps, so that Ray can interrupt
     except KeyboardInterrupt:
+        time.sleep(1)
         Path(job.folder, "saved").touch()
         raise
 
 def sweep():
     with terminable():
         pool = ray_pool.RayPool(None, "cpu", 1, 1)
-        run_jobs(pool, [Job("cell", sys.argv[1], "", "", (), "cpu")], print, terminate)
-
-def terminate():
-    if Path(sys.argv[1], "started").exists():
-        os.kill(os.getpid(), signal.SIGTERM)
+        try:
+            run_jobs(pool, [Job("cell", sys.argv[1], "", "", (), "cpu")], print, lambda: None)
+        finally:
+            pool.close()
 
 ray_pool.run_job = train
 sys.exit(run_command(sweep))
 """
 
 
-def test_sigterm_stops_a_sweep_as_ctrl_c_does(tmp_path):
-    command = [sys.executable, "-c", TERMINATED, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "warpgs: stopped\n")
+@pytest.fixture
+def start(tmp_path):
+    """Starts a sweep of one cell, after a command such as ``timeout``, in a session of its own."""
+    started = []
+
+    def start(*command):
+        words = [*command, sys.executable, "-c", SWEEP, str(tmp_path)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        started.append(subprocess.Popen(words, text=True, start_new_session=True, **pipes))
+        return started[-1]
+
+    yield start
+    for process in started:
+        for pid in session(process):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.communicate()
+
+
+def session(process):
+    """The processes of a session, by name."""
+    lines = subprocess.run(["ps", "-o", "pid=,comm=", "-s", str(process.pid)], capture_output=True, text=True).stdout
+    return {int(pid): name for pid, name in (line.split(maxsplit=1) for line in lines.splitlines())}
+
+
+def wait_until(condition):
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def leaves_nothing(process, *but):
+    wait_until(lambda: not [name for name in session(process).values() if "defunct" not in name and name not in but])
+    return True
+
+
+def to_all(process):
+    for pid in session(process):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGTERM)
+
+
+SIGNALS = {
+    "SIGTERM to the sweep": lambda process: process.terminate(),
+    "SIGTERM to its process group, as timeout sends it": lambda process: os.killpg(process.pid, signal.SIGTERM),
+    "SIGTERM to each process, as Slurm and systemd send it": to_all,
+    "Ctrl-C in the terminal": lambda process: os.killpg(process.pid, signal.SIGINT),
+}
+
+
+@pytest.mark.parametrize("send", SIGNALS.values(), ids=SIGNALS.keys())
+def test_a_signal_stops_a_sweep_which_saves_its_cells(start, tmp_path, send):
+    process = start()
+    wait_until((tmp_path / "started").exists)
+    send(process)
+    assert process.communicate(timeout=60) == ("", "warpgs: stopped\n")
+    assert process.returncode == 130
     assert (tmp_path / "saved").exists()
+    assert leaves_nothing(process)
+
+
+def test_timeout_which_sends_sigterm_twice_stops_a_sweep_which_saves_its_cells(start, tmp_path):
+    process = start("timeout", "--preserve-status", "15")
+    assert process.communicate(timeout=60) == ("", "warpgs: stopped\n")
+    assert process.returncode == 130
+    assert (tmp_path / "saved").exists()
+    assert leaves_nothing(process)
+
+
+@pytest.mark.parametrize("send", list(SIGNALS.values())[-2:], ids=list(SIGNALS)[-2:])
+@pytest.mark.parametrize("started", ["gcs_server", "raylet"])
+def test_a_signal_while_ray_starts_is_one_line_and_leaves_nothing(start, started, send):
+    process = start()
+    wait_until(lambda: started in session(process).values())
+    send(process)
+    assert process.communicate(timeout=60) == ("", "warpgs: stopped\n")
+    assert process.returncode == 130
+    assert leaves_nothing(process)
+
+
+def test_a_sweep_that_is_killed_leaves_nothing(start, tmp_path):
+    process = start()
+    wait_until((tmp_path / "started").exists)
+    process.kill()
+    process.communicate()
+    agents = ("ray::DashboardA", "ray::RuntimeEnv")  # end a minute later, when they have not reached the rest of Ray
+    assert leaves_nothing(process, *agents)
 
 
 def test_a_training_that_fits_on_no_node_is_refused(pool):

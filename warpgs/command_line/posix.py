@@ -65,6 +65,12 @@ def unblock_interrupts() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
+def block_termination() -> None:
+    """Keeps SIGTERM from this thread, and from the processes that it starts, which inherit that; not on Windows."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+
+
 def allow_interrupts() -> None:
     """Lets SIGINT arrive if it is ignored, as in everything that a shell started in the background."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

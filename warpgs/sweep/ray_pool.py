@@ -2,14 +2,15 @@
 
 import logging
 import os
-import signal
 import socket
 import sys
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
+from warpgs.command_line.posix import block_termination
 from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
 
@@ -33,6 +34,8 @@ def _import_ray(address: str | None) -> Any:
     # Ray prints what happens to its workers, also to those of no training, and even without log_to_driver; the sweep
     # reports trainings itself. Lines that match are never printed.
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
+    # Ray's own handler of SIGTERM prints a stack trace and ends the program, whatever handler Python has.
+    os.environ.setdefault("RAY_DISABLE_FAILURE_SIGNAL_HANDLER", "1")
     if address is None and "ray" not in sys.modules:
         # Anyone who can connect to Ray can run code, so a local instance listens on 127.0.0.1 only. That is Ray's
         # default on macOS and Windows; this variable, meant for these two, selects it on Linux as well.
@@ -57,11 +60,26 @@ class RayPool:
         ImportError: If Ray is not installed.
         ConnectionError: If there is no cluster at the address.
         ValueError: If no node has what a training needs.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM; a Ray that was started here has ended.
     """
 
     def __init__(self, address: str | None, device: str | None, per_gpu: int, cpus: int | None) -> None:
-        self._ray = _import_ray(address)
-        self._connect(address)
+        self._ray: Any = None
+        self._jobs: dict[Any, str] = {}
+        # Signals interrupt the main thread only, so Ray starts in another one: completely, or not at all. What it
+        # starts on this machine inherits that SIGTERM is blocked, which timeout, Slurm and systemd send to all
+        # processes: Ray and the cells run until the sweep stops them. Ray's processes end with that thread.
+        self._thread = ThreadPoolExecutor(1, initializer=block_termination)
+        try:
+            self._thread.submit(self._connect, address).result()
+            self._plan(device, per_gpu, cpus)
+        except BaseException:
+            self.close()
+            raise
+        self._heard = self._probed = time.monotonic()
+
+    def _plan(self, device: str | None, per_gpu: int, cpus: int | None) -> None:
+        """Decides what each training gets of a node."""
         total = self._ray.cluster_resources()
         self.device = device or ("cuda" if total.get("GPU", 0) else "cpu")
         gpus = 1.0 / per_gpu if self.device == "cuda" else 0.0
@@ -70,20 +88,18 @@ class RayPool:
         # Attempts are counted by the sweep, and a worker's memory must not outlive its training.
         remote = self._ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=0, max_calls=1)
         self._run = remote(run_job)
-        self._jobs: dict[Any, str] = {}
-        self._head = self._ray.get_runtime_context().gcs_address
-        self._heard = self._probed = time.monotonic()
 
     def _connect(self, address: str | None) -> None:
+        ray = _import_ray(address)
         if address is not None:
             _require_head(address)  # Ray would print and try for minutes, and then end the program
         logging.getLogger("ray").setLevel(logging.ERROR)
         options = {} if address else _local_options()
-        on_sigterm = signal.getsignal(signal.SIGTERM)
+        self._ray = ray  # from here on, there is something to close
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Ray's announcements of its future versions
-                self._ray.init(
+                ray.init(
                     address or "local",
                     log_to_driver=False,
                     logging_level=logging.ERROR,
@@ -92,8 +108,7 @@ class RayPool:
                 )
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise ConnectionError(f"Ray cannot be reached at {address or 'this machine'}: {one_line(error)}") from error
-        finally:
-            signal.signal(signal.SIGTERM, on_sigterm)  # Ray's handler would end the program
+        self._head = ray.get_runtime_context().gcs_address
 
     def _nodes(self) -> list[dict[str, float]]:
         return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
@@ -153,8 +168,13 @@ class RayPool:
         self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=GRACE_SECONDS + 10.0)
 
     def close(self) -> None:
-        """Disconnects; a Ray that was started here ends."""
-        self._ray.shutdown()
+        """Disconnects; a Ray that was started here ends, also one that is still starting."""
+        with self._thread:
+            self._thread.submit(self._disconnect).result()
+
+    def _disconnect(self) -> None:
+        if self._ray is not None:
+            self._ray.shutdown()
 
 
 def _local_options() -> dict[str, Any]:
