@@ -10,6 +10,8 @@ from warpgs.sweep.board import Board
 from warpgs.sweep.cells import plan_cells
 from warpgs.sweep.scheduler import Event
 from warpgs.sweep.spec import read_spec
+from warpgs.training import logger
+from warpgs.training.logger import Status, TrainingLogger
 
 
 @pytest.fixture
@@ -45,6 +47,36 @@ def test_running_and_failed_cells_come_first_with_their_host_and_reason(board, t
         "as-full-seed0 queued",
         "as-full-seed1 queued",
         "as-full-seed3 queued",
+    ]
+
+
+def test_running_cells_show_iterations_and_time_left_of_this_attempt(board, tmp_path, monkeypatch, capsys):
+    def log(cell, *lines):
+        (tmp_path / f"logs/{cell}.log").write_text("\n".join([*lines, ""]))
+        (tmp_path / f"running/{cell}").write_text("node7")
+
+    with monkeypatch.context() as patch, TrainingLogger(None, 12_000, 0) as training:
+        for iteration, now in ((4250, 1000.0), (4300, 1020.0)):
+            patch.setattr(logger.time, "monotonic", lambda now=now: now)
+            training.report(Status(iteration, "stage1", 0.75, 21.5, {}, 12_345, 67))
+    first, second = capsys.readouterr().out.splitlines()
+    (tmp_path / "running").mkdir()
+    (tmp_path / "logs").mkdir()
+    monkeypatch.setattr(board, "_live", type("Shown", (), {"update": lambda *_: None})())
+    log("as-full-seed0", "node7: warpgs train --seed 0", first, second)
+    log("as-full-seed1", "node7: warpgs train --seed 1", first)
+    log(
+        "as-full-seed2", "node7: warpgs train --seed 2", second, "node8: warpgs train --resume as-full-seed2", "reading"
+    )
+    (tmp_path / "running/as-full-seed3").write_text("node7")  # and no log yet
+    board.poll()
+    rows = [line for line in text(board.table()) if line.startswith("as-full")]
+    assert rows == [
+        "as-full-seed0 running 4,300 / 12,000 0:51:20 node7",
+        "as-full-seed1 running 4,250 / 12,000 node7",
+        "as-full-seed2 running node7",
+        "as-full-seed3 running node7",
+        "as-full-seed4 queued",
     ]
 
 

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,9 +15,11 @@ from rich.live import Live
 from rich.table import Column, Table
 from rich.text import Text
 
+from warpgs.training.logger import LINE
+
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
 from .scheduler import Event
-from .worker import Job
+from .worker import STARTED, Job, last_lines
 
 CELLS = "cells.csv"
 """File in the folder of a sweep with the state of each cell, and why those failed that did."""
@@ -81,7 +84,7 @@ class Board:
             Job(
                 name=cell.name,
                 folder=str(cell.folder),
-                log=str(self.out / "logs" / f"{cell.name}.log"),
+                log=str(self._log_of(cell)),
                 running=str(self._running / cell.name),
                 arguments=tuple(arguments(cell.config)),
                 device=device,
@@ -98,6 +101,21 @@ class Board:
     @property
     def _running(self) -> Path:
         return self.out / "running"
+
+    def _log_of(self, cell: Cell) -> Path:
+        return self.out / "logs" / f"{cell.name}.log"
+
+    def _progress(self, cell: Cell) -> tuple[str, str]:
+        """Iterations and remaining time of a cell that runs, as its log says; empty before it trains."""
+        with suppress(OSError):  # there is no log yet
+            for line in reversed(last_lines(self._log_of(cell))):
+                if match := LINE.fullmatch(line):
+                    done, total, seconds = match.groups()
+                    left = "" if seconds is None else str(timedelta(seconds=int(seconds)))
+                    return f"{int(done):,} / {int(total):,}", left
+                if f": {STARTED}" in line:  # the lines above are those of an earlier attempt
+                    break
+        return "", ""
 
     def tell(self, event: Event) -> None:
         """Takes note of how an attempt ended, and says so."""
@@ -142,12 +160,13 @@ class Board:
         }
         counts = Counter(states.values())
         title = ", ".join(f"{counts[state]} {state}" for state in ORDER if counts[state])
-        heads = ("cell", "state", "PSNR [dB]", "")
+        heads = ("cell", "state", "iterations", "time left", "PSNR [dB]", "")
         table = Table(*(Column(Text(head)) for head in heads), title=title, title_justify="left")
         for cell in sorted(self.cells, key=lambda cell: ORDER.index(states[cell.name]))[:MAX_LINES]:
             psnr = self.metrics.get(cell.name, {}).get("psnr")
             note = self.errors.get(cell.name) or self._hosts.get(cell.name, "")
-            values = (cell.name, states[cell.name], "" if psnr is None else f"{psnr:.2f}", note)
+            progress = self._progress(cell) if states[cell.name] == "running" else ("", "")
+            values = (cell.name, states[cell.name], *progress, "" if psnr is None else f"{psnr:.2f}", note)
             table.add_row(*map(Text, values))  # without markup: names and errors may have brackets
         return table
 

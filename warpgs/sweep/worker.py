@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-from collections import deque
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,10 @@ MAX_REASON = 300
 """Maximum number of characters of the reason of a failure."""
 
 LAST_BYTES = 1 << 14
-"""Bytes at the end of a log in which the reason is looked for."""
+"""Bytes at the end of a log in which the reason of a failure and the progress are looked for."""
+
+STARTED = "warpgs "
+"""Start of the first line that each attempt at a cell writes into its log, after the name of the host."""
 
 
 class Job(NamedTuple):
@@ -79,7 +81,7 @@ def _train(job: Job) -> str | None:
         arguments = ["train", *job.arguments]
     arguments += ["--device", job.device]
     log_path = Path(job.log)
-    _append(log_path, f"warpgs {' '.join(arguments)}")
+    _append(log_path, f"{STARTED}{' '.join(arguments)}")
     with open(log_path, "ab") as log:
         command = [sys.executable, "-m", "warpgs.sweep.child", str(os.getpid()), *arguments]
         # A session of its own: Ctrl-C in the terminal reaches the sweep, which stops its cells itself.
@@ -91,7 +93,8 @@ def _train(job: Job) -> str | None:
         return None
     if code < 0:
         return f"the training was killed by signal {-code}"
-    reason = _last_line(log_path)
+    lines = last_lines(log_path)
+    reason = lines[-1][:MAX_REASON] if lines else f"it wrote nothing into {log_path}"
     _append(log_path, f"ended with exit code {code}")  # fails if the disk was too full for the reason
     return reason
 
@@ -126,10 +129,9 @@ def _wait(child: subprocess.Popen[bytes]) -> int:
                 child.wait()
 
 
-def _last_line(log: Path) -> str:
-    """The last line of a log, where commands and exceptions say what went wrong."""
+def last_lines(log: Path) -> list[str]:
+    """The last lines of a log that are not empty; in the last one, commands and exceptions say what went wrong."""
     with open(log, "rb") as file:
         file.seek(max(0, log.stat().st_size - LAST_BYTES))
         lines = file.read().decode(errors="replace").splitlines()
-    last = deque((line.strip() for line in lines if line.strip()), maxlen=1)
-    return last[0][:MAX_REASON] if last else f"it wrote nothing into {log}"
+    return [line.strip() for line in lines if line.strip()]

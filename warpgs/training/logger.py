@@ -1,5 +1,6 @@
 """Progress of a training run: a bar or plain lines on the console, and TensorBoard events."""
 
+import re
 import sys
 import time
 from pathlib import Path
@@ -17,6 +18,9 @@ LINE_EVERY = 10.0
 
 WIDE = 120
 """Minimum width of a terminal that shows the bar and all numbers; others show the most important ones in full."""
+
+LINE = re.compile(r"(\d+)/(\d+) .* it/s(?:  (\d+) s left)?")
+"""A line of progress: iterations done, iterations of the whole run, and the remaining time [s] if it is known."""
 
 
 def ignore(text: str) -> None:
