@@ -425,6 +425,20 @@ def test_votes_follow_the_motion():
     assert np.array_equal(vote(list(dynamic), [step, step]), dynamic)
 
 
+def test_a_finger_of_the_colour_of_a_door_is_outlined_with_its_hand():
+    """GrabCut alone takes it for background, which has that colour elsewhere."""
+    image = np.full((192, 256, 3), 200.0)
+    image[:, :80] = image[50:60, 180:230] = 190, 120, 90
+    image[20:100, 100:180] = 40, 40, 60
+    probability = np.full((192, 256), 0.05, np.float32)
+    probability[20:100, 100:180], probability[50:60, 180:230] = 0.97, 0.8
+    image += np.random.default_rng(0).normal(0.0, 4.0, image.shape)
+    found = outline(image.clip(0, 255).astype(np.uint8), probability)
+    assert found[50:60, 185:225].all()
+    assert found[20:100, 100:180].all()
+    assert found.sum() < 1.02 * (80 * 80 + 10 * 50)
+
+
 def test_a_region_too_small_for_every_fourth_pixel_is_outlined():
     image = np.full((96, 128, 3), 90, np.uint8)
     image[40:43, 40:43] = 250

@@ -27,8 +27,13 @@ MIN_REGION = 0.002
 MIN_HOLE = 0.003
 """Size below which a hole in a dynamic region is filled, as a fraction of the image."""
 
-CERTAIN, LIKELY, POSSIBLE = 0.85, 0.5, 0.15
-"""Dynamic probabilities above which GrabCut starts from foreground, probable foreground and probable background."""
+CERTAIN, LIKELY, POSSIBLE = 0.65, 0.5, 0.15
+"""Dynamic probabilities above which GrabCut keeps the foreground, and starts from probable foreground and background.
+It takes away what is only likely if the background has its colour somewhere, such as fingers before a wall, beside a
+wooden door (docs/design/motion-masks.md)."""
+
+BLUR = 2.0
+"""Standard deviation of the blur that removes the steps between superpixels [px]; fingers are 10 px wide."""
 
 MIN_CERTAIN = 0.2
 """Fraction of a region that must seem to move beside the nearer far frames, too."""
@@ -263,7 +268,7 @@ def outline(image: UInt8[np.ndarray, "H W 3"], probability: Float[np.ndarray, "H
 
 def smooth(probability: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
     """[H, W] the probability without the steps between superpixels."""
-    return cv2.GaussianBlur(probability.astype(np.float32), (0, 0), 3.0)
+    return cv2.GaussianBlur(probability.astype(np.float32), (0, 0), BLUR)
 
 
 def clean(dynamic: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
