@@ -63,9 +63,8 @@ def test_an_interrupt_ends_the_process(tmp_path, monkeypatch):
     real = subprocess.Popen
 
     def start(command, **options):
-        started.append(
-            real([sys.executable, "-c", 'print(\'{"label": "a"}\', flush=True); input(); input()'], **options)
-        )
+        code = 'import time; print(\'{"label": "a"}\', flush=True); time.sleep(600)'  # also when its input closes
+        started.append(real([sys.executable, "-c", code], **options))
         return started[0]
 
     def interrupted(*arguments: object) -> None:
