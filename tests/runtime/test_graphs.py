@@ -1,5 +1,7 @@
 """The cache of CUDA graphs; without a GPU, a replay is simulated by repeating the work."""
 
+from unittest.mock import MagicMock
+
 import pytest
 import torch
 
@@ -112,3 +114,30 @@ def test_a_capture_that_fails_is_not_kept(captures, monkeypatch):
     assert not cache.is_captured("key")
     run(cache, "key", work, 1)
     assert cache.is_captured("key")
+
+
+@pytest.fixture
+def capture_end(monkeypatch):
+    """Replaces CUDA; the end of a capture, which fails as that of an invalid one does."""
+    cuda = MagicMock()
+    cuda.mem_get_info.return_value, cuda.memory_reserved.return_value, cuda.memory_allocated.return_value = (1, 1), 0, 0
+    cuda.CUDAGraph.return_value.capture_end.side_effect = RuntimeError("operation failed due to a previous error")
+    monkeypatch.setattr(graphs, "torch", MagicMock(cuda=cuda))
+    monkeypatch.setattr(graphs, "side_stream", lambda _device: None)
+    return cuda.CUDAGraph.return_value.capture_end
+
+
+@pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory"), KeyboardInterrupt("stopped")])
+def test_an_error_inside_a_capture_is_not_hidden_by_that_of_its_end(capture_end, error):
+    def work():
+        raise error
+
+    with pytest.raises(type(error)) as raised:
+        graphs.record(work)
+    assert raised.value is error
+    capture_end.assert_called_once_with()  # or the stream would stay in capture mode
+
+
+def test_an_error_at_the_end_of_a_capture_is_raised(capture_end):
+    with pytest.raises(RuntimeError, match="previous error"):
+        graphs.record(lambda: (torch.ones(1),))

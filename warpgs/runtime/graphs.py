@@ -1,5 +1,6 @@
 """CUDA graphs: work that is recorded once and replayed with a single launch."""
 
+import contextlib
 import threading
 from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
@@ -126,8 +127,11 @@ def record(
             graph.capture_begin(pool, capture_error_mode="thread_local")  # other threads may go on using the GPU
             try:
                 outputs = work()
-            finally:
-                graph.capture_end()
+            except BaseException:
+                with contextlib.suppress(RuntimeError):  # an error of the work often makes its capture invalid
+                    graph.capture_end()
+                raise
+            graph.capture_end()
 
     def replay() -> tuple[Tensor, ...]:
         graph.replay()
