@@ -58,9 +58,11 @@ def test_times_of_numpy_are_single_precision(capture):
     assert time.tolist() == [0.25]
 
 
-def test_views_are_resident_if_they_fit(capture):
-    assert views_of(capture).resident
-    assert not views_of(capture, resident_bytes=0).resident
+def test_views_are_resident_if_their_pixels_fit(capture):
+    stored = views_of(capture)._all
+    nbytes = sum(t.nbytes for t in (stored.image, stored.static_mask, stored.inverse_depth, stored.mask_border))
+    assert views_of(capture, nbytes).resident
+    assert not views_of(capture, nbytes - 1).resident
 
 
 def test_resident_views_equal_those_that_are_read_on_demand(capture):

@@ -13,6 +13,9 @@ from warpgs.data.capture import MASKS_REMEDY, Capture
 
 from .view_cache import Pixels, ViewCache
 
+BYTES_PER_PIXEL = 3 + 1 + 2
+"""Memory of a view per pixel [bytes]: 8-bit RGB, mask, depth in half precision; the border of the mask is one more."""
+
 
 class StoredView(NamedTuple):
     """A view as it is stored, in host memory or on the device; all T views of one size have T as a leading axis.
@@ -36,10 +39,6 @@ class StoredView(NamedTuple):
     inverse_depth: Float16[Tensor, "*T H W"]
     mask_border: Bool[Tensor, "*T H W"] | None
     gain: Float32[Tensor, "*T 3"] | None
-
-    def nbytes(self) -> int:
-        """Memory of all tensors [bytes]."""
-        return sum(tensor.nbytes for tensor in self if tensor is not None)
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "StoredView":
         """Applies a function to every tensor."""

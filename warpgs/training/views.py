@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
-from .stored_views import Slot, StoredView, ViewReader
+from .stored_views import BYTES_PER_PIXEL, Slot, StoredView, ViewReader
 from .view_cache import ViewCache
 
 
@@ -93,13 +94,13 @@ class Views:
         self.num_pixels = sum(width * height for width, height in sizes)
         have_one_size = len(set(sizes)) == 1
         self.uses_graphs = graph and have_one_size and device.type == "cuda"
+        bytes_per_pixel = BYTES_PER_PIXEL + (mask_margin > 0.0)
+        self.resident = have_one_size and self.num_pixels * bytes_per_pixel <= resident_bytes
+        self._reader.cache = self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
         first = self._reader.read(0)
-        self.resident = have_one_size and len(self) * first.nbytes() <= resident_bytes
-        self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
-        self._reader.cache = self.cache
         if self.resident:
             self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
-            for index, stored in enumerate(self._read_ahead.each(range(len(self)))):
+            for index, stored in enumerate(chain([first], self._read_ahead.each(range(1, len(self))))):
                 self._at(index).copy_(stored)
 
     def __len__(self) -> int:
