@@ -88,14 +88,12 @@ def group_of(name: str) -> str:
 
 
 def row(option: Option) -> tuple[str, ...]:
-    """Name, default and meaning of an option; switches that are on are listed by how to turn them off."""
-    text = escape(option.text, quote=False)
-    if option.default is True:
-        start, _, end = option.name.rpartition(".")
-        name = f"{start}.no-{end}" if start else option.name.replace("--", "--no-", 1)
-        return code(name), "on", text
-    metavar = option.metavar.replace(",", "`, `")  # so that lines of many choices break between them
-    return code(f"{option.name} {metavar}".strip()), value_of(option.default), text
+    """Name, default and meaning of an option; switches have two names, as in the help."""
+    name = f"{option.name} {option.metavar}".strip()
+    if isinstance(option.default, bool):
+        name += "," + re.sub(r"(.*\.|--)", r"\g<1>no-", option.name, count=1)
+    # Lines of many choices and of two names break between them.
+    return code(name.replace(",", "`, `")), value_of(option.default), escape(option.text, quote=False)
 
 
 def value_of(value: Any) -> str:
@@ -103,7 +101,7 @@ def value_of(value: Any) -> str:
     if value is None or value is dataclasses.MISSING or value == ():
         return ""
     if isinstance(value, bool):
-        return "on" if value else "off"
+        return "yes" if value else "no"
     return code(f"{value:g}" if isinstance(value, float) else str(value))
 
 
