@@ -1,18 +1,16 @@
-"""All options and their defaults; their bounds and the presets are in modules of their own."""
+"""All options and their defaults; their bounds and the presets are in modules of their own.
 
-from .options import (
-    DensifyConfig,
-    LossConfig,
-    MaskPerturbation,
-    ModelConfig,
-    NetName,
-    OptimConfig,
-    RenderSettings,
-    Schedule,
-    TrainConfig,
-    scaled,
-    validate,
-)
+Imports neither torch nor NumPy, so that ``--help`` is fast.
+"""
+
+from .densify import DensifyConfig
+from .loss import LossConfig
+from .masks import MaskPerturbation
+from .model import ModelConfig
+from .optim import OptimConfig
+from .options import NetName, TrainConfig, scaled, validate
+from .render_settings import RenderSettings
+from .schedule import Schedule
 
 __all__ = [
     "DensifyConfig",

@@ -2,7 +2,12 @@
 
 import dataclasses
 
-from .options import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig
+from .densify import DensifyConfig
+from .loss import LossConfig
+from .model import ModelConfig
+from .optim import OptimConfig
+from .options import TrainConfig
+from .schedule import Schedule
 
 PAPER = TrainConfig(
     preset="paper",

@@ -1,0 +1,36 @@
+"""The options ``--densify.*``."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from .bounds import Bounds
+
+
+@dataclass(frozen=True)
+class DensifyConfig:
+    """When Gaussians are cloned, split and removed (3DGS, section 5)."""
+
+    every: Annotated[int, Bounds(min=1)] = 100
+    """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
+    gradient: float = 2e-4
+    """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
+    depth_gradients: bool = True
+    """Whether that gradient includes the terms of depth, or those of images alone (paper)."""
+    dense_fraction: float = 0.01
+    """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
+    min_opacity: float = 0.005
+    """Opacity below which a Gaussian is removed."""
+    max_size: float = 0.1
+    """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
+    max_gaussians: int = 3_000_000
+    """Maximum number of Gaussians up to which both branches together grow."""
+    min_pixels: int = 0
+    """Minimum number of training pixels per Gaussian: densification stops where there are fewer. 0: no limit."""
+    visibility: float = 3e-4
+    """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
+    reseed: Annotated[float, Bounds(max=1)] = 0.0
+    """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start at
+    the next pruning during densification. 0: never."""
+    weakest: Annotated[float, Bounds(max=0.99)] = 0.0
+    """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
+    views: those that together hold this fraction of all blend weights. 0: none."""

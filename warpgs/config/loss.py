@@ -1,0 +1,46 @@
+"""The options ``--loss.*``."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from .bounds import Bounds
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss terms (paper Eq. 9, 12, 14, 15)."""
+
+    ssim: float = 0.2
+    """λ_ssim, the weight of 1 − SSIM next to L1 in every image term."""
+    static: float = 1.0
+    """Weight of the static image in the static region (Eq. 9)."""
+    dynamic: float = 1.0
+    """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
+    joint: float = 1.0
+    """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
+    dynamic_background: Literal["black", "random"] = "random"
+    """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
+    depth: float = 2.0
+    """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14)."""
+    depth_dynamic: float = 1.0
+    """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
+    depth_end: float = 0.2
+    """Final λ_depth; it decays exponentially."""
+    depth_gate: bool = True
+    """Whether depth is compared only where the rendered opacity exceeds a half; paper Eq. 14 compares it everywhere."""
+    branches_in_stage2: Literal["yes", "no", "given-masks"] = "yes"
+    """Whether stage II keeps the terms of the single branches (Eq. 9, 12, 14) beside the joint image, as Eq. 15 does,
+    or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""
+    depth_tolerance: float = 0.0
+    """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
+    by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
+    depth_margin: float = 0.0
+    """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse
+    points are not penalized, because the images determine the geometry better. 0: every error is (paper)."""
+    depth_smooth: bool = False
+    """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
+    object_depth: bool = False
+    """Whether dynamic objects of unknown depth get one by their size (docs/design/object-depth.md)."""
+    mask_margin: Annotated[float, Bounds(max=1)] = 0.0
+    """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
+    image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

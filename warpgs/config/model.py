@@ -1,0 +1,63 @@
+"""The options ``--model.*``."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from .bounds import Bounds
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Sizes of the two networks and of the initial Gaussians."""
+
+    position_bands: Annotated[int, Bounds(max=64)] = 10
+    """Number of frequencies L in the encoding of positions (paper Eq. 6)."""
+    time_bands: Annotated[int, Bounds(max=64)] = 10
+    """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
+    raw_input: bool = True
+    """Whether the networks get position and time beside their encodings, as in Deformable-3DGS; not in paper Eq. 6."""
+    min_period: float = 0.0
+    """Minimum period of the frequencies in the encoding of time [training frames]; higher frequencies overfit and are
+    dropped. 0: all are kept (paper)."""
+    depth: Annotated[int, Bounds(min=1, max=64)] = 8
+    """Number of hidden layers of each network."""
+    width: Annotated[int, Bounds(min=1, max=4096)] = 256
+    """Number of units per hidden layer."""
+    appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = None
+    """Number of hidden layers of the appearance network; as ``depth`` if None."""
+    appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
+    """Number of units per hidden layer of the appearance network; that of both networks if None."""
+    skip: int = 4
+    """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
+    deformation: str = "mlp"
+    """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
+    paths: Annotated[int, Bounds(min=1, max=4096)] = 1
+    """Number of splines of the deformation model "splines"; training sets it to the number of objects."""
+    path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
+    """Number of control points of each spline of the deformation model "splines"; training sets it by the number of
+    frames."""
+    sh_degree: int = 1
+    """Maximum degree of spherical harmonics."""
+    appearance_degree: int = 0
+    """Maximum degree of spherical harmonics that the appearance network changes."""
+    appearance_opacity: bool = False
+    """Whether the appearance network also changes opacities (paper Eq. 8). Off by default: with one camera at a time
+    it fits shadows by fading Gaussians at wrong depths in and out."""
+    half: bool = True
+    """On CUDA, multiply the networks' matrices in half precision and sum in single; only if 8 divides ``width``."""
+    max_static_points: int = 100_000
+    """Maximum number of initial static Gaussians."""
+    point_colors: Literal["capture", "grey"] = "capture"
+    """Initial colours of Gaussians at the sparse points: those of the points, or without any the mean of the pixels
+    that show them (capture), or mid-grey within 0.0011, as Deformable-3DGS starts captures in the layouts of NeRF-DS
+    and HyperNeRF (grey)."""
+    bound_sizes: bool = True
+    """Whether initial sizes, which are distances to neighbours, are between 1/1000 and 10 times their median, and those
+    of dynamic Gaussians of unknown depth under ``densify.max_size``; 3DGS has no such bounds."""
+    dynamic_points: int = 20_000
+    """Number of initial dynamic Gaussians."""
+    tracks: bool = True
+    """Whether small objects that move far between frames start on tracks (docs/design/tracks.md)."""
+    dynamic_start: Literal["points", "uniform"] = "points"
+    """Where dynamic Gaussians start if their depth is unknown: in front of the sparse points around them, or uniformly
+    in the scene's box, as in the code of the paper's authors; the paper names no start."""

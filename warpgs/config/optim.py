@@ -1,0 +1,37 @@
+"""The options ``--optim.*``."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from .bounds import Bounds
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Learning rates of Adam; those of Deformable-3DGS where the paper names none."""
+
+    means: float = 1.6e-4
+    """Positions, times ``means_scale``; decays exponentially to 1 %."""
+    means_scale: Annotated[float | None, Bounds(positive=True)] = None
+    """Factor of the rate of positions: the extent of the capture if None (3DGS), 5 in Deformable-3DGS, which the paper
+    builds upon: 8e-4 is also the rate that it prints (section Experimental Setup)."""
+    means_anneal: Literal["run", "trained"] = "run"
+    """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
+    trained: static ones until stage II (paper, section Static Component), dynamic ones from stage I."""
+    quats: float = 1e-3
+    """Rotations."""
+    scales: float = 5e-3
+    """Logarithms of the scales."""
+    opacities: float = 0.05
+    """Logits of the opacities."""
+    sh_dc: float = 2.5e-3
+    """Spherical harmonics of degree 0."""
+    sh_rest: float = 1.25e-4
+    """Spherical harmonics of higher degrees."""
+    poses: float = 0.0
+    """Initial rate of the corrections of camera poses [rad, and fractions of the extent]; decays exponentially to 1 %.
+    0: cameras stay as the capture has them (paper)."""
+    networks: Annotated[float, Bounds(positive=True)] = 8e-4
+    """Initial rate of both networks (paper, training protocol)."""
+    networks_end: Annotated[float, Bounds(positive=True)] = 1.6e-6
+    """Final rate of both networks; it decays exponentially while they are trained."""
