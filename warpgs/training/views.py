@@ -97,7 +97,7 @@ class Views:
         bytes_per_pixel = BYTES_PER_PIXEL + (mask_margin > 0.0)
         self.resident = have_one_size and self.num_pixels * bytes_per_pixel <= resident_bytes
         self._reader.cache = self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
-        first = self._reader.read(0)
+        first = self._reader.read(0)  # also where none is resident: captures without masks are refused at once
         if self.resident:
             self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
             for index, stored in enumerate(chain([first], self._read_ahead.each(range(1, len(self))))):
