@@ -20,6 +20,7 @@ from tests.scenes import (
 from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.config import RenderSettings
 from warpgs.ops.depth_error import depth_error
+from warpgs.ops.dropout import dropout
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import reset_budgets
 from warpgs.rendering import render
@@ -55,6 +56,11 @@ def rendered(device, settings, channels=None, seed=3):
 def test_images_and_gradients_equal_those_on_cpu(settings):
     for actual, expected in zip(rendered("cuda", settings), rendered("cpu", settings), strict=True):
         assert relative_error(actual, expected) < 1e-5
+
+
+def test_dropout_omits_the_same_gaussians_as_on_cpu():
+    opacities, seed = torch.rand(1000, generator=generator(0)), torch.tensor([2.0**24 - 1.0])
+    assert torch.equal(dropout(opacities.cuda(), seed.cuda(), 0.3).cpu(), dropout(opacities, seed, 0.3))
 
 
 def test_five_channels_equal_those_on_cpu():

@@ -103,6 +103,7 @@ PAPER = {
         "try_masks": False,
         "antialias": False,
         "densify.weakest": 0.0,
+        "model.dropout": 0.0,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,
     },

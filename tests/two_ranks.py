@@ -131,7 +131,7 @@ def one_step(folder: Path, config: TrainConfig) -> None:
         plan = trainer.protocol.at(0)
         sample = trainer._sample(plan)
         trainer.step(plan, sample)
-        torch.save((sample.view, sample.time_noise, sample.background), folder / f"sample{ranks.rank()}.pt")
+        torch.save(tuple(sample), folder / f"sample{ranks.rank()}.pt")
         trainer.step.statistics.merge()
         counts = trainer.step.statistics.count.clone()
         trainer.iteration = 1

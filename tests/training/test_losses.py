@@ -276,7 +276,7 @@ def terms_of(stage, loss=LOSS, schedule=SCHEDULE):
     with torch.no_grad():
         splats = scene.splats(torch.zeros(1), phase.use_deformation, phase.use_appearance, phase.sh_degree)
         rendering = render(splats, CAMERA, settings=RenderSettings(branches=True, depth=True))
-    step(plan, Sample(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
     return {name: torch.tensor(value) for name, value in step.take_means().terms.items()}, rendering
 
 
@@ -284,7 +284,7 @@ def changed_by(stage, loss=LOSS, at=0, **options):
     """Names of the parameters that an iteration of a stage changes; layers of networks count as the network."""
     scene, plan, step = prepared(stage, loss, at, **options)
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
-    step(plan, Sample(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
     changed = [name for name, p in scene.named_parameters() if not torch.equal(p, before[name])]
     return {name.split(".")[0] if name.startswith(("deformation", "appearance")) else name for name in changed}
 
@@ -363,16 +363,16 @@ def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_to
     assert (transparent & (rendering.static.alpha == 0)).any()
     assert error(terms["depth"], 2.0 * expected_depth(rendering.static, VIEW_MASK, min_alpha=-1.0)) < 1e-5
     scene, plan, step = prepared("pretrain", ungated)
-    step(plan, Sample(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
     assert all(parameter.isfinite().all() for parameter in scene.parameters())
 
 
 def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
     _, plan, step = prepared("stage1")
-    step(plan, Sample(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
     whole = step.take_means().terms
     _, plan, step = prepared("stage1", trust=(0.25, 0.0))
-    step(plan, Sample(0, 0.0, PURPLE))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
     part = step.take_means().terms
     for name in ("depth", "depth_dynamic"):
         assert part[name] == pytest.approx(0.25 * whole[name], rel=1e-6)
@@ -383,7 +383,7 @@ def test_a_margin_frees_small_errors_of_the_static_depth_alone():
     found = {}
     for margin in (0.0, 0.2, 1e3):
         _, plan, step = prepared("stage1", trust=(1.0, margin))
-        step(plan, Sample(0, 0.0, PURPLE))
+        step(plan, Sample(0, 0.0, PURPLE, 0))
         found[margin] = step.take_means().terms
     assert 0.0 < found[0.2]["depth"] < found[0.0]["depth"]
     assert found[1e3]["depth"] == 0.0

@@ -10,7 +10,10 @@ import torch
 from tests import tiny
 from tests.scenes import relative_error
 from tests.tiny import quickly  # noqa: F401  # a fixture
+from warpgs.ops.dropout import MAX_SEED
+from warpgs.training import ranks
 from warpgs.training.optimizer import GROUPS
+from warpgs.training.sampling import Sampler
 from warpgs.training.schedule import Phase
 from warpgs.training.step import Step
 from warpgs.training.step_inputs import StepInputs
@@ -30,6 +33,7 @@ def make_inputs():
 def send(inputs, **changes):
     values = {
         "time_noise": 0.5,
+        "dropout_seed": 2**24 - 1,
         "background": [0.7, 0.8, 0.9],
         "dynamic_background": [0.1, 0.2, 0.3],
         "scales": {"psnr": -10.0, "static": 2.0},
@@ -42,6 +46,7 @@ def test_inputs_reach_the_tensors_of_their_names():
     inputs = make_inputs()
     send(inputs)
     assert inputs.time_noise.tolist() == [0.5]
+    assert inputs.dropout_seed.tolist() == [2**24 - 1]
     assert torch.equal(inputs.backgrounds, torch.tensor([[0.7, 0.8, 0.9], [0.7, 0.8, 0.9], [0.1, 0.2, 0.3]]))
     assert {name: value.item() for name, value in inputs.scale.items()} == {"static": 2.0, "psnr": -10.0}
     assert inputs.scales.tolist() == [2.0, -10.0]
@@ -149,6 +154,30 @@ def test_phases_that_differ_in_one_field_are_different_keys(field):
     )
     other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
     assert len({phase, other}) == 2
+
+
+@pytest.mark.parametrize(("stage", "omits"), [("pretrain", False), ("stage1", True), ("stage2", True)])
+def test_gaussians_are_omitted_at_random_once_both_branches_are_trained(data, tmp_path, stage, omits):
+    trainer = tiny.trainer(data, tmp_path)
+    trainer._add_dynamic_gaussians()
+    plan = trainer.protocol.at(getattr(trainer.protocol, stage).start)
+    sample, state, totals = trainer._sample(plan), copy.deepcopy(trainer.scene.state_dict()), []
+    for seed in (1, 2):
+        trainer.scene.load_state_dict(state)
+        trainer.step.reset_statistics()
+        trainer.step(plan, sample._replace(dropout_seed=seed))
+        totals.append(trainer.step.statistics.total)
+    assert totals[0].any()
+    assert torch.equal(*totals) == (not omits)
+
+
+def test_each_iteration_and_each_rank_omits_other_gaussians(monkeypatch):
+    sampler, seeds = Sampler(0, 6, black=False), []
+    for rank in range(2):
+        monkeypatch.setattr(ranks, "rank", lambda rank=rank: rank)
+        seeds += [sampler(k, 0, 0.0).dropout_seed for k in range(10)]
+    assert len(set(seeds)) == 20
+    assert all(0 <= seed < MAX_SEED for seed in seeds)
 
 
 @pytest.mark.parametrize("depth_gradients", [True, False])

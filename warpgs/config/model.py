@@ -56,6 +56,9 @@ class ModelConfig:
     of dynamic Gaussians of unknown depth under ``densify.max_size``; 3DGS has no such bounds."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
+    dropout: Annotated[float, Bounds(max=0.9)] = 0.0
+    """Fraction of the Gaussians that each iteration of stages I and II omits at random, while the opacities of the
+    others are divided by one minus it, so that none relies on a few others (DropGaussian). 0: none (paper)."""
     tracks: bool = True
     """Whether small objects that move far between frames start on tracks (docs/design/tracks.md)."""
     dynamic_start: Literal["points", "uniform"] = "points"

@@ -6,6 +6,8 @@ from itertools import count
 
 import torch
 
+from warpgs.ops.dropout import MAX_SEED
+
 from . import ranks
 from .step import Sample
 
@@ -17,7 +19,7 @@ def random_numbers(seed: int, purpose: str, iteration: int, rollbacks: int) -> t
 
 
 class Sampler:
-    """Chooses a view, noise on time and a background for every iteration of this rank.
+    """Chooses a view, noise on time, a background and what to omit for every iteration of this rank.
 
     Every epoch visits each view once, in a new order; the ranks take its views in turn.
 
@@ -37,8 +39,9 @@ class Sampler:
         for _ in range(ranks.rank() + 1):  # each rank has numbers of its own, after those of the ranks before it
             noise = noise_deviation / self._num_views * torch.randn(1, generator=generator).item()
             background = torch.rand(3, generator=generator)
+            dropout_seed = int(torch.randint(MAX_SEED, (1,), generator=generator))
         view = next(self.views(iteration, rollbacks))
-        return Sample(view, noise, torch.zeros(3) if self._black else background)
+        return Sample(view, noise, torch.zeros(3) if self._black else background, dropout_seed)
 
     def views(self, iteration: int, rollbacks: int) -> Iterator[int]:
         """The views of this rank from an iteration on, without end."""

@@ -13,6 +13,7 @@ from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data.capture import background_color
 from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
 from warpgs.model.scene import SplitScene
+from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
 
@@ -36,11 +37,13 @@ class Sample(NamedTuple):
         view: Index of the training view.
         time_noise: Added to the time that the deformation network sees.
         background: [3] colour behind the dynamic image, unless the capture's is white.
+        dropout_seed: Chooses the Gaussians that are omitted, an integer below ``ops.dropout.MAX_SEED``.
     """
 
     view: int
     time_noise: float
     background: Float[Tensor, "3"]
+    dropout_seed: int
 
 
 class Means(NamedTuple):
@@ -119,6 +122,7 @@ class Step:
         self._inputs.send(
             time_noise=sample.time_noise,
             background=background,
+            dropout_seed=sample.dropout_seed,
             dynamic_background=background if any(background) else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
@@ -146,6 +150,9 @@ class Step:
         view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
+        if self.config.model.dropout and phase.stage != "pretrain":
+            opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
+            splats = replace(splats, opacities=opacities)
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
