@@ -41,7 +41,13 @@ BEST = TrainConfig(
     antialias=True,
     try_masks=True,
     model=ModelConfig(
-        position_bands=6, time_bands=6, min_period=4.0, appearance_depth=4, appearance_width=128, sh_degree=3
+        position_bands=6,
+        time_bands=6,
+        min_period=4.0,
+        appearance_depth=4,
+        appearance_width=128,
+        sh_degree=3,
+        dropout=0.1,
     ),
     loss=LossConfig(
         dynamic_background="black",
@@ -55,11 +61,11 @@ BEST = TrainConfig(
         branches_in_stage2="given-masks",
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
-    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.02, reseed=0.05),
+    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.01, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
-        stage2=22_500,
+        stage2=37_500,
         realign_at=200,
         densify_from=100,
         densify_until=4_500,
