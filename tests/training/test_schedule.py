@@ -410,7 +410,7 @@ def test_without_a_number_of_iterations_nothing_is_rescaled(preset):
 
 @pytest.mark.parametrize(
     ("preset", "iterations", "reset_every"),
-    [("paper", 12_000, 500), ("best", 6_500, 235), ("paper", 2_400, 100), ("paper", 60, 100), ("best", 60, 100)],
+    [("paper", 12_000, 500), ("best", 6_500, 157), ("paper", 2_400, 100), ("paper", 60, 100), ("best", 60, 100)],
 )
 def test_opacities_of_a_short_run_have_at_least_100_iterations_between_resets(preset, iterations, reset_every):
     assert scaled(with_iterations(preset, iterations)).schedule.reset_every == reset_every
