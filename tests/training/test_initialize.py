@@ -531,19 +531,21 @@ def test_without_a_tolerance_every_view_is_trusted():
 
 def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
-    trust = initialize.DepthAlignment(torch.ones(4, 2), errors).trust(LossConfig(depth_tolerance=0.03)).weight
+    trust = (
+        initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03)).weight
+    )
     assert error(trust, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
 def test_the_margin_is_a_multiple_of_the_error_of_each_view():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.01, 0.4], [0.02, 0.4]])
-    trust = initialize.DepthAlignment(torch.ones(4, 2), errors).trust(LossConfig(depth_margin=3.0))
+    trust = initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_margin=3.0))
     assert error(trust.margin, torch.tensor([0.09, 0.06, 0.03, 0.06])) < 1e-7
     assert torch.equal(trust.weight, torch.ones(4))
 
 
 def test_without_points_nothing_is_refused():
-    found = initialize.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf))
+    found = initialize.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
     trust = found.trust(LossConfig(depth_tolerance=0.03, depth_margin=3.0))
     assert torch.equal(trust.weight, torch.ones(2))
     assert torch.equal(trust.margin, torch.zeros(2))

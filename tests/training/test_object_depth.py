@@ -13,7 +13,7 @@ from warpgs.cameras import Camera
 from warpgs.config import LossConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
-from warpgs.training.object_depth import fill_object_depth, object_depth
+from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth
 from warpgs.training.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
@@ -217,14 +217,16 @@ def no_alignments() -> torch.Tensor:
     return torch.full((NUM, 2), torch.nan)
 
 
-MASKS = [ball(depth) for depth in np.linspace(1.0, 1.5, NUM)]
+DEPTHS = np.linspace(1.0, 1.5, NUM)
+MASKS = [ball(depth) for depth in DEPTHS]
+NO_ERRORS = torch.zeros(NUM)
 
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 def test_views_without_depth_get_that_of_objects(resident_bytes):
     capture, alignments = capture_of(MASKS), no_alignments()
     views = views_of(capture, resident_bytes)
-    assert fill_object_depth(CONFIG, capture, views, alignments) == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS) == NUM
     assert alignments.tolist() == [[1.0, 0.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -235,7 +237,7 @@ def test_views_without_depth_get_that_of_objects(resident_bytes):
 def test_static_depth_stays_and_objects_follow_its_alignment():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
     views, alignments = views_of(capture), torch.tensor([[0.5, -1.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views, alignments) == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS) == NUM
     assert alignments.tolist() == [[0.5, -1.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -247,7 +249,7 @@ def test_static_depth_stays_and_objects_follow_its_alignment():
 
 def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
-    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments()) == 0
+    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments(), NO_ERRORS) == 0
 
 
 @pytest.mark.parametrize(
@@ -262,14 +264,83 @@ def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
 )
 def test_objects_get_no_depth_where_it_is_not_asked_for(config, change):
     capture = change(capture_of(MASKS))
-    assert fill_object_depth(config, capture, views_of(capture), no_alignments()) == 0
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS) == 0
 
 
 def test_known_depth_of_what_moves_is_kept():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.ones(static.shape))
     views = views_of(capture)
-    assert fill_object_depth(CONFIG, capture, views, torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)) == 0
+    assert fill_object_depth(CONFIG, capture, views, torch.tensor([[1.0, 0.0]]).repeat(NUM, 1), NO_ERRORS) == 0
     assert (views[0].inverse_depth == 1.0).all()
+
+
+SHIFTS = 1.0 + 0.1 * np.sin(np.linspace(0.0, 2.0 * math.pi, NUM))
+"""Factors by which a depth network misplaces an object, slowly changing."""
+
+
+def misplaced(masks, shifts=SHIFTS) -> Capture:
+    """A ball before a wall whose depth is known and off by these factors."""
+    capture = capture_of(masks)
+    read = capture.read
+
+    def with_depth(name: str) -> Frame:
+        depth = torch.where(torch.from_numpy(masks[int(name)]), DEPTHS[int(name)] * shifts[int(name)], WALL)
+        return dataclasses.replace(read(name), inverse_depth=1.0 / depth.float())
+
+    capture._cached = with_depth
+    return capture
+
+
+def filled(capture: Capture, error: float) -> tuple[int, np.ndarray, Views]:
+    """The number of views changed, the depth of what moves in each view, and the views."""
+    views, alignments = views_of(capture), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    errors = torch.full((NUM,), error)
+    errors[3] = torch.inf  # a view with too few points
+    count = fill_object_depth(CONFIG, capture, views, alignments, errors)
+    return count, np.array([float((1.0 / v.inverse_depth[~v.static_mask]).mean()) for v in views]), views
+
+
+@pytest.mark.parametrize("error", [0.05, 0.15])
+def test_uncertain_depth_of_an_object_is_averaged_with_that_by_its_size(error):
+    """The factor of depth by size is the mean of the median of depth times size and of the bound, which is the wall."""
+    count, found, views = filled(misplaced(MASKS), error)
+    by_size = math.sqrt(WALL / DEPTHS[-1]) * DEPTHS
+    weight = 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)
+    assert count == NUM
+    assert found == pytest.approx((DEPTHS * SHIFTS) ** weight * by_size ** (1.0 - weight), rel=0.03)
+    assert all(torch.allclose(v.inverse_depth[v.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3) for v in views)
+
+
+def test_views_that_are_not_aligned_keep_their_depth():
+    capture, alignments = misplaced(MASKS), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    alignments[1] = torch.nan
+    views = views_of(capture)
+    assert fill_object_depth(CONFIG, capture, views, alignments, torch.full((NUM,), 0.05)) == NUM - 1
+    assert torch.allclose(views[1].inverse_depth, capture.frame("001").inverse_depth, rtol=1e-3)
+
+
+def test_depth_that_agrees_with_the_points_is_kept():
+    count, found, _ = filled(misplaced(MASKS), 0.016)
+    assert count == 0
+    assert found == pytest.approx(DEPTHS * SHIFTS, rel=2e-3)
+
+
+def test_frames_that_cut_an_object_off_are_corrected_as_their_neighbours():
+    masks = [ball(depth, x=k / NUM * depth * WIDTH / 2 / FOCAL) for k, depth in enumerate(DEPTHS)]
+    is_cut = np.array([mask[:, -1].any() for mask in masks])
+    assert 0 < is_cut.sum() < 10
+    _, found, _ = filled(misplaced(masks), 0.15)
+    corrections = found / (DEPTHS * SHIFTS)
+    last = corrections[~is_cut][-1]
+    assert abs(last - 1.0) > 0.02
+    assert corrections[is_cut] == pytest.approx(np.full(is_cut.sum(), last), rel=0.01)
+
+
+def test_objects_whose_size_is_unknown_keep_their_depth():
+    masks = [ball(depth) if k < 11 else np.zeros((HEIGHT, WIDTH), bool) for k, depth in enumerate(DEPTHS)]
+    count, found, _ = filled(misplaced(masks), 0.15)
+    assert count == 0
+    assert found[:11] == pytest.approx((DEPTHS * SHIFTS)[:11], rel=2e-3)
 
 
 def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
@@ -295,5 +366,5 @@ def test_a_capture_with_depth_pretrains(tmp_path):
 def test_training_says_that_size_gives_depth(tmp_path):
     lines: list[str] = []
     _describe(Trainer(CONFIG, capture_of(MASKS), tmp_path), lines.append)
-    assert f"depth of dynamic objects is taken from their size in {NUM} of {NUM} views" in lines
+    assert f"the size of dynamic objects gives or corrects their depth in {NUM} of {NUM} views" in lines
     assert not any("training without depth" in line for line in lines)

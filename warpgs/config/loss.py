@@ -40,7 +40,8 @@ class LossConfig:
     depth_smooth: bool = False
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
     object_depth: bool = False
-    """Whether dynamic objects of unknown depth get one by their size (docs/design/object-depth.md)."""
+    """Whether dynamic objects of unknown depth get one by their size, and uncertain depth of objects is averaged with
+    that (docs/design/object-depth.md)."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

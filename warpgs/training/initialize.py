@@ -123,10 +123,12 @@ class DepthAlignment(NamedTuple):
     Attributes:
         alignments: [T, 2] scale and offset; NaN where the points do not determine them.
         errors: [T, 2] of aligned depth and of a constant depth; see ``depth_alignment.relative_errors``.
+        plain_errors: [T] of aligned depth without the smooth factor.
     """
 
     alignments: Float[Tensor, "T 2"]
     errors: Float[Tensor, "T 2"]
+    plain_errors: Float[Tensor, " T"]
 
     def trust(self, loss: LossConfig) -> DepthTrust:
         """How much each view's depth is trusted; views with too few points have the median error of the others."""
@@ -154,6 +156,7 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
     smooth = smooth and not capture.metric_depth
     alignments = torch.full((len(views), 2), torch.nan, device=views.device)
     errors = torch.full((len(views), 2), torch.inf, device=views.device)
+    plain = errors[:, 0].clone()
     points = capture.points.to(views.device)
     for batch in _batches(views, len(points)):
         samples = []
@@ -162,12 +165,13 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
         alignments[batch] = depth_alignment.align_to_points(samples, capture.metric_depth)
         for index, part in zip(batch, samples, strict=True):
             errors[index] = depth_alignment.relative_errors(part, alignments[index])
+            plain[index] = errors[index, 0]
             if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
                 factor, error = depth_alignment.smooth_factor(part, alignments[index])
                 if error < errors[index, 0]:
                     views.set_depth_factor(index, alignments[index], factor)
                     errors[index, 0] = error
-    return DepthAlignment(alignments, errors)
+    return DepthAlignment(alignments, errors, plain)
 
 
 @torch.no_grad()

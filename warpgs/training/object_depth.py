@@ -4,12 +4,16 @@ One camera does not determine how far away something is that moves: twice as lar
 looks the same. But the distance of an object that keeps its size is inversely proportional to the size at which it is
 seen, and the factor is bounded, because the object hides the static surfaces around it. Most objects stand on something
 or come close to it at least once, so the largest factor that the bound allows is a good one.
+
+The depth of a network has the right order of magnitude, and misplaces each object as a whole by an amount that changes
+with time. Both depths are averaged then.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable
 from functools import cache, partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,6 +24,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
+from warpgs.data.depth_alignment import metric_depth
 
 from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_objects, scaled_size
@@ -42,27 +47,45 @@ the factor. Both tolerate outliers."""
 MAX_POINTS = 10_000
 """Maximum number of static points that are projected into each frame."""
 
+SIZE_ERROR = 0.05
+"""Relative error of depth by size: 4 to 7 % on two captures (docs/design/object-depth.md)."""
+
+MAX_WEIGHT = 0.9
+"""Weight of a capture's depth from which on it stays as it is."""
+
 Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
 
 
-def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> int:
+def fill_object_depth(
+    config: TrainConfig,
+    capture: Capture,
+    views: Views,
+    alignments: Float[Tensor, "T 2"],
+    errors: Float[Tensor, " T"],
+) -> int:
     """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
 
-    Captures with the depth of what moves keep it, and those without masks get none.
+    Captures without masks get none. Where the depth of what moves is known but uncertain, it is averaged with that by
+    size.
 
     Args:
         config: The config.
         capture: The capture, with masks and static points.
-        views: Its training views; dynamic pixels of unknown depth are changed.
+        views: Its training views; the depth of dynamic pixels is changed.
         alignments: [T, 2] scale and offset of each view's inverse depth; set to 1 and 0 for views that had none.
+        errors: [T] relative error of each view's depth at the sparse points, aligned by a scale and an offset alone;
+            infinite if not aligned.
 
     Returns:
-        The number of views that have such depth now.
+        The number of views whose dynamic pixels have depth by size now.
     """
-    is_wanted = config.loss.object_depth and config.depth and capture.assumption == "masks"
-    if not is_wanted or is_depth_known(views, alignments):
+    if not (config.loss.object_depth and config.depth and capture.assumption == "masks"):
         return 0
+    if is_depth_known(views, alignments):
+        known = errors[errors.isfinite()]
+        error = float(known.median()) if len(known) else 0.0
+        return _average_depths(capture, views, alignments, 1.0 / (1.0 + (error / SIZE_ERROR) ** 2))
     count = 0
     for index, depth in object_depth(capture).items():
         if capture.frame(capture.train[index]).inverse_depth is None:
@@ -71,6 +94,89 @@ def fill_object_depth(config: TrainConfig, capture: Capture, views: Views, align
             views.set_object_depth(index, alignments[index], depth)
             count += 1
     return count
+
+
+def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], weight: float) -> int:
+    """Moves each object to the weighted geometric mean of its depth and that by its size, in all frames that show it.
+
+    Both have errors of their own: a depth network misplaces objects as a whole, by amounts that change with time, and
+    the size may change a little. The factor of depth by size is between the median of depth times size and the bound.
+
+    Args:
+        capture: The capture, with masks and static points.
+        views: Its training views, changed.
+        alignments: [T, 2] scale and offset of each view's inverse depth.
+        weight: Weight of the views' depth; 1 / (1 + (error / SIZE_ERROR)²) if its relative error is known.
+
+    Returns:
+        The number of views that were changed.
+    """
+    if weight > MAX_WEIGHT:
+        return 0
+    mean_depth = _mean_depth(capture, views, alignments)
+
+    def factors(item: MovingObject, points_of: Callable[[int], Points]) -> dict[int, Float[Tensor, " P"]]:
+        known = {index: mean_depth(index, pixels) for index, pixels in item.pixels.items()}
+        times = {index: capture.cameras[capture.train[index]].time for index in known}
+        sizes = _sizes(item, _seen(item, capture), points_of)
+        corrections = _corrections(sizes, known, times, 1.0 - weight)
+        return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
+
+    is_aligned = alignments.isfinite().all(1).tolist()
+    found = {index: factor for index, factor in _by_object(capture, factors).items() if is_aligned[index]}
+    for index, factor in found.items():
+        size = views[index].inverse_depth.shape[::-1]
+        resized = cv2.resize(factor.nan_to_num(1.0).numpy(), size, interpolation=cv2.INTER_NEAREST)
+        views.set_depth_factor(index, alignments[index], torch.from_numpy(resized))
+    return len(found)
+
+
+def _mean_depth(
+    capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]
+) -> Callable[[int, Int[np.ndarray, " P"]], float]:
+    """The function that gives a view's mean depth over pixels of its scaled mask; NaN where unknown."""
+
+    @cache
+    def depth_of(index: int) -> Float[np.ndarray, "h w"]:
+        size = scaled_size(capture.cameras[capture.train[index]])
+        depth = metric_depth(views[index].inverse_depth, alignments[index]).cpu().numpy()
+        return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
+
+    def mean_depth(index: int, pixels: Int[np.ndarray, " P"]) -> float:
+        values = depth_of(index).flat[pixels]
+        values = values[np.isfinite(values)]
+        return float(values.mean()) if len(values) else math.nan
+
+    return mean_depth
+
+
+def _corrections(
+    sizes: list["_Sizes"], known: dict[int, float], times: dict[int, float], weight: float
+) -> dict[int, float]:
+    """Factors of the known depth of an object in each frame that bring it to a weighted mean with depth by size.
+
+    The measure of size is the one by which depth times size varies least. Frames without a size or a depth are
+    corrected as those around them.
+
+    Args:
+        sizes: The object's sizes by each measure.
+        known: Its known depth by index of the frame; NaN where unknown.
+        times: Times of the same frames.
+        weight: Weight of the depth by size.
+    """
+    choices = []
+    for sizes_by, bound in sizes:
+        frames = sorted((index for index in sizes_by if math.isfinite(known[index])), key=times.__getitem__)
+        if len(frames) < MIN_FRAMES:
+            continue
+        products = np.log([known[index] * sizes_by[index] for index in frames])
+        median = float(np.median(products))
+        factor = median if math.isnan(bound) else 0.5 * (median + math.log(bound))
+        choices.append((float(products.std()), [times[index] for index in frames], weight * (factor - products)))
+    if not choices:
+        return {}
+    _, at, logs = min(choices, key=lambda choice: choice[0])
+    return {index: math.exp(np.interp(time, at, logs)) for index, time in times.items()}
 
 
 def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
@@ -82,17 +188,29 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
     Returns:
         By index of the frame, [h, w] depth in its scaled mask [scene units], that of round objects, NaN elsewhere.
     """
+    return _by_object(capture, partial(_depths, capture=capture))
+
+
+def _by_object(
+    capture: Capture, values_of: Callable[..., dict[int, Float[Tensor, " P"]]]
+) -> dict[int, Float[Tensor, "h w"]]:
+    """By index of the frame, [h, w] values of objects' pixels in its scaled mask, NaN elsewhere.
+
+    Args:
+        capture: The capture, with masks and static points.
+        values_of: Given an object and ``points_of``, the values of its pixels by index of the frame.
+    """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     points_of = cache(partial(_static_points, capture))
-    depths: dict[int, Tensor] = {}
+    images: dict[int, Tensor] = {}
     for frames in (order, order[::-1]):  # by time first; backward, what parts later can be told apart before
         for item in find_objects(capture, frames):
-            for index, depth in _depths(item, capture, points_of).items():
+            for index, found in values_of(item, points_of=points_of).items():
                 size = scaled_size(capture.cameras[capture.train[index]])
-                values = depths.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
+                values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
                 pixels = torch.from_numpy(item.pixels[index]).long()
-                values[pixels] = torch.where(values[pixels].isnan(), depth, values[pixels])
-    return depths
+                values[pixels] = torch.where(values[pixels].isnan(), found, values[pixels])
+    return images
 
 
 def _static_points(capture: Capture, index: int) -> Points:
@@ -112,22 +230,50 @@ def _depths(item: MovingObject, capture: Capture, points_of: Callable[[int], Poi
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
     """
-    if item.is_mixture or len(item.whole) < MIN_FRAMES:
-        return {}
-    views = {index: _ObjectView(pixels, capture.cameras[capture.train[index]]) for index, pixels in item.pixels.items()}
-    bounds = np.array([views[index].bound(points_of(index)) for index in item.whole])
-    if not np.isfinite(bounds).any():
-        return {}
+    views = _seen(item, capture)
     choices = []
-    for measure in (_ObjectView.diameter, _ObjectView.area):
-        sizes = {index: measure(view) for index, view in views.items() if index in item.whole or not view.is_cut}
-        factor = float(np.nanquantile(bounds * [sizes[index] for index in item.whole], TIGHTEST))
+    for sizes, factor in _sizes(item, views, points_of):
+        if math.isnan(factor):
+            return {}
         found = {index: factor / size for index, size in sizes.items()}
         path = np.stack([views[index].position(found[index]) for index in item.whole])
         choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
+    if not choices:
+        return {}
     return {
         index: views[index].surface(depth) for index, depth in min(choices, key=lambda choice: choice[0])[1].items()
     }
+
+
+class _Sizes(NamedTuple):
+    """An object's size by one measure.
+
+    Attributes:
+        sizes: By index of the frame, in those that show it whole or beside another one [at depth 1].
+        bound: Largest factor by which depth may be divided by size, by the static points around it; NaN if unknown.
+    """
+
+    sizes: dict[int, float]
+    bound: float
+
+
+def _sizes(item: MovingObject, views: dict[int, "_ObjectView"], points_of: Callable[[int], Points]) -> list[_Sizes]:
+    """An object's size by each measure; none if it cannot be told."""
+    if item.is_mixture or len(item.whole) < MIN_FRAMES:
+        return []
+    bounds = np.array([views[index].bound(points_of(index)) for index in item.whole])
+    found = []
+    for measure in (_ObjectView.diameter, _ObjectView.area):
+        sizes = {index: measure(view) for index, view in views.items() if index in item.whole or not view.is_cut}
+        factors = bounds * [sizes[index] for index in item.whole]
+        known = np.isfinite(factors).any()
+        found.append(_Sizes(sizes, float(np.nanquantile(factors, TIGHTEST)) if known else math.nan))
+    return found
+
+
+def _seen(item: MovingObject, capture: Capture) -> dict[int, "_ObjectView"]:
+    """An object as each frame sees it, by index of the frame."""
+    return {index: _ObjectView(pixels, capture.cameras[capture.train[index]]) for index, pixels in item.pixels.items()}
 
 
 class _ObjectView:

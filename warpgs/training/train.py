@@ -174,7 +174,8 @@ def _describe(trainer: Trainer, log: Log) -> None:
         reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
         log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
-        log(f"depth of dynamic objects is taken from their size in {trainer.num_with_objects} of {num_views} views")
+        changed = f"{trainer.num_with_objects} of {num_views} views"
+        log(f"the size of dynamic objects gives or corrects their depth in {changed}")
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:

@@ -94,7 +94,7 @@ class Trainer:
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss)
         self.alignments = torch.where(self.depth_trust.weight[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
-        self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments)
+        self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments, found.plain_errors)
         fits = initialize.fits_motion(config, self.capture, self.views, self.alignments)
         self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, self.num_aligned > 0, fits)
         self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
