@@ -4,7 +4,7 @@ For each Gaussian, with a random number u in [0, 1) that depends on the seed and
 
     factor = 0 if u < fraction, else 1 / (1 - fraction),
 
-so that the expected value of factor times opacity is the opacity.
+so that the expected value of factor times opacity is the opacity, as long as the product is not clamped to 1.
 """
 
 import warp as wp

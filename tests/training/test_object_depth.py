@@ -13,6 +13,7 @@ from warpgs.cameras import Camera
 from warpgs.config import LossConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
+from warpgs.training import objects
 from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth
 from warpgs.training.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
@@ -309,6 +310,24 @@ def test_uncertain_depth_of_an_object_is_averaged_with_that_by_its_size(error):
     assert count == NUM
     assert found == pytest.approx((DEPTHS * SHIFTS) ** weight * by_size ** (1.0 - weight), rel=0.03)
     assert all(torch.allclose(v.inverse_depth[v.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3) for v in views)
+
+
+def test_metric_depth_of_objects_is_kept():
+    capture = misplaced(MASKS)
+    capture.metric_depth = True
+    count, found, _ = filled(capture, 0.15)
+    assert count == 0
+    assert found == pytest.approx(DEPTHS * SHIFTS, rel=2e-3)
+
+
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_static_pixels_keep_their_depth_where_objects_are_found_in_smaller_masks(monkeypatch, resident_bytes):
+    monkeypatch.setattr(objects, "MAX_SIDE", 40)
+    capture = misplaced(MASKS)
+    views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    assert fill_object_depth(CONFIG, capture, views, alignments, torch.full((NUM,), 0.15)) == NUM
+    for view in views:
+        assert torch.allclose(view.inverse_depth[view.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3)
 
 
 def test_views_that_are_not_aligned_keep_their_depth():

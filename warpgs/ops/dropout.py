@@ -15,6 +15,8 @@ MAX_SEED = 2**24
 def dropout(opacities: Float[Tensor, " N"], seed: Float[Tensor, "1"], fraction: float) -> Float[Tensor, " N"]:
     """Opacities of which a random fraction is 0 and the others are divided by 1 − fraction, at most 1; differentiable.
 
+    Opacities above 1 − fraction have no gradient while they are not omitted, because they are clamped to 1.
+
     Args:
         opacities: [N] in [0, 1].
         seed: [1] an integer below ``MAX_SEED``, on the device. The same seed omits the same indices on every device.

@@ -34,7 +34,7 @@ class LossInputs(NamedTuple):
     Attributes:
         config: Settings of the loss.
         view: The training view, with the ground truth.
-        splats: The activated Gaussians at the view's time, static ones first.
+        splats: The activated Gaussians at the view's time, static ones first; a few have an opacity of 0 with dropout.
         rendering: Joint, static and dynamic image; with depth where ``Phase.with_depth``.
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.

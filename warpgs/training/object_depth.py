@@ -66,8 +66,8 @@ def fill_object_depth(
 ) -> int:
     """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
 
-    Captures without masks get none. Where the depth of what moves is known but uncertain, it is averaged with that by
-    size.
+    Captures without masks get none. Where the depth of what moves is known but neither metric nor certain, it is
+    averaged with that by size.
 
     Args:
         config: The config.
@@ -78,11 +78,13 @@ def fill_object_depth(
             infinite if not aligned.
 
     Returns:
-        The number of views whose dynamic pixels have depth by size now.
+        The number of views that were changed.
     """
     if not (config.loss.object_depth and config.depth and capture.assumption == "masks"):
         return 0
     if is_depth_known(views, alignments):
+        if capture.metric_depth:
+            return 0
         known = errors[errors.isfinite()]
         error = float(known.median()) if len(known) else 0.0
         return _average_depths(capture, views, alignments, 1.0 / (1.0 + (error / SIZE_ERROR) ** 2))
@@ -125,9 +127,9 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     is_aligned = alignments.isfinite().all(1).tolist()
     found = {index: factor for index, factor in _by_object(capture, factors).items() if is_aligned[index]}
     for index, factor in found.items():
-        size = views[index].inverse_depth.shape[::-1]
-        resized = cv2.resize(factor.nan_to_num(1.0).numpy(), size, interpolation=cv2.INTER_NEAREST)
-        views.set_depth_factor(index, alignments[index], torch.from_numpy(resized))
+        static = views[index].static_mask.cpu()
+        resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        views.set_depth_factor(index, alignments[index], torch.where(static, 1.0, torch.from_numpy(resized)))
     return len(found)
 
 

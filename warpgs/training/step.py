@@ -51,7 +51,7 @@ class Means(NamedTuple):
 
     Attributes:
         terms: Each loss term, weighted; 0 where it was not active.
-        psnr: PSNR of the joint image [dB].
+        psnr: PSNR of the joint image [dB], without the Gaussians that ``model.dropout`` omits.
     """
 
     terms: dict[str, float]

@@ -61,7 +61,7 @@ class Trainer:
         iteration: Iterations done.
         gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
-        num_with_objects: Number of views in which the size of dynamic objects gives their depth.
+        num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
         depth_trust: [T] how much each view's depth is trusted.
         seconds: Training time of earlier sessions of this run [s].
