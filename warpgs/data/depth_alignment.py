@@ -138,6 +138,12 @@ def relative_errors(samples: PointSamples, alignment: Float[Tensor, "2"]) -> Flo
     return torch.where(errors.isfinite().all(), errors, torch.inf)
 
 
+def typical_error(errors: Float[Tensor, " T"]) -> Float[Tensor, ""]:
+    """The median of the finite ones of views' relative errors; 0 if none is finite."""
+    known = errors[errors.isfinite()]
+    return known.median() if len(known) else errors.new_tensor(0.0)
+
+
 def smooth_factor(samples: PointSamples, alignment: Float[Tensor, "2"]) -> tuple[Float[Tensor, "H W"], float]:
     """Factor of aligned inverse depth that brings it to the sparse points, and the error that is left.
 

@@ -30,6 +30,6 @@ def dropout(opacities: Float[Tensor, " N"], seed: Float[Tensor, "1"], fraction: 
     check_same_device({"opacities": opacities, "seed": seed})
     if not 0.0 <= fraction < 1.0:
         raise ValueError(f"fraction must be in [0, 1), got {fraction}")
-    factors = torch.empty_like(opacities, requires_grad=False)
+    factors = torch.empty_like(opacities)
     launch(kernels.dropout_factors, len(opacities), seed, fraction, factors, work=LITTLE_WORK)
     return (opacities * factors).clamp_max(1.0)

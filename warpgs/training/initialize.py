@@ -133,9 +133,7 @@ class DepthAlignment(NamedTuple):
     def trust(self, loss: LossConfig) -> DepthTrust:
         """How much each view's depth is trusted; views with too few points have the median error of the others."""
         errors = self.errors[:, 0]
-        known = errors.isfinite()
-        typical = errors[known].median() if bool(known.any()) else errors.new_tensor(0.0)
-        errors = torch.where(known, errors, typical)
+        errors = torch.where(errors.isfinite(), errors, depth_alignment.typical_error(errors))
         weight = torch.ones_like(errors)
         if loss.depth_tolerance:
             refused = depth_alignment.is_unusable(self.errors)

@@ -24,12 +24,12 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
-from warpgs.data.depth_alignment import metric_depth
+from warpgs.data.depth_alignment import metric_depth, typical_error
 
 from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_objects, scaled_size
 from .point_cloud import front_of_ball
-from .views import Views
+from .views import View, Views
 
 MIN_FRAMES = 12
 """Minimum number of frames that show an object whole."""
@@ -85,8 +85,7 @@ def fill_object_depth(
     if is_depth_known(views, alignments):
         if capture.metric_depth:
             return 0
-        known = errors[errors.isfinite()]
-        error = float(known.median()) if len(known) else 0.0
+        error = float(typical_error(errors))
         return _average_depths(capture, views, alignments, 1.0 / (1.0 + (error / SIZE_ERROR) ** 2))
     count = 0
     for index, depth in object_depth(capture).items():
@@ -115,13 +114,18 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     """
     if weight > MAX_WEIGHT:
         return 0
-    mean_depth = _mean_depth(capture, views, alignments)
+    cameras = [capture.cameras[name] for name in capture.train]
+    depths = [
+        _scaled_depth(view, alignment, camera)
+        for view, alignment, camera in zip(views, alignments, cameras, strict=True)
+    ]
 
-    def factors(item: MovingObject, points_of: Callable[[int], Points]) -> dict[int, Float[Tensor, " P"]]:
-        known = {index: mean_depth(index, pixels) for index, pixels in item.pixels.items()}
-        times = {index: capture.cameras[capture.train[index]].time for index in known}
-        sizes = _sizes(item, _seen(item, capture), points_of)
-        corrections = _corrections(sizes, known, times, 1.0 - weight)
+    def factors(
+        item: MovingObject, seen: dict[int, _ObjectView], points_of: Callable[[int], Points]
+    ) -> dict[int, Float[Tensor, " P"]]:
+        known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
+        times = {index: cameras[index].time for index in known}
+        corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
         return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
 
     is_aligned = alignments.isfinite().all(1).tolist()
@@ -133,23 +137,16 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     return len(found)
 
 
-def _mean_depth(
-    capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]
-) -> Callable[[int, Int[np.ndarray, " P"]], float]:
-    """The function that gives a view's mean depth over pixels of its scaled mask; NaN where unknown."""
+def _scaled_depth(view: View, alignment: Float[Tensor, "2"], camera: Camera) -> Float[np.ndarray, "h w"]:
+    """A view's aligned depth at the pixels of its scaled mask."""
+    depth = metric_depth(view.inverse_depth, alignment).cpu().numpy()
+    return cv2.resize(depth, scaled_size(camera), interpolation=cv2.INTER_NEAREST)
 
-    @cache
-    def depth_of(index: int) -> Float[np.ndarray, "h w"]:
-        size = scaled_size(capture.cameras[capture.train[index]])
-        depth = metric_depth(views[index].inverse_depth, alignments[index]).cpu().numpy()
-        return cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)
 
-    def mean_depth(index: int, pixels: Int[np.ndarray, " P"]) -> float:
-        values = depth_of(index).flat[pixels]
-        values = values[np.isfinite(values)]
-        return float(values.mean()) if len(values) else math.nan
-
-    return mean_depth
+def _mean_known(depths: Float[np.ndarray, " P"]) -> float:
+    """The mean of the depths that are known; NaN if none is."""
+    known = depths[np.isfinite(depths)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _corrections(
@@ -190,7 +187,7 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
     Returns:
         By index of the frame, [h, w] depth in its scaled mask [scene units], that of round objects, NaN elsewhere.
     """
-    return _by_object(capture, partial(_depths, capture=capture))
+    return _by_object(capture, _depths)
 
 
 def _by_object(
@@ -198,16 +195,22 @@ def _by_object(
 ) -> dict[int, Float[Tensor, "h w"]]:
     """By index of the frame, [h, w] values of objects' pixels in its scaled mask, NaN elsewhere.
 
+    Objects that cannot be told apart, or that too few frames show whole, have no values.
+
     Args:
         capture: The capture, with masks and static points.
-        values_of: Given an object and ``points_of``, the values of its pixels by index of the frame.
+        values_of: Given an object, how each frame sees it, and the static points that a frame shows: the values of its
+            pixels by index of the frame.
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     points_of = cache(partial(_static_points, capture))
     images: dict[int, Tensor] = {}
     for frames in (order, order[::-1]):  # by time first; backward, what parts later can be told apart before
         for item in find_objects(capture, frames):
-            for index, found in values_of(item, points_of=points_of).items():
+            if item.is_mixture or len(item.whole) < MIN_FRAMES:
+                continue
+            seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
+            for index, found in values_of(item, seen, points_of).items():
                 size = scaled_size(capture.cameras[capture.train[index]])
                 values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
                 pixels = torch.from_numpy(item.pixels[index]).long()
@@ -226,25 +229,23 @@ def _static_points(capture: Capture, index: int) -> Points:
     return row.int(), column.int(), depth[shown]
 
 
-def _depths(item: MovingObject, capture: Capture, points_of: Callable[[int], Points]) -> dict[int, Float[Tensor, " P"]]:
+def _depths(
+    item: MovingObject, seen: dict[int, "_ObjectView"], points_of: Callable[[int], Points]
+) -> dict[int, Float[Tensor, " P"]]:
     """Depth of an object's pixels in each frame that shows it whole or beside another one; none if it cannot be told.
 
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
     """
-    views = _seen(item, capture)
     choices = []
-    for sizes, factor in _sizes(item, views, points_of):
+    for sizes, factor in _sizes(item, seen, points_of):
         if math.isnan(factor):
             return {}
         found = {index: factor / size for index, size in sizes.items()}
-        path = np.stack([views[index].position(found[index]) for index in item.whole])
+        path = np.stack([seen[index].position(found[index]) for index in item.whole])
         choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
-    if not choices:
-        return {}
-    return {
-        index: views[index].surface(depth) for index, depth in min(choices, key=lambda choice: choice[0])[1].items()
-    }
+    _, depths = min(choices, key=lambda choice: choice[0])
+    return {index: seen[index].surface(depth) for index, depth in depths.items()}
 
 
 class _Sizes(NamedTuple):
@@ -259,23 +260,16 @@ class _Sizes(NamedTuple):
     bound: float
 
 
-def _sizes(item: MovingObject, views: dict[int, "_ObjectView"], points_of: Callable[[int], Points]) -> list[_Sizes]:
-    """An object's size by each measure; none if it cannot be told."""
-    if item.is_mixture or len(item.whole) < MIN_FRAMES:
-        return []
-    bounds = np.array([views[index].bound(points_of(index)) for index in item.whole])
+def _sizes(item: MovingObject, seen: dict[int, "_ObjectView"], points_of: Callable[[int], Points]) -> list[_Sizes]:
+    """An object's size by each measure."""
+    bounds = np.array([seen[index].bound(points_of(index)) for index in item.whole])
+    known = np.isfinite(bounds).any()
     found = []
     for measure in (_ObjectView.diameter, _ObjectView.area):
-        sizes = {index: measure(view) for index, view in views.items() if index in item.whole or not view.is_cut}
+        sizes = {index: measure(view) for index, view in seen.items() if index in item.whole or not view.is_cut}
         factors = bounds * [sizes[index] for index in item.whole]
-        known = np.isfinite(factors).any()
         found.append(_Sizes(sizes, float(np.nanquantile(factors, TIGHTEST)) if known else math.nan))
     return found
-
-
-def _seen(item: MovingObject, capture: Capture) -> dict[int, "_ObjectView"]:
-    """An object as each frame sees it, by index of the frame."""
-    return {index: _ObjectView(pixels, capture.cameras[capture.train[index]]) for index, pixels in item.pixels.items()}
 
 
 class _ObjectView:

@@ -121,8 +121,8 @@ class Step:
         background = background_color(self.views.background)
         self._inputs.send(
             time_noise=sample.time_noise,
-            background=background,
             dropout_seed=sample.dropout_seed,
+            background=background,
             dynamic_background=background if any(background) else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
