@@ -90,7 +90,7 @@ PAPER = {
         "schedule.densify_until": 14_900,
         "schedule.reset_every": 3_000,
     },
-    "3DGS: rasterization": {"max_alpha": 0.99},
+    "3DGS: rasterization": {"max_alpha": 0.99, "background": "capture"},
     "3DGS: initial Gaussians": {"model.bound_sizes": False},
     "Deformable-3DGS: initial Gaussians, in the layouts of NeRF-DS and HyperNeRF": {"model.point_colors": "grey"},
     "Deformable-3DGS: cameras and frames as they are": {"undistort": False},
@@ -104,6 +104,8 @@ PAPER = {
         "antialias": False,
         "densify.weakest": 0.0,
         "model.dropout": 0.0,
+        "schedule.settle_from": None,
+        "loss.squared": 0.0,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,
     },
@@ -121,7 +123,7 @@ PAPER = {
 """Every option of the method, by the section of the paper, or of the code that it builds upon, that sets it."""
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
-RUN |= {"lpips_net", "as_taken", "background"}
+RUN |= {"lpips_net", "as_taken"}
 RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 

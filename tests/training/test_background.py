@@ -1,4 +1,4 @@
-"""The white behind a capture is composited in training, and whatever opens the run has the run's background."""
+"""Training composites over a background, and whatever opens the run has it: white, the mean colour of frames, any."""
 
 import dataclasses
 import json
@@ -21,7 +21,9 @@ from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
-from warpgs.training.fitting import fitted
+from warpgs.training import fitting
+from warpgs.training.command import parse
+from warpgs.training.fitting import fitted, mean_color
 from warpgs.training.train import make_trainer, train
 from warpgs.training.trainer import Trainer
 from warpgs.training.views import Views
@@ -172,5 +174,80 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
 def test_a_trainer_refuses_a_background_that_was_not_looked_up(run, tmp_path):
     capture = load_capture(Run.open(run, "cpu").config.data)
     assert capture.background == "white"
-    with pytest.raises(ValueError, match='background is "capture" over white: call fitted'):
+    with pytest.raises(ValueError, match='background is "capture": call fitted'):
         Trainer(TrainConfig(device="cpu"), capture, tmp_path)
+    with pytest.raises(ValueError, match='background is "mean": call fitted'):
+        Trainer(TrainConfig(device="cpu", background="mean"), capture, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def mean_run(tmp_path_factory, quickly):  # noqa: F811
+    """A finished run on a small capture without a background of its own, over the mean colour of its frames."""
+    folder = tmp_path_factory.mktemp("mean")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+        data = tiny.write(folder)
+        loss = dataclasses.replace(tiny.CONFIG.loss, dynamic_background="black")
+        config = dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run", background="mean", loss=loss)
+        train(dataclasses.replace(config, checkpoint_every=30))
+    return folder / "run"
+
+
+def mean_of(capture):
+    """Mean colour of all training frames."""
+    return torch.stack([capture.frame(name).image.double() / 255.0 for name in capture.train]).mean((0, 1, 2))
+
+
+def test_the_mean_background_is_the_mean_colour_of_the_training_frames(mean_run):
+    scene = open_run(mean_run, "cpu")
+    capture = scene.open_capture()
+    mean = mean_of(capture)
+    assert mean.min() > 0.05
+    assert mean.max() < 0.95
+    assert scene.config.background == pytest.approx(mean.tolist(), abs=6e-4)
+    assert capture.background == scene.config.background
+    assert scene.background.tolist() == pytest.approx(mean.tolist(), abs=6e-4)
+    camera = dataclasses.replace(capture.cameras[capture.val[0]], viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])))
+    empty = scene.render(camera).joint  # looks away from the scene
+    assert (empty.alpha == 0).any()
+    assert torch.allclose(empty.image[empty.alpha == 0], scene.background)
+
+
+def test_the_dynamic_image_is_trained_over_black_where_the_others_are_over_the_mean(mean_run, tmp_path):
+    trainer = resumed(shutil.copytree(mean_run, tmp_path / "run"))
+    joint, static, dynamic = backgrounds(trainer)
+    assert joint.tolist() == static.tolist() == pytest.approx(list(trainer.config.background))
+    assert torch.equal(dynamic, torch.zeros(3))
+
+
+def test_a_run_over_the_mean_resumes_as_it_would_have_gone_on(mean_run, tmp_path):
+    copy = shutil.copytree(mean_run, tmp_path / "run")
+    assert tiny.train(resumed(copy))
+    assert tiny.differences(tiny.state(copy), tiny.state(mean_run)) == []
+
+
+def test_a_capture_over_white_stays_so_where_others_get_the_mean(run):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    assert fitted(TrainConfig(background="mean"), capture, print).background == "white"
+    assert fitted(TrainConfig(background="mean"), capture.over("black"), print).background == mean_color(capture)
+
+
+def test_the_mean_of_many_frames_is_that_of_some_of_them(run, monkeypatch):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    everything = mean_color(capture)
+    monkeypatch.setattr(fitting, "MAX_AVERAGED", 2)
+    assert mean_color(capture) != everything
+    assert mean_color(capture) == pytest.approx(everything, abs=0.1)
+
+
+@pytest.mark.parametrize("color", [[0.1, 0.2], [0.1, 0.2, 1.5], [0.1, 0.2, "0.3"], [0.1, 0.2, float("nan")], "grey"])
+def test_a_background_that_is_no_colour_is_refused(mean_run, tmp_path, color):
+    damaged = edited(shutil.copytree(mean_run, tmp_path / "run"), lambda values: values.update(background=color))
+    with pytest.raises(ValueError, match=r"config\.json: background"):
+        open_run(damaged, "cpu")
+
+
+def test_a_background_may_be_given_in_rgb(run):
+    capture = load_capture(Run.open(run, "cpu").config.data)
+    config = parse(["--data", "x", "--background", "0.1", "0.2", "0.3"])
+    assert fitted(config, capture, print).background == (0.1, 0.2, 0.3)

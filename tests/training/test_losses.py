@@ -29,7 +29,7 @@ WEIGHTS = [0.0, 0.2, 1.0]
 @pytest.fixture(autouse=True)
 def terms_of_the_paper(monkeypatch):
     """A term that is added to the dictionary has tests of its own."""
-    for name in TERMS.keys() - {"static", "dynamic", "joint", "depth", "depth_dynamic"}:
+    for name in TERMS.keys() - {"static", "dynamic", "joint", "squared", "depth", "depth_dynamic"}:
         monkeypatch.delitem(TERMS, name)
 
 
@@ -395,6 +395,20 @@ def test_the_joint_term_compares_the_joint_image_with_the_whole_ground_truth():
     assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
 
 
+def test_the_squared_term_is_the_weighted_squared_error_of_the_joint_image():
+    terms, rendering = terms_of("stage2", dataclasses.replace(LOSS, squared=7.0))
+    expected = 7.0 * (rendering.joint.image.double() - view_truth()).square().mean()
+    assert error(terms["squared"], expected) < 1e-6
+    assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
+
+
+@pytest.mark.parametrize(("stage", "counts"), [("pretrain", False), ("stage1", True), ("stage2", True)])
+def test_the_squared_error_counts_wherever_the_joint_image_is_compared(stage, counts):
+    loss, schedule = dataclasses.replace(LOSS, squared=7.0), dataclasses.replace(SCHEDULE, joint_from=0)
+    terms, _ = terms_of(stage, loss, schedule)
+    assert bool(terms["squared"]) == bool(terms["joint"]) == counts
+
+
 @pytest.mark.parametrize(
     ("stage", "used"),
     [
@@ -465,7 +479,7 @@ def test_a_term_is_inactive_in_other_phases(monkeypatch):
 
 def test_terms_are_reported_in_the_order_of_the_dictionary():
     terms, _ = terms_of("stage2")
-    assert list(terms) == ["static", "dynamic", "joint", "depth", "depth_dynamic"]
+    assert list(terms) == ["static", "dynamic", "joint", "squared", "depth", "depth_dynamic"]
 
 
 # Parameters that are trained -----------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import torch
 from tests.scenes import error, generator, relative_error
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.model.fields import make_deformation
+from warpgs.model.trunk import Trunk
 from warpgs.training import motion_fit
 from warpgs.training.dynamic_points import DynamicPoints, to_canonical
 from warpgs.training.motion_fit import MAX_ERROR, fit_motion
@@ -296,3 +297,15 @@ def test_where_positions_are_searched_and_how_far_from_the_canonical_point(monke
     monkeypatch.setattr(motion_fit, "to_canonical", search)
     canonical = points.canonical(Turned(), found)
     assert error(canonical.colors, colors[kept]) == 0.0
+
+
+def test_the_fit_is_in_single_precision_and_leaves_the_deformation_in_its_own(monkeypatch):
+    seen, forward = [], Trunk.forward
+    monkeypatch.setattr(
+        Trunk, "forward", lambda self, *inputs: (seen.append(self.uses_half), forward(self, *inputs))[1]
+    )
+    deformation = new_deformation(half=True)
+    assert deformation.trunk.uses_half
+    assert fit(FOUND, deformation, num_steps=3) is not None
+    assert set(seen) == {False}
+    assert deformation.trunk.uses_half

@@ -72,9 +72,11 @@ def trained(num_steps=3, rate=0.01, **sizes):
 WARM = dict.fromkeys(NETWORKS, 1.0)
 
 
-def rates_at(progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM, means_progress=None):
+def rates_at(
+    progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM, means_progress=None, settle=0.0
+):
     means_progress = dict.fromkeys(BRANCHES, progress) if means_progress is None else means_progress
-    return learning_rates(config, extent, progress, means_progress, network_progress, warmup_factors)
+    return learning_rates(config, extent, progress, settle, means_progress, network_progress, warmup_factors)
 
 
 # The optimizer -------------------------------------------------------------------------------------------------------
@@ -284,6 +286,15 @@ def test_the_rate_of_positions_decays_by_branch():
     rates = rates_at(0.3, START, means_progress={"static": 1.0, "dynamic": 0.5})
     assert rates["static.means"] == pytest.approx(0.1 * 0.01)
     assert rates["dynamic.means"] == pytest.approx(0.1 * 0.1)
+
+
+def test_gaussians_settle_at_a_tenth_of_their_rates():
+    before, halfway, end = (rates_at(0.9, START, settle=settle) for settle in (0.0, 0.5, 1.0))
+    settling = {f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS if name != "means"}
+    assert before == rates_at(0.9, START)
+    for rates, factor in ((halfway, math.sqrt(0.1)), (end, 0.1)):
+        expected = {name: rate * (factor if name in settling else 1.0) for name, rate in before.items()}
+        assert rates == pytest.approx(expected)
 
 
 def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_extent():

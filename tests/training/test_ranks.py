@@ -88,7 +88,12 @@ def test_a_step_averages_gradients_and_adds_statistics_over_the_ranks(data, tmp_
 
 def test_a_step_is_as_much_larger_as_gsplat_and_grendel_scale_it(monkeypatch, data, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
-    rates = {"extent": 1.0, "progress": 0.5, "means_progress": dict.fromkeys(optimizer.BRANCHES, 0.5)}
+    rates = {
+        "extent": 1.0,
+        "progress": 0.5,
+        "settle_progress": 0.0,
+        "means_progress": dict.fromkeys(optimizer.BRANCHES, 0.5),
+    }
     rates |= {name: dict.fromkeys(optimizer.NETWORKS, 0.5) for name in ("network_progress", "warmup_factors")}
     alone = optimizer.learning_rates(tiny.CONFIG.optim, **rates)
     monkeypatch.setattr(ranks, "num_ranks", lambda: 4)

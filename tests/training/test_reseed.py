@@ -17,7 +17,7 @@ from warpgs.training.logger import TrainingLogger
 from warpgs.training.reseed import gaussians_that_show, lost_fraction, lost_pixels
 from warpgs.training.schedule import Phase
 
-PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True)
+PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False)
 
 
 @pytest.fixture(scope="module")

@@ -107,6 +107,30 @@ def test_equal_phases_are_equal_keys():
     assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
 
 
+# Dropout and settling -----------------------------------------------------------------------------------------------
+
+DROPPING = dataclasses.replace(CONFIG.model, dropout=0.1)
+
+
+def test_gaussians_are_omitted_from_stage_1_on_until_they_settle():
+    assert iterations_in_phases_where("use_dropout", model=DROPPING) == list(range(STAGE1, END))
+    settling = {"settle_from": 150}
+    expected = list(range(STAGE1, STAGE1 + 150))
+    assert iterations_in_phases_where("use_dropout", schedule=settling, model=DROPPING) == expected
+    assert iterations_in_phases_where("use_dropout", schedule=settling) == []
+
+
+def test_gaussians_settle_from_an_iteration_to_the_end_of_the_run():
+    progress = [plan.settle_progress for plan in plans(schedule={"settle_from": 150})]
+    start, steps = STAGE1 + 150, END - STAGE1 - 150
+    assert progress == pytest.approx([0.0] * start + [k / steps for k in range(steps)])
+
+
+@pytest.mark.parametrize("settle_from", [None, 180, 10_000])
+def test_gaussians_never_settle_if_not_asked_to(settle_from):
+    assert {plan.settle_progress for plan in plans(schedule={"settle_from": settle_from})} == {0.0}
+
+
 # Networks and losses -------------------------------------------------------------------------------------------------
 
 

@@ -151,6 +151,7 @@ def test_phases_that_differ_in_one_field_are_different_keys(field):
         sh_degree=1,
         with_depth=True,
         with_joint=True,
+        use_dropout=True,
     )
     other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
     assert len({phase, other}) == 2

@@ -18,6 +18,9 @@ class LossConfig:
     """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
     joint: float = 1.0
     """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
+    squared: float = 0.0
+    """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
+    paper. Large errors vanish sooner and fewer remain."""
     dynamic_background: Literal["black", "random"] = "random"
     """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
     depth: float = 2.0

@@ -65,8 +65,9 @@ class TrainConfig:
     try_masks: bool = False
     """Try out masks that `prepare` made in two short trainings, with them and without, before runs that are longer, and
     take everything as dynamic if held-out frames are better without."""
-    background: Literal["capture", "black", "white"] = "capture"
-    """Colour behind all Gaussians; that of the capture is white if D-NeRF's images have alpha, else black."""
+    background: Literal["capture", "mean", "black", "white"] | tuple[float, float, float] = "capture"
+    """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
+    same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
     static_geometry: bool = False
     """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
     static_appearance: bool = False
@@ -123,6 +124,8 @@ def validate(config: TrainConfig) -> None:
             "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "
             f"got {model.position_bands} and {model.time_bands}"
         )
+    if not isinstance(config.background, str) and not all(0.0 <= value <= 1.0 for value in config.background):
+        raise ValueError(f"background must be red, green and blue in [0, 1], got {config.background}")
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
 

@@ -38,6 +38,7 @@ BEST = TrainConfig(
     static_geometry=True,
     static_appearance=True,
     exposure=True,
+    background="mean",
     antialias=True,
     try_masks=True,
     model=ModelConfig(
@@ -50,6 +51,7 @@ BEST = TrainConfig(
         dropout=0.1,
     ),
     loss=LossConfig(
+        squared=15.0,
         dynamic_background="black",
         depth=0.5,
         depth_dynamic=4.0,
@@ -76,6 +78,7 @@ BEST = TrainConfig(
         joint_from=0,
         warmup=400,
         noise_until=3_750,
+        settle_from=37_500,
         sh_degree_every=400,
     ),
     checkpoint_every=2_500,
@@ -113,6 +116,7 @@ PATIENT = dataclasses.replace(
         warmup=100,
         joint_from=0,
         noise_until=800,
+        settle_from=3_900,
         sh_degree_every=400,
     ),
     checkpoint_every=500,
@@ -139,6 +143,7 @@ QUICK = dataclasses.replace(
         warmup=100,
         joint_from=0,
         noise_until=400,
+        settle_from=1_650,
         sh_degree_every=400,
     ),
 )

@@ -37,12 +37,14 @@ Assumption = Literal["masks", "static", "dynamic"]
 MASKS_REMEDY = "with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
 """How to go on without masks: the end of a message that says what to make."""
 
-Background = Literal["black", "white"]
-"""Colour behind all Gaussians."""
+Background = Literal["black", "white"] | tuple[float, float, float]
+"""Colour behind all Gaussians, by name or as red, green and blue in [0, 1]."""
 
 
-def background_color(background: Background | Literal["capture"]) -> tuple[float, float, float]:
-    """RGB in [0, 1]; black for "capture", which only runs of earlier versions keep in their config (``fitted``)."""
+def background_color(background: Background | Literal["capture", "mean"]) -> tuple[float, float, float]:
+    """RGB in [0, 1]; black for "capture", which runs of earlier versions kept, and "mean": ``fitted`` replaces both."""
+    if isinstance(background, tuple):
+        return background
     return (1.0, 1.0, 1.0) if background == "white" else (0.0, 0.0, 0.0)
 
 

@@ -61,3 +61,11 @@ class Trunk(nn.Module):
         box = (self.center, self.half_size)
         inputs = encode(means.detach(), time, self.bands, box, self.reserved_columns, half, self.raw)
         return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0])
+
+
+def in_single_precision(model: nn.Module) -> nn.Module:
+    """The same model, changed in place so that its trunks are evaluated in single precision."""
+    for module in model.modules():
+        if isinstance(module, Trunk):
+            module.uses_half = False
+    return model

@@ -28,16 +28,18 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         perturbation=config.masks,
         undistort=config.undistort,
     )
-    return capture if config.background == "capture" else capture.over(config.background)
+    if config.background == "capture" or config.background == "mean":
+        return capture
+    return capture.over(config.background)
 
 
 def known_background(config: TrainConfig, capture: Capture) -> Background:
     """The background of a config.
 
     Raises:
-        ValueError: If it is that of the capture, which is white, and was not looked up: runs of earlier versions, whose
-            config does not know it, are over black.
+        ValueError: If it depends on the capture and was not looked up. Runs of earlier versions, whose config does not
+            know it, are over black.
     """
-    if config.background == "capture" and capture.background == "white":
-        raise ValueError('background is "capture" over white: call fitted(config, capture, log) first')
+    if config.background == "mean" or (config.background == "capture" and capture.background == "white"):
+        raise ValueError(f'background is "{config.background}": call fitted(config, capture, log) first')
     return "black" if config.background == "capture" else config.background

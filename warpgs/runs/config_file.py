@@ -108,6 +108,8 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
             value = Path(value)
         elif not _matches(value, hint):
             raise ValueError(f"{path}: {prefix}{name} cannot be {reprlib.repr(value)}")
+        if isinstance(value, list):
+            value = tuple(float(item) for item in value)
         fields[name] = float(value) if hint is float else value
     return cls(**fields)
 
@@ -115,6 +117,9 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
 def _matches(value: Any, hint: Any) -> bool:
     if typing.get_origin(hint) is typing.Literal:
         return value in typing.get_args(hint)
+    if typing.get_origin(hint) is tuple:
+        items = typing.get_args(hint)
+        return isinstance(value, list) and len(value) == len(items) and all(map(_matches, value, items))
     if choices := typing.get_args(hint):
         return any(_matches(value, choice) for choice in choices)
     if hint is float:

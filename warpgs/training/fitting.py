@@ -4,12 +4,18 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+import torch
+
 from warpgs.config import ModelConfig, TrainConfig
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Background, Capture
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.runs.captures import known_background
 
 from .tracked_start import for_tracks
 from .tracks import find_tracks
+
+MAX_AVERAGED = 50
+"""Maximum number of frames whose mean colour is the background."""
 
 
 def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) -> TrainConfig:
@@ -18,8 +24,7 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
     Raises:
         ValueError: If it names a deformation model that the capture does not suit.
     """
-    background = capture.background if config.background == "capture" else config.background
-    config = dataclasses.replace(config, background=background)
+    config = dataclasses.replace(config, background=_background(config, capture))
     seen = capture.assuming(config.assume).over(known_background(config, capture))
     tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
     if tracks:
@@ -36,6 +41,22 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
             log("the masks are estimates: stage II compares the joint image alone")
         loss = dataclasses.replace(loss, branches_in_stage2="no" if seen.uses_estimated_masks else "yes")
     return dataclasses.replace(config, loss=loss)
+
+
+def _background(config: TrainConfig, capture: Capture) -> Background:
+    """The background of a config: what it asks for, or that of the capture, with the mean colour instead of black."""
+    if config.background == "mean":
+        return mean_color(capture) if capture.background == "black" else capture.background
+    return capture.background if config.background == "capture" else config.background
+
+
+def mean_color(capture: Capture) -> tuple[float, float, float]:
+    """Mean red, green and blue of a capture's training frames in [0, 1], to 3 decimals, of some frames if many."""
+    chosen = evenly_spaced_indices(len(capture.train), MAX_AVERAGED)
+    frames = capture.frames([capture.train[k] for k in chosen])
+    means = torch.stack([frame.image.double().mean((0, 1)) for frame in frames])
+    red, green, blue = (round(value, 3) for value in (means.mean(0) / 255.0).tolist())
+    return red, green, blue
 
 
 def fitted_bands(model: ModelConfig, num_frames: int) -> int:

@@ -35,6 +35,11 @@ def joint(inputs: LossInputs) -> Float[Tensor, ""]:
     return losses.image_loss(inputs.rendering.joint.image, inputs.view.image, inputs.config.ssim)
 
 
+def squared(inputs: LossInputs) -> Float[Tensor, ""]:
+    """The squared error of the joint image: what the PSNR measures."""
+    return (inputs.rendering.joint.image - inputs.view.image).square().mean()
+
+
 def _depth_error(
     inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"], margin: Float[Tensor, ""]
 ) -> Float[Tensor, ""]:
@@ -77,6 +82,11 @@ TERMS: dict[str, LossTerm] = {
         joint,
         is_active=lambda phase, config: phase.with_joint,
         weight=lambda plan, config: config.joint,
+    ),
+    "squared": LossTerm(
+        squared,
+        is_active=lambda phase, config: phase.with_joint and config.squared > 0,
+        weight=lambda plan, config: config.squared,
     ),
     "depth": LossTerm(
         depth,

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from warpgs.config import TrainConfig
+from warpgs.model.trunk import in_single_precision
 from warpgs.ops.adam import Adam
 from warpgs.runtime.graphs import GraphCache
 
@@ -80,7 +81,8 @@ def fit_motion(
         Those of the points that are deformed to where they were seen, at their canonical positions; None, and the
         deformation as it was, if stopped.
     """
-    fitted = copy.deepcopy(deformation).requires_grad_(True)
+    # In half precision, the network of one of six seeds learned nothing on builtin:studio without depth.
+    fitted = in_single_precision(copy.deepcopy(deformation).requires_grad_(True))
     device = next((parameter.device for parameter in fitted.parameters()), None)
     if device is None:
         return found
@@ -88,7 +90,7 @@ def fit_motion(
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
-    return points.canonical(deformation, found, config.graph and device.type == "cuda")
+    return points.canonical(fitted, found, config.graph and device.type == "cuda")
 
 
 def _fit(

@@ -32,6 +32,9 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 MEANS_DECAY = 0.01
 """Final learning rate of positions, relative to the initial one (3DGS)."""
 
+SETTLE_DECAY = 0.1
+"""Final learning rate of the other parameters of Gaussians, relative to that until they settle."""
+
 POSES_DECAY = 0.01
 """Final learning rate of camera poses, relative to the initial one."""
 
@@ -72,6 +75,7 @@ def learning_rates(
     config: OptimConfig,
     extent: float,
     progress: float,
+    settle_progress: float,
     means_progress: Mapping[str, float],
     network_progress: Mapping[str, float],
     warmup_factors: Mapping[str, float],
@@ -82,6 +86,7 @@ def learning_rates(
         config: Rates of one view per step.
         extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
         progress: Fraction of the run done, in [0, 1].
+        settle_progress: Fraction done of the iterations in which Gaussians settle.
         means_progress: By branch, fraction done of the decay of its positions' rate.
         network_progress: By network, fraction done of the iterations in which it is trained.
         warmup_factors: By network, factor of its rate.
@@ -94,7 +99,8 @@ def learning_rates(
         "sh_dc": config.sh_dc,
         "sh_rest": config.sh_rest,
     }
-    rates = {f"{branch}.{name}": rate for branch in BRANCHES for name, rate in gaussians.items()}
+    settled = exponential(1.0, SETTLE_DECAY, settle_progress)
+    rates = {f"{branch}.{name}": settled * rate for branch in BRANCHES for name, rate in gaussians.items()}
     for branch in BRANCHES:
         rates[f"{branch}.means"] = exponential(config.means, MEANS_DECAY * config.means, means_progress[branch]) * scale
     for name in NETWORKS:

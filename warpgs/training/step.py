@@ -115,7 +115,7 @@ class Step:
 
     def __call__(self, plan: IterationPlan, sample: Sample) -> None:
         """Runs one iteration."""
-        progress = (plan.progress, plan.means_progress, plan.network_progress)
+        progress = (plan.progress, plan.settle_progress, plan.means_progress, plan.network_progress)
         rates = optim.learning_rates(self.config.optim, self.extent, *progress, plan.warmup_factors)
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
         background = background_color(self.views.background)
@@ -123,7 +123,7 @@ class Step:
             time_noise=sample.time_noise,
             dropout_seed=sample.dropout_seed,
             background=background,
-            dynamic_background=background if any(background) else sample.background.tolist(),
+            dynamic_background=background if self.views.background == "white" else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
             learning_rates=rates,
         )
@@ -150,7 +150,7 @@ class Step:
         view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
         splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
-        if self.config.model.dropout and phase.stage != "pretrain":
+        if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
