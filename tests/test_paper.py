@@ -104,7 +104,7 @@ PAPER = {
         "antialias": False,
         "densify.weakest": 0.0,
         "model.dropout": 0.0,
-        "schedule.settle_from": None,
+        "schedule.settle": 0,
         "loss.squared": 0.0,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,

@@ -83,8 +83,13 @@ def test_every_option_survives_the_way_through_the_command_line(tmp_path):
                 values[field.name] = value + 1
         return dataclasses.replace(config, **values)
 
-    config = changed(TrainConfig(preset="best"))
+    config = changed(TrainConfig(preset="best", background=(0.1, 0.2, 0.3)))
     assert parse(arguments(config)) == config
+
+
+def test_a_sweep_may_name_a_colour(tmp_path):
+    [cell] = plan(spec(options={"background": [0.1, 0.2, 0.3]}), out=tmp_path)
+    assert parse(arguments(cell.config)).background == (0.1, 0.2, 0.3)
 
 
 @pytest.mark.parametrize("options", [{}, {"try_masks": True}])

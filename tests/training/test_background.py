@@ -12,8 +12,9 @@ import torch
 
 from tests import tiny
 from tests.tiny import quickly  # noqa: F401  # a fixture
-from warpgs.config import TrainConfig
+from warpgs.config import TrainConfig, validate
 from warpgs.data.balls import BallsSize, balls_capture
+from warpgs.data.capture import background_color
 from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.export.clouds import Clouds
@@ -152,8 +153,11 @@ def test_a_transparent_image_has_none_of_the_background():
     assert torch.equal(frames._pixels(over_white, Render(Path("run")), torch.ones(3)), over_white.image)
 
 
-def test_a_page_starts_over_the_background(run):
-    assert start_view(Clouds(open_run(run, "cpu")), None, keys=2, seconds=1.0).background == WHITE
+def test_a_page_starts_over_the_background(run, mean_run):
+    for folder in (run, mean_run):
+        scene = open_run(folder, "cpu")
+        expected = WHITE if folder == run else scene.config.background
+        assert start_view(Clouds(scene), None, keys=2, seconds=1.0).background == expected
 
 
 def test_a_capture_without_a_background_has_black_behind_it(tmp_path):
@@ -247,7 +251,21 @@ def test_a_background_that_is_no_colour_is_refused(mean_run, tmp_path, color):
         open_run(damaged, "cpu")
 
 
-def test_a_background_may_be_given_in_rgb(run):
+@pytest.mark.parametrize(
+    ("words", "expected"), [("0.1 0.2 0.3", (0.1, 0.2, 0.3)), ("1 1 1", "white"), ("0 0 0", "black")]
+)
+def test_a_background_may_be_given_in_rgb(run, words, expected):
     capture = load_capture(Run.open(run, "cpu").config.data)
-    config = parse(["--data", "x", "--background", "0.1", "0.2", "0.3"])
-    assert fitted(config, capture, print).background == (0.1, 0.2, 0.3)
+    config = parse(["--data", "x", "--background", *words.split()])
+    assert fitted(config, capture, print).background == expected
+
+
+@pytest.mark.parametrize("background", ["grey", [0.1, 0.2, 0.3], (0.5, 0.5), (0.5, 0.5, 1.5), 0.5])
+def test_a_background_that_is_no_colour_is_refused_before_training(background):
+    with pytest.raises(ValueError, match="background must be capture, mean, black, white, or three numbers"):
+        validate(TrainConfig(background=background))
+
+
+def test_a_colour_that_is_not_known_yet_is_not_black():
+    with pytest.raises(ValueError, match='background is "mean": call fitted'):
+        background_color("mean")

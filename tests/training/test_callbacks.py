@@ -173,6 +173,13 @@ def test_the_last_stage_takes_the_added_iterations():
     assert Protocol(extended(only, 50), has_depth=True).stage1.end == 50
 
 
+def test_the_gaussians_of_a_longer_run_settle_at_its_end():
+    settling = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, settle=8))
+    longer = Protocol(extended(settling, 50), has_depth=True)
+    assert [longer.at(k).phase.use_dropout for k in (30, 41, 42)] == [True, True, False]
+    assert [longer.at(k).settle_progress for k in (30, 42, 46)] == [0.0, 0.0, 0.5]
+
+
 def test_a_run_is_not_shortened():
     with pytest.raises(ValueError, match="expected at least its 32, got 31"):
         extended(tiny.CONFIG, 31)

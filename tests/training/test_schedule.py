@@ -114,21 +114,31 @@ DROPPING = dataclasses.replace(CONFIG.model, dropout=0.1)
 
 def test_gaussians_are_omitted_from_stage_1_on_until_they_settle():
     assert iterations_in_phases_where("use_dropout", model=DROPPING) == list(range(STAGE1, END))
-    settling = {"settle_from": 150}
-    expected = list(range(STAGE1, STAGE1 + 150))
+    settling = {"settle": 30}
+    expected = list(range(STAGE1, END - 30))
     assert iterations_in_phases_where("use_dropout", schedule=settling, model=DROPPING) == expected
     assert iterations_in_phases_where("use_dropout", schedule=settling) == []
 
 
-def test_gaussians_settle_from_an_iteration_to_the_end_of_the_run():
-    progress = [plan.settle_progress for plan in plans(schedule={"settle_from": 150})]
-    start, steps = STAGE1 + 150, END - STAGE1 - 150
-    assert progress == pytest.approx([0.0] * start + [k / steps for k in range(steps)])
+@pytest.mark.parametrize("has_depth", [True, False])  # without depth there is no pretraining
+def test_gaussians_settle_in_the_last_iterations_of_the_run(has_depth):
+    progress = [plan.settle_progress for plan in plans(has_depth, schedule={"settle": 30})]
+    assert progress == pytest.approx([0.0] * (END - 30) + [k / 30 for k in range(30)])
 
 
-@pytest.mark.parametrize("settle_from", [None, 180, 10_000])
-def test_gaussians_never_settle_if_not_asked_to(settle_from):
-    assert {plan.settle_progress for plan in plans(schedule={"settle_from": settle_from})} == {0.0}
+def test_gaussians_never_settle_if_not_asked_to():
+    assert {plan.settle_progress for plan in plans(schedule={"settle": 0})} == {0.0}
+
+
+def test_a_settling_longer_than_the_run_begins_before_it():
+    made = plans(schedule={"settle": 2 * END})
+    assert [plan.settle_progress for plan in made] == pytest.approx([0.5 + k / (2 * END) for k in range(END)])
+
+
+@pytest.mark.parametrize("preset", ["best", "patient", "quick"])
+def test_gaussians_of_the_presets_settle_in_the_last_sixth(preset):
+    schedule = PRESETS[preset].schedule
+    assert schedule.settle == pytest.approx((schedule.stage1 + schedule.stage2) / 6, rel=0.06)
 
 
 # Networks and losses -------------------------------------------------------------------------------------------------
@@ -404,7 +414,7 @@ def test_a_tenth_of_the_iterations_is_a_tenth_of_every_schedule_but_those_of_ada
 @pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])
 @pytest.mark.parametrize("iterations", [5, 50, 1003])
 def test_zeros_of_a_schedule_stay_zero_when_it_is_rescaled(off, iterations):
-    schedule = dataclasses.replace(SHORT, **dict.fromkeys(off, 0))
+    schedule = dataclasses.replace(SHORT, settle=30, **dict.fromkeys(off, 0))
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
     assert total(after) == iterations
     assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == set(off)

@@ -124,8 +124,9 @@ def validate(config: TrainConfig) -> None:
             "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "
             f"got {model.position_bands} and {model.time_bands}"
         )
-    if not isinstance(config.background, str) and not all(0.0 <= value <= 1.0 for value in config.background):
-        raise ValueError(f"background must be red, green and blue in [0, 1], got {config.background}")
+    named, rgb = config.background in ("capture", "mean", "black", "white"), config.background
+    if not named and not (isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)):
+        raise ValueError(f"background must be capture, mean, black, white, or three numbers in [0, 1], got {rgb!r}")
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
 

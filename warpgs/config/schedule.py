@@ -43,9 +43,9 @@ class Schedule:
     full rate, Adam's first steps would leave ReLU units inactive forever and move the Gaussians of an object away."""
     noise_until: int = 20_000
     """Iteration at which the noise on time has decayed to 0."""
-    settle_from: int | None = None
-    """Iteration from which no Gaussians are omitted any more (``model.dropout``) and the learning rates of their
-    rotations, scales, opacities and colours decay to a tenth at the end of the run; None: never (paper)."""
+    settle: int = 0
+    """Number of iterations at the end of the run in which no Gaussians are omitted (``model.dropout``), and in which
+    the learning rates of rotations, scales, opacities and colours decay to a tenth; 0: none (paper)."""
     sh_degree_every: Annotated[int, Bounds(min=1)] = 1_000
     """Iterations between increments of the degree of spherical harmonics, from 0 to ``model.sh_degree``."""
 

@@ -37,15 +37,25 @@ Assumption = Literal["masks", "static", "dynamic"]
 MASKS_REMEDY = "with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
 """How to go on without masks: the end of a message that says what to make."""
 
-Background = Literal["black", "white"] | tuple[float, float, float]
-"""Colour behind all Gaussians, by name or as red, green and blue in [0, 1]."""
+Color = tuple[float, float, float]
+"""Red, green and blue in [0, 1]."""
+Background = Literal["black", "white"] | Color
+"""Colour behind all Gaussians."""
+
+COLORS: dict[Literal["black", "white"], Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""RGB of the named backgrounds."""
 
 
-def background_color(background: Background | Literal["capture", "mean"]) -> tuple[float, float, float]:
-    """RGB in [0, 1]; black for "capture", which runs of earlier versions kept, and "mean": ``fitted`` replaces both."""
-    if isinstance(background, tuple):
-        return background
-    return (1.0, 1.0, 1.0) if background == "white" else (0.0, 0.0, 0.0)
+def background_color(background: Background | Literal["capture", "mean"]) -> Color:
+    """RGB in [0, 1].
+
+    Raises:
+        ValueError: If it is to be looked up in a capture first (``fitted``). "capture" is black: runs of earlier
+            versions kept it in their config.
+    """
+    if background == "mean":
+        raise ValueError('background is "mean": call fitted(config, capture, log) first')
+    return background if isinstance(background, tuple) else COLORS["white" if background == "white" else "black"]
 
 
 @dataclass(frozen=True)

@@ -224,7 +224,8 @@ def _different(prefix: str, config: Any, default: Any) -> Iterator[list[str]]:
             yield from _different(f"{prefix}{name}.", value, usual)
         elif value != usual:
             switch = f"--{prefix}{name}" if value else f"--{prefix}no-{name}"
-            yield [switch] if isinstance(value, bool) else [f"--{prefix}{name}", str(value)]
+            words = map(str, value) if isinstance(value, tuple) else [str(value)]
+            yield [switch] if isinstance(value, bool) else [f"--{prefix}{name}", *words]
 
 
 def finished_metrics(cell: Cell) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from warpgs.config import ModelConfig, TrainConfig
-from warpgs.data.capture import Background, Capture
+from warpgs.data.capture import COLORS, Background, Capture, Color, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.runs.captures import known_background
 
@@ -44,13 +44,18 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
 
 
 def _background(config: TrainConfig, capture: Capture) -> Background:
-    """The background of a config: what it asks for, or that of the capture, with the mean colour instead of black."""
-    if config.background == "mean":
-        return mean_color(capture) if capture.background == "black" else capture.background
-    return capture.background if config.background == "capture" else config.background
+    """The background of a config: what it asks for, or that of the capture, with the mean colour instead of black.
+
+    Black and white get their names: captures over white know where frames are empty.
+    """
+    if config.background == "capture" or (config.background == "mean" and capture.background != "black"):
+        return capture.background
+    color = mean_color(capture) if config.background == "mean" else background_color(config.background)
+    names: dict[Background, Background] = {value: name for name, value in COLORS.items()}
+    return names.get(color, color)
 
 
-def mean_color(capture: Capture) -> tuple[float, float, float]:
+def mean_color(capture: Capture) -> Color:
     """Mean red, green and blue of a capture's training frames in [0, 1], to 3 decimals, of some frames if many."""
     chosen = evenly_spaced_indices(len(capture.train), MAX_AVERAGED)
     frames = capture.frames([capture.train[k] for k in chosen])
