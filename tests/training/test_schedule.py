@@ -135,10 +135,9 @@ def test_a_settling_longer_than_the_run_begins_before_it():
     assert [plan.settle_progress for plan in made] == pytest.approx([0.5 + k / (2 * END) for k in range(END)])
 
 
-@pytest.mark.parametrize("preset", ["best", "patient", "quick"])
-def test_gaussians_of_the_presets_settle_in_the_last_sixth(preset):
-    schedule = PRESETS[preset].schedule
-    assert schedule.settle == pytest.approx((schedule.stage1 + schedule.stage2) / 6, rel=0.06)
+def test_gaussians_of_the_preset_best_settle_in_the_last_sixth():
+    schedule = PRESETS["best"].schedule
+    assert schedule.settle == (schedule.stage1 + schedule.stage2) / 6
 
 
 # Networks and losses -------------------------------------------------------------------------------------------------

@@ -116,7 +116,6 @@ PATIENT = dataclasses.replace(
         warmup=100,
         joint_from=0,
         noise_until=800,
-        settle=800,
         sh_degree_every=400,
     ),
     checkpoint_every=500,
@@ -143,7 +142,6 @@ QUICK = dataclasses.replace(
         warmup=100,
         joint_from=0,
         noise_until=400,
-        settle=350,
         sh_degree_every=400,
     ),
 )
