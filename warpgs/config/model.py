@@ -44,8 +44,8 @@ class ModelConfig:
     """Whether the appearance network also changes opacities (paper Eq. 8). Off by default: with one camera at a time
     it fits shadows by fading Gaussians at wrong depths in and out."""
     half: bool = True
-    """On CUDA, multiply the networks' matrices in half precision and sum in single; only if 8 divides ``width``. The fit
-    of the deformation to points is always in single precision."""
+    """On CUDA, multiply the networks' matrices in half precision and sum in single; only if 8 divides ``width``. The
+    fit of the deformation to points is always in single precision."""
     max_static_points: int = 100_000
     """Maximum number of initial static Gaussians."""
     point_colors: Literal["capture", "grey"] = "capture"
