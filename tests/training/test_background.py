@@ -145,12 +145,13 @@ def test_exact_masks_have_no_margin(run):
         assert bool(view.mask_border.any()) == has_border
 
 
-def test_a_transparent_image_has_none_of_the_background():
-    color, alpha = torch.rand(4, 5, 3), 0.2 + 0.8 * torch.rand(4, 5)
-    over_white = Layer(color * alpha[..., None] + (1.0 - alpha[..., None]), alpha, None)
-    rgba = frames._pixels(over_white, Render(Path("run"), transparent=True), torch.ones(3))
+@pytest.mark.parametrize("background", [WHITE, (0.6, 0.5, 0.4)])
+def test_a_transparent_image_has_none_of_the_background(background):
+    color, alpha, behind = torch.rand(4, 5, 3), 0.2 + 0.8 * torch.rand(4, 5), torch.tensor(background)
+    layer = Layer(color * alpha[..., None] + (1.0 - alpha[..., None]) * behind, alpha, None)
+    rgba = frames._pixels(layer, Render(Path("run"), transparent=True), behind)
     assert torch.allclose(rgba, torch.cat([color, alpha[..., None]], -1), atol=1e-5)
-    assert torch.equal(frames._pixels(over_white, Render(Path("run")), torch.ones(3)), over_white.image)
+    assert torch.equal(frames._pixels(layer, Render(Path("run")), behind), layer.image)
 
 
 def test_a_page_starts_over_the_background(run, mean_run):
