@@ -34,15 +34,20 @@ from warpgs.video.command import Render
 WHITE = (1.0, 1.0, 1.0)
 
 
+def finished(data, out, **changes):
+    """The folder of a finished run on a capture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
+        train(dataclasses.replace(tiny.CONFIG, data=data, out=out, checkpoint_every=30, **changes))
+    return out
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, quickly):  # noqa: F811
     """A finished run on a small capture over white; its folder has the capture as well."""
     folder = tmp_path_factory.mktemp("run")
     data = balls_capture(folder / "cache", BallsSize(side=16, num_frames=8, num_val=2), quiet=True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-        train(dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run", checkpoint_every=30))
-    return folder / "run"
+    return finished(data, folder / "run")
 
 
 @pytest.fixture
@@ -189,13 +194,8 @@ def test_a_trainer_refuses_a_background_that_was_not_looked_up(run, tmp_path):
 def mean_run(tmp_path_factory, quickly):  # noqa: F811
     """A finished run on a small capture without a background of its own, over the mean colour of its frames."""
     folder = tmp_path_factory.mktemp("mean")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-        data = tiny.write(folder)
-        loss = dataclasses.replace(tiny.CONFIG.loss, dynamic_background="black")
-        config = dataclasses.replace(tiny.CONFIG, data=data, out=folder / "run", background="mean", loss=loss)
-        train(dataclasses.replace(config, checkpoint_every=30))
-    return folder / "run"
+    loss = dataclasses.replace(tiny.CONFIG.loss, dynamic_background="black")
+    return finished(tiny.write(folder), folder / "run", background="mean", loss=loss)
 
 
 def mean_of(capture):

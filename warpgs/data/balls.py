@@ -20,8 +20,9 @@ from warpgs.command_line.progress import progress
 from warpgs.files import write_json, write_png
 from warpgs.ops.raytrace import SPHERE, raytrace
 
-from .bodies import Body, Color, as_tensors, euler
+from .bodies import Body, as_tensors, euler
 from .builtin_cache import cached, content_folder
+from .capture import Color
 
 VERSION = 1
 """Increase it when the content changes, so that cached captures are not used any more."""

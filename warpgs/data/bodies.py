@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpgs.ops.raytrace import Bodies
 
-Color = tuple[float, float, float]
+from .capture import Color
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture, background_color
+from warpgs.data.capture import COLORS, Capture, Color, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
 
@@ -46,7 +46,7 @@ class StartView:
     seconds: float
     antialias: bool
     max_alpha: float
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = COLORS["black"]
 
 
 def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:

@@ -4,12 +4,11 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-import torch
+import numpy as np
 
 from warpgs.config import ModelConfig, TrainConfig
 from warpgs.data.capture import COLORS, Background, Capture, Color, background_color
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.runs.captures import known_background
 
 from .tracked_start import for_tracks
 from .tracks import find_tracks
@@ -24,8 +23,9 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
     Raises:
         ValueError: If it names a deformation model that the capture does not suit.
     """
-    config = dataclasses.replace(config, background=_background(config, capture))
-    seen = capture.assuming(config.assume).over(known_background(config, capture))
+    background = _background(config, capture)
+    config = dataclasses.replace(config, background=background)
+    seen = capture.assuming(config.assume).over(background)
     tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
     if tracks:
         log(f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks")
@@ -59,8 +59,8 @@ def mean_color(capture: Capture) -> Color:
     """Mean red, green and blue of a capture's training frames in [0, 1], to 3 decimals, of some frames if many."""
     chosen = evenly_spaced_indices(len(capture.train), MAX_AVERAGED)
     frames = capture.frames([capture.train[k] for k in chosen])
-    means = torch.stack([frame.image.double().mean((0, 1)) for frame in frames])
-    red, green, blue = (round(value, 3) for value in (means.mean(0) / 255.0).tolist())
+    means = [frame.image.numpy().mean((0, 1)) for frame in frames]
+    red, green, blue = (round(float(value), 3) for value in np.mean(means, 0) / 255.0)
     return red, green, blue
 
 

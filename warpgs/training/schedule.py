@@ -152,7 +152,7 @@ class Protocol:
         deform_from = 0 if fits_motion else schedule.deform_from
         starts = {"deformation": deform_from, "appearance": schedule.appearance_from}
         self._network_starts = {name: stage1 if k is None else min(k, stage1) for name, k in starts.items()}
-        self._settle_start = self.num_iterations - schedule.settle
+        self._settle_from = stage1 + stage2 - schedule.settle
         self._reseed_from = self._network_starts["deformation"] + schedule.warmup
 
     def stage_at(self, iteration: int) -> Stage:
@@ -170,7 +170,7 @@ class Protocol:
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
-            use_dropout=config.model.dropout > 0.0 and in_stage1 >= 0 and iteration < self._settle_start,
+            use_dropout=config.model.dropout > 0.0 and 0 <= in_stage1 < self._settle_from,
         )
 
     def at(self, iteration: int) -> IterationPlan:
@@ -186,7 +186,7 @@ class Protocol:
         return IterationPlan(
             phase=phase,
             progress=progress,
-            settle_progress=max(0, iteration - self._settle_start) / max(1, schedule.settle),
+            settle_progress=self._progress_from(self._settle_from, in_stage1),
             means_progress=self._means_progress(iteration),
             network_progress={name: self._progress_from(k, in_stage1) for name, k in self._network_starts.items()},
             warmup_factors={name: self._warmup_factor(in_stage1 - k) for name, k in self._network_starts.items()},
