@@ -47,7 +47,7 @@ the factor. Both tolerate outliers."""
 MAX_POINTS = 10_000
 """Maximum number of static points that are projected into each frame."""
 
-SIZE_ERROR = 0.03
+SIZE_ERROR = 0.02
 """Relative error of a capture's depth at the sparse points at which it and depth by size have the same weight; chosen
 on two captures (docs/design/object-depth.md)."""
 
