@@ -51,10 +51,6 @@ SIZE_ERROR = 0.02
 """Relative error of a capture's depth at the sparse points at which it and depth by size have the same weight; chosen
 on two captures (docs/design/object-depth.md)."""
 
-STEADY = 3.0
-"""Standard deviation of the Gaussian by which the factor between depth and depth by size is smoothed over time
-[frames]: the depth of a network flickers, a size does not."""
-
 MAX_WEIGHT = 0.9
 """Weight of a capture's depth from which on it stays as it is."""
 
@@ -107,7 +103,6 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
 
     Both have errors of their own: a depth network misplaces objects as a whole, by amounts that change with time, and
     the size may change a little. The factor of depth by size is between the median of depth times size and the bound.
-    How the distance changes from frame to frame is that of the size.
 
     Args:
         capture: The capture, with masks and static points.
@@ -177,9 +172,7 @@ def _corrections(
         products = np.log([known[index] * sizes_by[index] for index in frames])
         median = float(np.median(products))
         factor = median if math.isnan(bound) else 0.5 * (median + math.log(bound))
-        steady = cv2.GaussianBlur(products[None], (0, 0), STEADY, borderType=cv2.BORDER_REPLICATE)[0]
-        logs = weight * factor + (1.0 - weight) * steady - products
-        choices.append((float(products.std()), [times[index] for index in frames], logs))
+        choices.append((float(products.std()), [times[index] for index in frames], weight * (factor - products)))
     if not choices:
         return {}
     _, at, logs = min(choices, key=lambda choice: choice[0])
