@@ -14,7 +14,7 @@ from warpgs.config import LossConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
 from warpgs.training import objects
-from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth
+from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth, without_rims
 from warpgs.training.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
@@ -312,10 +312,64 @@ def test_uncertain_depth_of_an_object_is_averaged_with_that_by_its_size(error):
     assert all(torch.allclose(v.inverse_depth[v.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3) for v in views)
 
 
-def test_depth_of_an_object_does_not_flicker():
-    flicker = 0.04 * np.random.default_rng(0).standard_normal(NUM)
-    _, found, _ = filled(misplaced(MASKS, np.exp(flicker)), 0.05)
-    assert np.diff(np.log(found / DEPTHS)).std() < 0.15 * np.diff(flicker).std()
+def rim_of(static_mask: torch.Tensor, width: int) -> torch.Tensor:
+    """Dynamic pixels at most ``width`` pixels from static ones."""
+    near = torch.nn.functional.max_pool2d(static_mask[None, None].float(), 2 * width + 1, 1, width)[0, 0]
+    return (near > 0) & ~static_mask
+
+
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_rims_of_objects_have_the_depth_further_inside(monkeypatch, resident_bytes):
+    """A depth network draws the edges of objects half way to what is behind them."""
+    monkeypatch.setattr("warpgs.training.object_depth.RIM", 2.5 / WIDTH)
+    capture = misplaced(MASKS)
+    read = capture._cached
+
+    def blurred(name: str) -> Frame:
+        frame = read(name)
+        rim = rim_of(frame.static_mask, 1)
+        return dataclasses.replace(frame, inverse_depth=torch.where(rim, 0.5 / WALL, frame.inverse_depth))
+
+    capture._cached = blurred
+    views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    assert fill_object_depth(CONFIG, capture, views, alignments, torch.full((NUM,), 0.05)) == NUM
+    for view in views:
+        depths = 1.0 / view.inverse_depth[~view.static_mask]
+        assert depths.max() < 1.01 * depths.min()
+        assert torch.allclose(view.inverse_depth[view.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3)
+
+
+def test_rims_of_dynamic_pixels_at_the_border_of_the_image_are_not_edges():
+    static, depth = torch.ones(200, 300, dtype=torch.bool), torch.rand(200, 300)
+    static[:, :100] = False
+    filled = without_rims(depth, static)
+    assert torch.equal(filled[:, :97], depth[:, :97])
+    assert torch.equal(filled[:, 98:100], depth[:, 97:98].expand(-1, 2))
+    assert torch.equal(filled[:, 100:], depth[:, 100:])
+
+
+def test_thin_objects_keep_their_depth():
+    static, depth = torch.ones(200, 300, dtype=torch.bool), torch.rand(200, 300)
+    static[50:150, 50:150] = False  # with an inside
+    static[90:94, 200:290] = False  # as thin as two rims
+    filled = without_rims(depth, static)
+    assert torch.equal(filled[:, 160:], depth[:, 160:])
+    assert not torch.equal(filled, depth)
+
+
+@pytest.mark.parametrize("masks", ["all static", "thin"])
+def test_depth_without_an_inside_stays(masks):
+    static, depth = torch.ones(200, 300, dtype=torch.bool), torch.rand(200, 300)
+    if masks == "thin":
+        static[90:94] = False
+    assert torch.equal(without_rims(depth, static), depth)
+
+
+def test_rims_are_not_filled_with_unknown_depth():
+    static, depth = torch.ones(200, 300, dtype=torch.bool), torch.full((200, 300), 0.5)
+    static[50:150, 50:150] = False
+    depth[60:140, 60:140] = torch.nan
+    assert torch.equal(without_rims(depth, static).isfinite(), depth.isfinite())
 
 
 def test_metric_depth_of_objects_is_kept():

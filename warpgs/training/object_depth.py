@@ -18,7 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from warpgs.cameras import Camera
@@ -50,6 +50,10 @@ MAX_POINTS = 10_000
 SIZE_ERROR = 0.02
 """Relative error of a capture's depth at the sparse points at which it and depth by size have the same weight; chosen
 on two captures (docs/design/object-depth.md)."""
+
+RIM = 0.008
+"""Width of the rim of dynamic objects in which a network's depth is replaced, as a fraction of the image's longer side:
+it changes smoothly to that of what is behind them."""
 
 MAX_WEIGHT = 0.9
 """Weight of a capture's depth from which on it stays as it is."""
@@ -86,8 +90,8 @@ def fill_object_depth(
     if is_depth_known(views, alignments):
         if capture.metric_depth:
             return 0
-        error = float(typical_error(errors))
-        return _average_depths(capture, views, alignments, 1.0 / (1.0 + (error / SIZE_ERROR) ** 2))
+        weight = 1.0 / (1.0 + (float(typical_error(errors)) / SIZE_ERROR) ** 2)
+        return _average_depths(capture, views, alignments, weight) if weight <= MAX_WEIGHT else 0
     count = 0
     for index, depth in object_depth(capture).items():
         if capture.frame(capture.train[index]).inverse_depth is None:
@@ -103,6 +107,7 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
 
     Both have errors of their own: a depth network misplaces objects as a whole, by amounts that change with time, and
     the size may change a little. The factor of depth by size is between the median of depth times size and the bound.
+    Before that, the rims of objects get the depth that is known further inside.
 
     Args:
         capture: The capture, with masks and static points.
@@ -113,8 +118,8 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     Returns:
         The number of views that were changed.
     """
-    if weight > MAX_WEIGHT:
-        return 0
+    for index in range(len(views)):
+        views.change_depth(index, without_rims)
     cameras = [capture.cameras[name] for name in capture.train]
     depths = [
         _scaled_depth(view, alignment, camera)
@@ -136,6 +141,25 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
         views.set_depth_factor(index, alignments[index], torch.where(static, 1.0, torch.from_numpy(resized)))
     return len(found)
+
+
+def without_rims(inverse_depth: Float[Tensor, "H W"], static_mask: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Inverse depth in which the rims of dynamic objects have that of the nearest pixels further inside.
+
+    Objects that are rims only stay as they are, and so does what is further than two rims away from the inside of one.
+    """
+    width = RIM * max(static_mask.shape)
+    is_dynamic = cv2.copyMakeBorder((~static_mask).numpy().astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    is_deep = (cv2.distanceTransform(is_dynamic, cv2.DIST_L2, 5) > width)[1:-1, 1:-1]
+    inside = is_deep & inverse_depth.isfinite().numpy()
+    if not inside.any():
+        return inverse_depth
+    outside = np.where(inside, 0, 255).astype(np.uint8)
+    distance, labels = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    nearest = np.zeros(labels.max() + 1, np.int64)
+    nearest[labels[inside]] = np.flatnonzero(inside)
+    is_rim = ~static_mask & torch.from_numpy(~is_deep & (distance <= 2.0 * width))
+    return torch.where(is_rim, inverse_depth.flatten()[torch.from_numpy(nearest[labels])], inverse_depth)
 
 
 def _scaled_depth(view: View, alignment: Float[Tensor, "2"], camera: Camera) -> Float[np.ndarray, "h w"]:

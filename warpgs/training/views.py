@@ -159,7 +159,7 @@ class Views:
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
         """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
         (scale, offset), factor = alignment.cpu(), factor.half().cpu()
-        self._change_depth(index, lambda depth, static_mask: ((scale * depth + offset) * factor - offset) / scale)
+        self.change_depth(index, lambda depth, static_mask: ((scale * depth + offset) * factor - offset) / scale)
 
     def set_object_depth(self, index: int, alignment: Float[Tensor, "2"], depths: Float[Tensor, "h w"]) -> None:
         """Sets the aligned depth of a view's dynamic pixels whose depth is unknown.
@@ -176,10 +176,10 @@ class Views:
             found = resize_inverse(inverse, (depth.shape[1], depth.shape[0]))
             return torch.where(depth.isnan() & ~static_mask, torch.from_numpy(found), depth)
 
-        self._change_depth(index, change)
+        self.change_depth(index, change)
 
-    def _change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
-        """Replaces the inverse depth of a view by a function of it and of the mask."""
+    def change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
+        """Replaces the inverse depth of a view by a function of it and of its static mask, on the CPU."""
         if self.resident:
             depth, static_mask = (values[index].cpu() for values in (self._all.inverse_depth, self._all.static_mask))
             self._all.inverse_depth[index] = change(depth.float(), static_mask).half()
