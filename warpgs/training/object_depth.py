@@ -55,8 +55,8 @@ RIM = 0.008
 """Width of the rim of dynamic objects in which a network's depth is replaced, as a fraction of the image's longer side:
 it changes smoothly to that of what is behind them."""
 
-MAX_WEIGHT = 0.9
-"""Weight of a capture's depth from which on it stays as it is."""
+MIN_ERROR = 0.016
+"""Relative error of a capture's depth at the sparse points up to which it stays as it is."""
 
 Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
@@ -83,15 +83,16 @@ def fill_object_depth(
             infinite if not aligned.
 
     Returns:
-        The number of views that were changed.
+        The number of views in which objects were given a depth or moved.
     """
     if not (config.loss.object_depth and config.depth and capture.assumption == "masks"):
         return 0
     if is_depth_known(views, alignments):
         if capture.metric_depth:
             return 0
-        weight = 1.0 / (1.0 + (float(typical_error(errors)) / SIZE_ERROR) ** 2)
-        return _average_depths(capture, views, alignments, weight) if weight <= MAX_WEIGHT else 0
+        error = float(typical_error(errors))
+        weight = 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)
+        return _average_depths(capture, views, alignments, weight) if error > MIN_ERROR else 0
     count = 0
     for index, depth in object_depth(capture).items():
         if capture.frame(capture.train[index]).inverse_depth is None:
@@ -116,10 +117,12 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         weight: Weight of the views' depth; 1 / (1 + (error / SIZE_ERROR)²) if its relative error is known.
 
     Returns:
-        The number of views that were changed.
+        The number of views in which objects were moved.
     """
+    is_aligned = alignments.isfinite().all(1).tolist()
     for index in range(len(views)):
-        views.change_depth(index, without_rims)
+        if is_aligned[index]:
+            views.change_depth(index, without_rims)
     cameras = [capture.cameras[name] for name in capture.train]
     depths = [
         _scaled_depth(view, alignment, camera)
@@ -134,7 +137,6 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
         return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
 
-    is_aligned = alignments.isfinite().all(1).tolist()
     found = {index: factor for index, factor in _by_object(capture, factors).items() if is_aligned[index]}
     for index, factor in found.items():
         static = views[index].static_mask.cpu()
@@ -144,22 +146,29 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
 
 
 def without_rims(inverse_depth: Float[Tensor, "H W"], static_mask: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Inverse depth in which the rims of dynamic objects have that of the nearest pixels further inside.
+    """Replaces the depth in the rims of dynamic objects by that of the nearest pixel inside of the same object.
 
-    Objects that are rims only stay as they are, and so does what is further than two rims away from the inside of one.
+    A rim is ``RIM`` wide. What is more than two rims away from the inside of its object stays, such as thin parts.
+
+    Args:
+        inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown; on the CPU.
+        static_mask: [H, W] true where the scene is static.
+
+    Returns:
+        [H, W] inverse depth, changed at dynamic pixels only.
     """
-    width = RIM * max(static_mask.shape)
-    is_dynamic = cv2.copyMakeBorder((~static_mask).numpy().astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-    is_deep = (cv2.distanceTransform(is_dynamic, cv2.DIST_L2, 5) > width)[1:-1, 1:-1]
-    inside = is_deep & inverse_depth.isfinite().numpy()
+    width, is_dynamic = RIM * max(static_mask.shape), (~static_mask).numpy().astype(np.uint8)
+    is_rim = (is_dynamic > 0) & (cv2.distanceTransform(is_dynamic, cv2.DIST_L2, 5) <= width)
+    inside = (is_dynamic > 0) & ~is_rim & inverse_depth.isfinite().numpy()
     if not inside.any():
         return inverse_depth
     outside = np.where(inside, 0, 255).astype(np.uint8)
     distance, labels = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    nearest = np.zeros(labels.max() + 1, np.int64)
-    nearest[labels[inside]] = np.flatnonzero(inside)
-    is_rim = ~static_mask & torch.from_numpy(~is_deep & (distance <= 2.0 * width))
-    return torch.where(is_rim, inverse_depth.flatten()[torch.from_numpy(nearest[labels])], inverse_depth)
+    pixel_of = np.zeros(labels.max() + 1, np.int64)
+    pixel_of[labels[inside]] = np.flatnonzero(inside)
+    nearest, (_, item) = pixel_of[labels], cv2.connectedComponents(is_dynamic)
+    is_rim &= (distance <= 2.0 * width) & (item.flat[nearest] == item)
+    return torch.where(torch.from_numpy(is_rim), inverse_depth.flatten()[torch.from_numpy(nearest)], inverse_depth)
 
 
 def _scaled_depth(view: View, alignment: Float[Tensor, "2"], camera: Camera) -> Float[np.ndarray, "h w"]:
