@@ -1,10 +1,10 @@
-"""Masks: their connected regions, and their perturbation for training (paper, robustness)."""
+"""Masks: their regions, what is nearest to them, and their perturbation for training (paper, robustness)."""
 
 import hashlib
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int
 
 from warpgs.config import MaskPerturbation
 
@@ -19,6 +19,16 @@ def connected_regions(mask: Bool[np.ndarray, "H W"], min_area: int) -> list[Bool
     """The connected regions of a mask that have at least ``min_area`` pixels; diagonal neighbours are not connected."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     return [labels == k for k in range(1, len(stats)) if stats[k, cv2.CC_STAT_AREA] >= min_area]
+
+
+def nearest_pixels(mask: Bool[np.ndarray, "H W"]) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """For each pixel the flat index of the nearest true pixel of a mask that is not empty, and its distance [px]."""
+    distance, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    pixel_of = np.zeros(labels.max() + 1, np.int64)
+    pixel_of[labels[mask]] = np.flatnonzero(mask)
+    return pixel_of[labels], distance
 
 
 def check_perturbation(perturbation: MaskPerturbation) -> None:

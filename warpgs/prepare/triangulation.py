@@ -14,9 +14,10 @@ weighted by 1 / |error|, so that the majority of the frames decides. The residua
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+
+from warpgs.data.masks import nearest_pixels
 
 NUM_REWEIGHTINGS = 5
 """Rounds of reweighting; more do not change the masks."""
@@ -119,9 +120,5 @@ def fill_unknown(values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
         return np.zeros_like(values)
     if not unknown.any():
         return values
-    _, nearest = cv2.distanceTransformWithLabels(
-        unknown.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    of_label = np.zeros(nearest.max() + 1, values.dtype)
-    of_label[nearest[~unknown]] = values[~unknown]
-    return of_label[nearest]
+    nearest, _ = nearest_pixels(~unknown)
+    return values.ravel()[nearest]

@@ -25,6 +25,7 @@ from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import metric_depth, typical_error
+from warpgs.data.masks import nearest_pixels
 
 from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_objects, scaled_size
@@ -119,10 +120,9 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     Returns:
         The number of views in which objects were moved.
     """
-    is_aligned = alignments.isfinite().all(1).tolist()
-    for index in range(len(views)):
-        if is_aligned[index]:
-            views.change_depth(index, without_rims)
+    aligned = set(alignments.isfinite().all(1).nonzero()[:, 0].tolist())
+    for index in aligned:
+        views.change_depth(index, without_rims)
     cameras = [capture.cameras[name] for name in capture.train]
     depths = [
         _scaled_depth(view, alignment, camera)
@@ -137,7 +137,7 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
         return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
 
-    found = {index: factor for index, factor in _by_object(capture, factors).items() if is_aligned[index]}
+    found = {index: factor for index, factor in _by_object(capture, factors).items() if index in aligned}
     for index, factor in found.items():
         static = views[index].static_mask.cpu()
         resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -162,12 +162,8 @@ def without_rims(inverse_depth: Float[Tensor, "H W"], static_mask: Bool[Tensor, 
     inside = (is_dynamic > 0) & ~is_rim & inverse_depth.isfinite().numpy()
     if not inside.any():
         return inverse_depth
-    outside = np.where(inside, 0, 255).astype(np.uint8)
-    distance, labels = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    pixel_of = np.zeros(labels.max() + 1, np.int64)
-    pixel_of[labels[inside]] = np.flatnonzero(inside)
-    nearest, (_, item) = pixel_of[labels], cv2.connectedComponents(is_dynamic)
-    is_rim &= (distance <= 2.0 * width) & (item.flat[nearest] == item)
+    (nearest, distance), (_, item) = nearest_pixels(inside), cv2.connectedComponents(is_dynamic)
+    is_rim &= (distance <= 2.0 * width) & (item.ravel()[nearest] == item)
     return torch.where(torch.from_numpy(is_rim), inverse_depth.flatten()[torch.from_numpy(nearest)], inverse_depth)
 
 
