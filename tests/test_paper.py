@@ -103,6 +103,7 @@ PAPER = {
         "try_masks": False,
         "antialias": False,
         "densify.weakest": 0.0,
+        "densify.max_elongation": 0.0,
         "model.dropout": 0.0,
         "schedule.settle": 0,
         "loss.squared": 0.0,

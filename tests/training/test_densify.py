@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, remove, reset opacities."""
+"""Adaptive density control: clone, split, remove, reset opacities, shorten needles."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from tests.scenes import error, generator, relative_error
 from warpgs.config import DensifyConfig, ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, reset_opacities
+from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, reset_opacities, shorten_needles
 from warpgs.training.optimizer import make_optimizer
 
 EXTENT = 2.0
@@ -266,6 +266,56 @@ def test_a_reset_clears_the_moments_of_opacities_only():
         state = optimizer.state[getattr(gaussians, name)]
         for part in ("exp_avg", "exp_avg_sq"):
             assert state[part].any() == (name != "logit_opacities")
+
+
+def shortened(scales, max_elongation=10.0):
+    """Scales after shortening, in scene units; ``max_size`` is 1 there."""
+    gaussians = make_gaussians([SMALL] * len(scales))
+    gaussians.log_scales.data = torch.tensor(scales).log()
+    before = copies(gaussians)
+    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=max_elongation), EXTENT)
+    changed = [name for name, value in copies(gaussians).items() if not torch.equal(value, before[name])]
+    assert changed in ([], ["log_scales"])
+    return gaussians.scales.detach()
+
+
+def test_needles_are_shortened_to_a_multiple_of_their_second_longest_axis():
+    expected = torch.tensor([[0.2, 2.0, 0.1], [3.0, 0.3, 0.3], [1.5, 0.01, 15.0]])
+    assert relative_error(shortened([[0.2, 50.0, 0.1], [9.0, 0.3, 0.3], [1.5, 0.01, 15.1]]), expected) < 1e-6
+
+
+def test_needles_are_not_shortened_below_the_maximum_size():
+    expected = torch.tensor([[1.0, 0.001, 0.002], [0.9, 0.001, 0.002]])
+    assert relative_error(shortened([[50.0, 0.001, 0.002], [0.9, 0.001, 0.002]]), expected) < 1e-6
+
+
+@pytest.mark.parametrize("max_elongation", [1.0, 0.5])
+def test_flat_gaussians_and_balls_keep_their_shape_at_any_limit(max_elongation):
+    scales = [[30.0, 0.001, 30.0], [5.0, 5.0, 5.0]]
+    assert relative_error(shortened(scales, max_elongation), torch.tensor(scales)) < 1e-6
+
+
+def test_shortening_no_gaussians_gives_none():
+    gaussians = Gaussians.empty(0)
+    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=10.0), EXTENT)
+    assert len(gaussians) == 0
+
+
+@pytest.mark.parametrize("static_geometry", [True, False])
+def test_training_with_a_limit_ends_without_static_needles(tmp_path, static_geometry):
+    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, max_size=1e-6)
+    schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
+    config = dataclasses.replace(tiny.CONFIG, static_geometry=static_geometry, schedule=schedule)
+    elongations = []
+    for densify_config in (config.densify, limit):
+        folder = tmp_path / str(densify_config.max_elongation)
+        trainer = tiny.trainer(tiny.write(folder), folder / "run", dataclasses.replace(config, densify=densify_config))
+        with tiny.in_haste():
+            tiny.train(trainer)
+        axes = trainer.scene.static.scales.detach().sort(1).values
+        elongations.append((axes[:, 2] / axes[:, 1]).max())
+    assert elongations[0] > 1.1
+    assert elongations[1] <= 1.05 * (1 + 1e-5)
 
 
 @pytest.mark.parametrize(("min_pixels", "most"), [(0, 120), (8, 120), (46, 100), (60, 76), (500, 70)])

@@ -337,6 +337,12 @@ def test_the_weakest_are_pruned_once_densification_has_ended():
     assert iterations_where("prune_weakest") == []
 
 
+def test_needles_are_shortened_at_intervals_and_at_the_end():
+    limit = DensifyConfig(every=50, max_elongation=10.0)
+    assert iterations_where("shorten", densify=limit) == [STAGE1 - 1, *after(50, 100, 150), END - 1]
+    assert iterations_where("shorten") == []
+
+
 def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_network_has_warmed_up():
     reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
     assert iterations_where("reseed", densify=reseed, schedule=often) == after(50)

@@ -22,6 +22,9 @@ class DensifyConfig:
     """Opacity below which a Gaussian is removed."""
     max_size: float = 0.1
     """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
+    max_elongation: float = 0.0
+    """After every ``every`` iterations and at the end, static Gaussians above ``max_size`` are shortened to this many
+    times their second longest axis, or to ``max_size``. 0: never."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
     min_pixels: int = 0

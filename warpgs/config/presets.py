@@ -63,7 +63,7 @@ BEST = TrainConfig(
         branches_in_stage2="given-masks",
     ),
     optim=OptimConfig(means=1.7e-3, poses=1e-4),
-    densify=DensifyConfig(gradient=3e-4, min_pixels=8, weakest=0.01, reseed=0.05),
+    densify=DensifyConfig(gradient=3e-4, max_elongation=10.0, min_pixels=8, weakest=0.01, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,

@@ -1,5 +1,6 @@
-"""Adaptive density control: clone, split, remove, reset opacities (3DGS, section 5)."""
+"""Adaptive density control: clone, split, remove, reset opacities (3DGS, section 5), and shorten needles."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -121,6 +122,23 @@ def _scatter_children(gaussians: Gaussians, first: int, generator: torch.Generat
     rotated = noise + 2.0 * torch.linalg.cross(axis, torch.linalg.cross(axis, noise) + w * noise)
     gaussians.means[first:] += rotated
     gaussians.log_scales[first:] = (scales / SPLIT_SHRINK).log()
+
+
+@torch.no_grad()
+def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) -> None:
+    """Shortens the longest axis of large Gaussians to at most ``config.max_elongation`` times the second longest.
+
+    Needles that end where the training views do streak in views beyond (docs/design/needles.md). Flat Gaussians stay:
+    surfaces need them.
+
+    Args:
+        gaussians: Changed in place.
+        config: ``max_elongation``, and ``max_size``, up to which a Gaussian may have any shape.
+        extent: Extent of the capture [scene units].
+    """
+    second = gaussians.log_scales.median(1, keepdim=True).values
+    longest = (second + math.log(max(config.max_elongation, 1.0))).clamp_min(math.log(config.max_size * extent))
+    gaussians.log_scales.clamp_(max=longest)
 
 
 @torch.no_grad()

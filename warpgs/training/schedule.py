@@ -70,9 +70,9 @@ class IterationPlan:
         warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, prune_weakest, reseed, realign: What to do after the iteration: densify, reset opacities,
-            prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where none shows
-            what moves, align depth again.
+        densify, reset, prune, prune_weakest, reseed, realign, shorten: What to do after the iteration: densify, reset
+            opacities, prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where
+            none shows what moves, align depth again, shorten needles.
         remove_large: Whether densification removes oversized Gaussians.
     """
 
@@ -90,6 +90,7 @@ class IterationPlan:
     prune_weakest: bool
     reseed: bool
     realign: bool
+    shorten: bool
     remove_large: bool
 
     @property
@@ -100,7 +101,7 @@ class IterationPlan:
     @property
     def adapts(self) -> bool:
         """Whether anything is done after the iteration."""
-        return self.replaces_gaussians or self.reset or self.realign
+        return self.replaces_gaussians or self.reset or self.realign or self.shorten
 
 
 def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
@@ -200,6 +201,8 @@ class Protocol:
             and schedule.densify_until <= done <= 2 * schedule.densify_until,
             reseed=self.config.densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
             realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
+            shorten=self.config.densify.max_elongation > 0.0
+            and (done % self.config.densify.every == 0 or iteration + 1 == self.num_iterations),
             remove_large=done > schedule.reset_every,
         )
 

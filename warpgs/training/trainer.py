@@ -19,7 +19,7 @@ from warpgs.runs.trained import TrainedScene
 from . import initialize, ranks
 from . import optimizer as optim
 from .callbacks import Callback, Progress
-from .densify import DensifyLimits, densify, reset_opacities
+from .densify import DensifyLimits, densify, reset_opacities, shorten_needles
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
@@ -188,6 +188,8 @@ class Trainer:
             weights = blend_weights(scene, self.views, plan.phase, settings)
             number = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
             logger.log(f"iteration {self.iteration + 1}: {number:,} Gaussians pruned that contribute least")
+        if plan.shorten:
+            shorten_needles(scene.static, self.config.densify, self.capture.extent)
         if plan.reset:
             for gaussians in (scene.static, scene.dynamic):
                 reset_opacities(gaussians, self.step.optimizer)
