@@ -368,6 +368,19 @@ def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
         warpgs.train(given)
 
 
+def test_a_damaged_evaluation_frame_leaves_a_trained_run_and_says_how_to_evaluate_it(config, tmp_path):
+    data, lines = shutil.copytree(config.data, tmp_path / "damaged"), []
+    name = json.loads((data / "dataset.json").read_text())["val_ids"][0]
+    frame = data / f"rgb/1x/{name}.png"
+    whole = frame.read_bytes()
+    frame.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=f"{frame} is truncated"):
+        warpgs.train(dataclasses.replace(config, data=data), log=lines.append)
+    assert lines[-1].endswith(f"evaluation failed; when what follows is solved, run it with warpgs eval {config.out}")
+    frame.write_bytes(whole)
+    assert evaluate_run.evaluate_run(config.out, quiet=True)
+
+
 def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
     warpgs.train(dataclasses.replace(config, as_taken=True))
     taken, evaluate = [], evaluate_run.evaluate

@@ -42,7 +42,7 @@ class TrainConfig:
     """Run folder to continue from its newest checkpoint; a larger --iterations extends it."""
     preset: Literal["paper", "best", "patient", "quick"] | None = None
     """Defaults of everything below: best (one GPU, minutes), paper (as published, 72k iterations; docs/method.md),
-    patient (two CPU cores, 20 minutes), quick (two CPU cores, minutes). On the command line the default is best for a
+    patient (two CPU cores, 10 minutes), quick (two CPU cores, minutes). On the command line the default is best for a
     capture and quick for the built-in scene; in Python it is none."""
     iterations: Annotated[int | None, Bounds(min=3)] = None
     """Total iterations; every schedule is rescaled to it."""

@@ -104,7 +104,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
 
 
 def _evaluate(trainer: Trainer, log: Log | None) -> None:
-    """Evaluates what was trained and logs the results; a KeyboardInterrupt says how to evaluate later."""
+    """Evaluates what was trained and logs the results; says how to evaluate later if it is interrupted or fails."""
     quiet, log, config = log is None, log or ignore, trainer.config
     weights = (config.lpips, config.lpips_net)  # config.json has others if they were given with --resume
     if trainer.views.poses is not None:
@@ -112,12 +112,16 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
     if capture.val:
         log(f"evaluating {len(capture.val)} views")  # without a terminal, there is no progress bar for minutes
+    lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
+    command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
+    later = f"run it with {shlex.join(command)}"
     try:
         log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
-        lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
-        command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
-        raise KeyboardInterrupt(f"training is done, evaluation stopped; run it with {shlex.join(command)}") from None
+        raise KeyboardInterrupt(f"training is done, evaluation stopped; {later}") from None
+    except (ValueError, OSError):
+        log(f"training is done and saved, evaluation failed; when what follows is solved, {later}")
+        raise
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 
 
@@ -225,7 +229,7 @@ def _cpu_advice(config: TrainConfig) -> str:
         open_capture(dataclasses.replace(config, factor=2), quiet=True)
     except ValueError:
         return "on a CPU, use --preset patient, or quick, which is faster"
-    return "on two CPU cores, --preset patient --factor 2 takes 10 to 20 minutes, and quick 3"
+    return "on two CPU cores, --preset patient --factor 2 takes about 10 minutes, and quick 2"
 
 
 def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trainer:
