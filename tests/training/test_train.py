@@ -12,6 +12,7 @@ import sys
 import time
 import types
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -374,11 +375,21 @@ def test_a_damaged_evaluation_frame_leaves_a_trained_run_and_says_how_to_evaluat
     frame = data / f"rgb/1x/{name}.png"
     whole = frame.read_bytes()
     frame.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=f"{frame} is truncated"):
+    with pytest.raises(ValueError, match=f"{frame} is truncated") as error:
         warpgs.train(dataclasses.replace(config, data=data), log=lines.append)
-    assert lines[-1].endswith(f"evaluation failed; when what follows is solved, run it with warpgs eval {config.out}")
+    assert lines[-1].endswith(f"failed ({error.value}); once that is solved, run it with warpgs eval {config.out}")
     frame.write_bytes(whole)
     assert evaluate_run.evaluate_run(config.out, quiet=True)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left"), torch.OutOfMemoryError("1 GB"), RuntimeError("a bug")])
+def test_an_evaluation_that_fails_says_how_to_evaluate(config, monkeypatch, error):
+    monkeypatch.setattr(script, "evaluate_run", Mock(side_effect=error))
+    lines = []
+    with pytest.raises(type(error)) as raised:
+        warpgs.train(config, log=lines.append)
+    assert raised.value is error
+    assert lines[-1].endswith(f"evaluation failed ({error}); once that is solved, run it with warpgs eval {config.out}")
 
 
 def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
