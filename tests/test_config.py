@@ -36,6 +36,7 @@ def test_presets_are_valid(name):
         ("densify.every", 0),
         ("densify.gradient", -1e-4),
         ("densify.weakest", 1.0),  # would leave no Gaussian
+        ("densify.max_size", 0.0),  # likewise
         ("model.depth", 0),
         ("model.width", -4),
         ("model.max_static_points", -1),

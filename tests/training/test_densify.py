@@ -1,7 +1,9 @@
 """Adaptive density control: clone, split, remove, reset opacities, shorten needles."""
 
+import copy
 import dataclasses
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -13,6 +15,7 @@ from warpgs.config import DensifyConfig, ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, reset_opacities, shorten_needles
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 
 EXTENT = 2.0
@@ -299,6 +302,21 @@ def test_shortening_no_gaussians_gives_none():
     gaussians = Gaussians.empty(0)
     shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=10.0), EXTENT)
     assert len(gaussians) == 0
+
+
+def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_alone(tmp_path):
+    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5)
+    trainer = tiny.trainer(
+        tiny.write(tmp_path), tmp_path / "run", dataclasses.replace(tiny.CONFIG, densify=densify_config)
+    )
+    needles, extent = make_gaussians([SMALL]), trainer.capture.extent
+    needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
+    trainer._set_scene(SplitScene(needles, copy.deepcopy(needles), NETWORK, torch.zeros(3), torch.ones(3)))
+    nothing = dict.fromkeys(("densify", "prune", "prune_weakest", "reseed", "reset", "realign"), False)
+    trainer._adapt(dataclasses.replace(trainer.protocol.at(0), shorten=True, **nothing), Mock(spec=TrainingLogger))
+    assert abs(extent - 1.0) > 0.1
+    assert trainer.scene.static.scales.max().item() == pytest.approx(0.5 * extent, rel=1e-5)
+    assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("static_geometry", [True, False])

@@ -20,11 +20,12 @@ class DensifyConfig:
     """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
     min_opacity: float = 0.005
     """Opacity below which a Gaussian is removed."""
-    max_size: float = 0.1
-    """Size above which a Gaussian is removed once opacities have been reset, as a fraction of the extent."""
+    max_size: Annotated[float, Bounds(positive=True)] = 0.1
+    """Size above which a Gaussian is removed once opacities have been reset, and above which ``max_elongation`` holds,
+    as a fraction of the extent."""
     max_elongation: float = 0.0
-    """After every ``every`` iterations and at the end, static Gaussians above ``max_size`` are shortened to this many
-    times their second longest axis, or to ``max_size``. 0: never."""
+    """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
+    their second longest, or to ``max_size`` if that is longer. 0: never."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
     min_pixels: int = 0

@@ -128,8 +128,8 @@ def _scatter_children(gaussians: Gaussians, first: int, generator: torch.Generat
 def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) -> None:
     """Shortens the longest axis of large Gaussians to at most ``config.max_elongation`` times the second longest.
 
-    Needles that end where the training views do streak in views beyond (docs/design/needles.md). Flat Gaussians stay:
-    surfaces need them.
+    Needles at the border of what the training views show are streaks in views of what lies beyond
+    (docs/design/needles.md). Flat Gaussians stay: surfaces need them.
 
     Args:
         gaussians: Changed in place.
