@@ -13,6 +13,7 @@ from warpgs.cameras import Camera
 from warpgs.config import LossConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
+from warpgs.training import object_depth as module
 from warpgs.training import objects
 from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth, without_rims
 from warpgs.training.objects import MIN_VISIBLE, find_objects
@@ -139,6 +140,59 @@ def test_the_area_measures_a_body_that_deforms():
 )
 def test_there_is_no_depth_where_nothing_tells_it(masks, points):
     assert object_depth(capture_of(masks, points)) == {}
+
+
+def two_walls(left: float, right: float) -> torch.Tensor:
+    """Points on a plane across the left half of the image, and on another one across the right half."""
+    points = wall(1.0)
+    return points * torch.where(points[:, :1] < 0.0, left, right)
+
+
+BESIDE = ellipse(40, 25, (15.0, 15.0))
+"""A ball that is whole."""
+
+
+def test_an_object_that_the_border_cuts_off_is_as_far_away_as_the_points_around_it():
+    cut = ellipse(120, 119, (20.0, 30.0))
+    found = object_depth(capture_of([BESIDE | cut] * NUM, two_walls(2.0, 1.5)))
+    assert sorted(found) == list(range(NUM))
+    for depth in found.values():
+        assert depth.numpy()[cut] == pytest.approx(np.full(cut.sum(), 1.5), rel=1e-3)
+        assert depth.numpy()[BESIDE] == pytest.approx(np.full(BESIDE.sum(), 2.0), rel=0.1)
+
+
+def test_the_depth_around_an_object_is_smoothed_over_time():
+    cut = [ellipse(20 + 4 * k, 119, (10.0, 30.0)) for k in range(NUM)]
+    found = object_depth(capture_of([BESIDE | mask for mask in cut], two_walls(2.0, 1.5)))
+    depths = np.array([found[k].numpy()[mask & ~BESIDE].mean() for k, mask in enumerate(cut)])
+    assert depths[[0, -1]] == pytest.approx([2.0, 1.5], rel=0.01)
+    assert 0.02 < -np.diff(depths).min() < 0.2  # without smoothing, it is 0.5
+
+
+def test_the_depth_around_an_object_is_that_of_the_frames_nearby_where_it_is_unknown():
+    """Nothing is seen around it in the first frames, which show it at the left border."""
+    cut = [ellipse(4 * k, 119, (10.0, 30.0)) for k in range(NUM)]
+    points = two_walls(2.0, 1.5)
+    points = points[points[:, 0] / points[:, 2] > -0.4]
+    found = object_depth(capture_of([BESIDE | mask for mask in cut], points))
+    assert found[0].numpy()[cut[0]] == pytest.approx(np.full(cut[0].sum(), 2.0), rel=0.01)
+
+
+@pytest.mark.parametrize("shown", [11, 12])
+def test_an_object_that_few_frames_show_has_no_depth(shown):
+    cut, beside = ellipse(120, 119, (20.0, 30.0)), [BESIDE] * NUM
+    masks = [mask | cut if k < shown else mask for k, mask in enumerate(beside)]
+    found = object_depth(capture_of(masks))
+    assert np.isfinite(found[0].numpy()[cut]).all() == (shown == 12)
+
+
+def test_depth_by_size_is_used_where_an_object_is_known_both_whole_and_cut_off(monkeypatch):
+    """As one that is told apart from others in one order of time only."""
+    mask = ball(1.0)
+    pixels = dict.fromkeys(range(NUM), np.flatnonzero(mask).astype(np.int32))
+    items = [objects.MovingObject(pixels, whole) for whole in ([], list(range(NUM)))]
+    monkeypatch.setattr(module, "find_objects", lambda capture, order: items)
+    assert np.ptp(object_depth(capture_of([mask] * NUM))[0].numpy()[mask]) > 0.05  # round, not flat
 
 
 def test_frames_without_masks_show_no_objects():

@@ -48,6 +48,9 @@ the factor. Both tolerate outliers."""
 MAX_POINTS = 10_000
 """Maximum number of static points that are projected into each frame."""
 
+SMOOTHING = 0.05
+"""Standard deviation of the time, of all in [0, 1], over which the depth around an object is smoothed."""
+
 SIZE_ERROR = 0.02
 """Relative error of a capture's depth at the sparse points at which it and depth by size have the same weight; chosen
 on two captures (docs/design/object-depth.md)."""
@@ -209,13 +212,14 @@ def _corrections(
 
 
 def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
-    """Depth of the objects in a capture's training frames that keep their size.
+    """Depth of the objects in a capture's training frames, if it has some that keep their size.
 
     Args:
         capture: The capture, with masks and static points.
 
     Returns:
-        By index of the frame, [h, w] depth in its scaled mask [scene units], that of round objects, NaN elsewhere.
+        By index of the frame, [h, w] depth in its scaled mask [scene units], NaN elsewhere: that of round objects, or,
+        of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
     return _by_object(capture, _depths)
 
@@ -225,7 +229,8 @@ def _by_object(
 ) -> dict[int, Float[Tensor, "h w"]]:
     """By index of the frame, [h, w] values of objects' pixels in its scaled mask, NaN elsewhere.
 
-    Objects that cannot be told apart, or that too few frames show whole, have no values.
+    Objects that cannot be told apart have no values, and those that too few frames show whole only where no other
+    values are, and where there are others at all.
 
     Args:
         capture: The capture, with masks and static points.
@@ -235,17 +240,23 @@ def _by_object(
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     points_of = cache(partial(_static_points, capture))
     images: dict[int, Tensor] = {}
-    for frames in (order, order[::-1]):  # by time first; backward, what parts later can be told apart before
-        for item in find_objects(capture, frames):
-            if item.is_mixture or len(item.whole) < MIN_FRAMES:
-                continue
-            seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
-            for index, found in values_of(item, seen, points_of).items():
-                size = scaled_size(capture.cameras[capture.train[index]])
-                values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
-                pixels = torch.from_numpy(item.pixels[index]).long()
-                values[pixels] = torch.where(values[pixels].isnan(), found, values[pixels])
+    # By time first; backward, what parts later can be told apart before.
+    objects = [item for frames in (order, order[::-1]) for item in find_objects(capture, frames) if not item.is_mixture]
+    for item in sorted(objects, key=_is_mostly_cut):
+        if _is_mostly_cut(item) and not images:
+            break  # without any depth, dynamic Gaussians start in front of the points around them
+        seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
+        for index, found in values_of(item, seen, points_of).items():
+            size = scaled_size(capture.cameras[capture.train[index]])
+            values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
+            pixels = torch.from_numpy(item.pixels[index]).long()
+            values[pixels] = torch.where(values[pixels].isnan(), found, values[pixels])
     return images
+
+
+def _is_mostly_cut(item: MovingObject) -> bool:
+    """Whether too few frames show an object whole for its size to be known."""
+    return len(item.whole) < MIN_FRAMES
 
 
 def _static_points(capture: Capture, index: int) -> Points:
@@ -264,9 +275,13 @@ def _depths(
 ) -> dict[int, Float[Tensor, " P"]]:
     """Depth of an object's pixels in each frame that shows it whole or beside another one; none if it cannot be told.
 
+    If it is hardly ever whole, its depth is that of the static points around it, in all frames that show it.
+
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
     """
+    if _is_mostly_cut(item):
+        return _depths_around(seen, points_of)
     choices = []
     for sizes, factor in _sizes(item, seen, points_of):
         if math.isnan(factor):
@@ -276,6 +291,22 @@ def _depths(
         choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
     _, depths = min(choices, key=lambda choice: choice[0])
     return {index: seen[index].surface(depth) for index, depth in depths.items()}
+
+
+def _depths_around(
+    seen: dict[int, "_ObjectView"], points_of: Callable[[int], Points]
+) -> dict[int, Float[Tensor, " P"]]:
+    """Depth of the static points around an object, smoothed over time, at its pixels by frame; none if unknown."""
+    bounds = {index: view.bound(points_of(index)) for index, view in seen.items()}
+    known = [index for index, bound in bounds.items() if math.isfinite(bound)]
+    if len(known) < MIN_FRAMES:
+        return {}
+    times, logs = np.array([seen[index].time for index in known]), np.log([bounds[index] for index in known])
+    found = {}
+    for index, view in seen.items():
+        weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
+        found[index] = torch.full((view.num_pixels,), math.exp(np.average(logs, weights=weights)))
+    return found
 
 
 class _Sizes(NamedTuple):
@@ -311,10 +342,13 @@ class _ObjectView:
 
     Attributes:
         is_cut: Whether it touches the image border.
+        num_pixels: Number of its pixels.
+        time: Time of the frame in [0, 1].
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
         self._camera = camera.resized(*scaled_size(camera))
+        self.num_pixels, self.time = len(pixels), camera.time
         width, height = self._camera.size
         rows, columns = np.divmod(pixels, width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
