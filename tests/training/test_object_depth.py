@@ -509,6 +509,17 @@ def test_objects_whose_size_is_unknown_keep_their_depth():
     assert found[:11] == pytest.approx((DEPTHS * SHIFTS)[:11], rel=2e-3)
 
 
+def test_objects_that_few_frames_show_apart_from_others_keep_their_depth(monkeypatch):
+    both = (MASKS, [BESIDE] * NUM)
+    pixels = [{k: np.flatnonzero(mask).astype(np.int32) for k, mask in enumerate(masks)} for masks in both]
+    items = [objects.MovingObject(pixels[0], list(range(11))), objects.MovingObject(pixels[1], list(range(NUM)))]
+    monkeypatch.setattr(module, "find_objects", lambda capture, order: items)
+    count, _, views = filled(misplaced([mask | BESIDE for mask in MASKS]), 0.15)
+    assert count == NUM
+    found = [float((1.0 / view.inverse_depth[mask]).mean()) for view, mask in zip(views, MASKS, strict=True)]
+    assert found == pytest.approx(DEPTHS * SHIFTS, rel=2e-3)
+
+
 def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
     capture = capture_of(MASKS)
     trainer = Trainer(CONFIG, capture, tmp_path)

@@ -135,6 +135,8 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     def factors(
         item: MovingObject, seen: dict[int, _ObjectView], points_of: Callable[[int], Points]
     ) -> dict[int, Float[Tensor, " P"]]:
+        if _is_mostly_cut(item):
+            return {}
         known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
