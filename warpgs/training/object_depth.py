@@ -127,10 +127,7 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     for index in aligned:
         views.change_depth(index, without_rims)
     cameras = [capture.cameras[name] for name in capture.train]
-    depths = [
-        _scaled_depth(view, alignment, camera)
-        for view, alignment, camera in zip(views, alignments, cameras, strict=True)
-    ]
+    depths = [_scaled_depth(*of) for of in zip(views, alignments, cameras, strict=True)]
 
     def factors(
         item: MovingObject, seen: dict[int, _ObjectView], points_of: Callable[[int], Points]
