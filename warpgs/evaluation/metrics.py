@@ -107,19 +107,6 @@ def _window(like: Float64[Tensor, "..."]) -> Float64[Tensor, " WINDOW"]:
     return weights / weights.sum()
 
 
-def flicker(
-    before: Float[Tensor, "H W 3"],
-    after: Float[Tensor, "H W 3"],
-    region: Bool[Tensor, "H W"],
-    truth_before: Float[Tensor, "H W 3"] | None = None,
-    truth_after: Float[Tensor, "H W 3"] | None = None,
-) -> float:
-    """Mean absolute change between two consecutive frames of a fixed camera within a region.
-
-    With the truth of both frames, only the change beyond the truth's counts: max(0, |Δ image| − |Δ truth|) per pixel
-    and channel. NaN if the region is empty.
-    """
-    change = (after - before).abs()
-    if truth_before is not None and truth_after is not None:
-        change = (change - (truth_after - truth_before).abs()).clamp_min(0.0)
-    return float(change.mean(-1)[region].mean())
+def flicker(before: Float[Tensor, "H W 3"], after: Float[Tensor, "H W 3"], region: Bool[Tensor, "H W"]) -> float:
+    """Mean absolute change between two consecutive frames of a fixed camera within a region; NaN if it is empty."""
+    return float((after - before).abs().mean(-1)[region].mean())
