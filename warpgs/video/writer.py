@@ -1,13 +1,12 @@
 """Videos in MP4, GIF and WebP, written frame by frame."""
 
-import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType, TracebackType
 from typing import Any
 
+import av
 import numpy as np
 from jaxtyping import UInt8
 
@@ -63,16 +62,14 @@ class Video:
             if self._file is None:
                 self._open(width, height)
             pixels = "rgb24" if image.shape[2] == 3 else "rgba"
-            frame = _ffmpeg().VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), pixels)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), pixels)
             if pixels == "rgb24":
                 frame = frame.reformat(format="rgba")
             frame.pts, frame.time_base = self._num_frames, 1 / self.rate
             self._num_frames += 1
             self._encode(frame)
 
-    def __exit__(
-        self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if self._file is None:
             return
         if error is None:
@@ -81,7 +78,7 @@ class Video:
                 self._file.mux(self._stream.encode(None))
                 self._file.close()
         else:
-            with suppress(_ffmpeg().FFmpegError):
+            with suppress(av.FFmpegError):
                 self._file.close()
             partial_path(self.path).unlink(missing_ok=True)
 
@@ -90,7 +87,7 @@ class Video:
             self._file.mux(self._stream.encode(converted))
 
     def _open(self, width: int, height: int) -> None:
-        av, encoding = _ffmpeg(), self.encoding
+        encoding = self.encoding
         if encoding.codec not in av.codecs_available:
             raise OSError(f"{self.path} cannot be written: the FFmpeg that PyAV was built with has no {encoding.codec}")
         if self.path.is_dir():
@@ -111,19 +108,5 @@ class Video:
         """Converts errors of FFmpeg to OSErrors that name the file."""
         try:
             yield
-        except _ffmpeg().FFmpegError as error:
+        except av.FFmpegError as error:
             raise OSError(f"{self.path} could not be written: {error.strerror}") from error
-
-
-def _ffmpeg() -> ModuleType:
-    """PyAV, which includes FFmpeg; imported on first use because the import takes a third of a second.
-
-    Raises:
-        OSError: If PyAV is not installed or cannot be loaded.
-    """
-    try:
-        return importlib.import_module("av")
-    except ModuleNotFoundError as error:
-        raise OSError("a video needs FFmpeg, which comes with PyAV: pip install av") from error
-    except ImportError as error:  # of its libraries, such as for lack of memory
-        raise OSError(f"FFmpeg could not be loaded: {error}") from error
