@@ -87,22 +87,16 @@ def train(arguments: Sequence[str], prog: str) -> int:
     if "--version" in arguments:
         return main(["--version"])
     with ending_at_once(prog):
-        from .command_line.parsing import described, one_line_errors
+        from .command_line.parsing import described
         from .training import command as training
 
         config = COMMANDS["train"].load()
     help_all = "--help-all" in arguments
     if not help_all and not {"-h", "--help"} & set(arguments):
-
-        def start() -> int:
-            with one_line_errors(config, arguments, prog):
-                values = training.parse(arguments, prog)
-            return training.run(values)
-
-        return run_command(start, prog, training.ADVICE)
+        return training.main(arguments, prog)
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     try:
-        with one_line_errors(config, arguments, prog), described(config, None if help_all else TRAIN_OPTIONS):
+        with described(config, None if help_all else TRAIN_OPTIONS):
             return training.main(arguments, prog)
     finally:
         if not help_all:

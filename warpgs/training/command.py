@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from warpgs.command_line.parsing import one_line_errors
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.errors import ending_at_once, run_command
@@ -52,13 +53,19 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     return config
 
 
-def main(arguments: Sequence[str] | None = None, prog: str = "train.py") -> int:
+def main(arguments: Sequence[str], prog: str = "train.py") -> int:
     """Trains, then evaluates; returns the exit code.
 
     Ctrl-C and SIGTERM save a checkpoint and end with 130. Errors that the user can fix end with one line and 2,
     captures on which training would be useless with one line per error and 1.
     """
-    return run_command(lambda: run(parse(sys.argv[1:] if arguments is None else arguments, prog)), prog, ADVICE)
+
+    def start() -> int:
+        with one_line_errors(TrainConfig, arguments, prog):
+            config = parse(arguments, prog)
+        return run(config)
+
+    return run_command(start, prog, ADVICE)
 
 
 def run(config: TrainConfig) -> int:
