@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.data.camera_files import is_rotation
 from warpgs.data.capture import Capture
 from warpgs.files import read_json, write_json
 
@@ -31,9 +32,6 @@ from . import camera_paths
 
 POSES = ("view", "position", "viewmat")
 KEYS = {*POSES, "target", "K", "width", "height", "time", "focal", "at"}
-MAX_DEVIATION = 1e-3
-"""Maximum deviation of a rotation times its transpose from the identity."""
-
 MAX_BYTES = 1 << 20
 """Maximum size of a file of keyframes."""
 
@@ -171,9 +169,7 @@ def _posed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Ca
 def _from_matrices(name: str, value: dict[str, Any], first: Camera) -> Camera:
     """A camera as the viewer saves it; without intrinsics, those of the capture's first camera."""
     viewmat = _matrix(f"{name}: viewmat", value["viewmat"], 4)
-    R = viewmat[:3, :3]
-    deviation = float((R @ R.T - torch.eye(3)).abs().max())
-    if deviation > MAX_DEVIATION or float(torch.linalg.det(R)) < 0 or viewmat[3].tolist() != [0, 0, 0, 1]:
+    if not is_rotation(viewmat[:3, :3].numpy()) or viewmat[3].tolist() != [0, 0, 0, 1]:
         raise ValueError(f"{name}: viewmat must be a rotation and a translation from world to camera")
     if not {"K", "width", "height"} & value.keys():
         return Camera(viewmat, first.K, first.width, first.height)
