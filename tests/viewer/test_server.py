@@ -254,5 +254,5 @@ def test_an_image_that_cannot_be_read_has_no_thumbnail(run, monkeypatch):
     def read(_):
         raise ValueError("damaged")
 
-    monkeypatch.setattr(training._capture, "frame", read)
+    monkeypatch.setattr(training.capture, "frame", read)
     assert training.thumbnail(0) is None

@@ -4,13 +4,14 @@ Masks named like the source's files belong to these. Masks named like a capture'
 capture, which are undistorted.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
 from warpgs.data.resized import read_resized_mask
+from warpgs.files import first_file
 
 from .frames import SourceFrame
 
@@ -24,19 +25,18 @@ def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[
     Raises:
         ValueError: If one is missing.
     """
-    as_source = [_file(folder, (Path(frame.source).stem, frame.source)) for frame in frames]
-    as_frames = [_file(folder, (frame.name,)) for frame in frames]
+
+    def find(*stems: str) -> Path | None:
+        return first_file(folder / (stem + suffix) for stem in stems for suffix in SUFFIXES)
+
+    as_source = [find(Path(frame.source).stem, frame.source) for frame in frames]
+    as_frames = [find(frame.name) for frame in frames]
     found = min(as_source, as_frames, key=lambda paths: paths.count(None))
     if None in found:
         frame = frames[found.index(None)]
         name = frame.name if found is as_frames else Path(frame.source).stem
         raise ValueError(f"{folder} has no mask for {frame.name} ({frame.source}): expected {name}.png")
     return [path for path in found if path is not None], found is as_frames
-
-
-def _file(folder: Path, stems: Iterable[str]) -> Path | None:
-    paths = (folder / (stem + suffix) for stem in stems for suffix in SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
 
 
 def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:

@@ -156,7 +156,10 @@ def unproject_pixels(
         return None
     fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num)
     points = capture.points.to(views.device)
-    known = partial(_metric_depth, alignments)
+
+    def known(index: int, view: View, mask: Tensor) -> Tensor:
+        return depth_alignment.metric_depth(view.inverse_depth, alignments[index])
+
     found = _unproject(views, mask_of, known, fraction, generator)
     depth_known = len(found[0]) >= MIN_KNOWN_FRACTION * fraction * num
     if not depth_known:
@@ -183,13 +186,6 @@ def _unproject(
         positions, colors = unproject(depth, mask, view.image, view.camera)
         parts.append((positions.cpu(), colors.cpu(), torch.full((len(positions),), index)))
     return tuple(torch.cat(values) for values in zip(*parts, strict=True))
-
-
-def _metric_depth(
-    alignments: Float[Tensor, "T 2"], index: int, view: View, mask: Bool[Tensor, "H W"]
-) -> Float[Tensor, "H W"]:
-    """Aligned depth of a view; NaN where unknown."""
-    return depth_alignment.metric_depth(view.inverse_depth, alignments[index])
 
 
 def _depth_before_points(

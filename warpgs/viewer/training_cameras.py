@@ -43,7 +43,7 @@ class TrainingCameras:
 
     def __init__(self, capture: Capture) -> None:
         names = sorted(capture.train, key=lambda name: (capture.cameras[name].time, name))
-        self._capture = capture
+        self.capture = capture
         self.views = []
         for name in names:
             camera = capture.cameras[name]
@@ -53,35 +53,31 @@ class TrainingCameras:
     @property
     def up(self) -> np.ndarray:
         """Mean upward direction of the cameras; a capture has no other."""
-        return upward(self._capture).numpy()
+        return upward(self.capture).numpy()
 
     @property
     def frustum_scale(self) -> float:
         """Size of the cameras in the scene [scene units]."""
-        return FRUSTUM_SCALE * self._capture.extent
+        return FRUSTUM_SCALE * self.capture.extent
 
     def target(self, index: int) -> np.ndarray:
         """The point straight ahead of a view, at the median depth of the points of the capture that it sees."""
-        camera = self._capture.cameras[self.views[index].name]
-        return (camera.position + focus(camera, self._capture.points) * camera.viewmat[2, :3]).double().numpy()
+        camera = self.capture.cameras[self.views[index].name]
+        return (camera.position + focus(camera, self.capture.points) * camera.viewmat[2, :3]).double().numpy()
 
     def camera(self, index: int) -> Camera:
         """The camera of a view."""
-        return self._capture.cameras[self.views[index].name]
+        return self.capture.cameras[self.views[index].name]
 
     @property
     def times(self) -> list[float]:
         """All times of the views, in order."""
         return sorted({view.time for view in self.views})
 
-    @property
-    def capture(self) -> Capture:
-        return self._capture
-
     def image(self, index: int) -> UInt8[np.ndarray, "H W 3"] | None:
         """The image of a view; None if it cannot be read."""
         try:
-            return self._capture.frame(self.views[index].name).image.numpy()
+            return self.capture.frame(self.views[index].name).image.numpy()
         except (ValueError, OSError):
             return None
 

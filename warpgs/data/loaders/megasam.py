@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from warpgs.data.capture import Capture
 from warpgs.data.images import MAX_SIDE
@@ -60,7 +60,7 @@ class MegaSamLoader:
                 poses[k],
                 float(k),
                 partial(_image, images[k]),
-                inverse_depth=partial(_inverse_depth, depths[k]),
+                inverse_depth=partial(inverse_of, depths[k]),
             )
             for k in range(count)
         ]
@@ -82,7 +82,3 @@ def _file(root: Path) -> Path:
 
 def _image(image: UInt8[np.ndarray, "h w 3"], size: Size) -> UInt8[np.ndarray, "H W 3"]:
     return resize(np.ascontiguousarray(image), size)
-
-
-def _inverse_depth(depth: Float[np.ndarray, "h w"], size: Size) -> Float[np.ndarray, "H W"]:
-    return inverse_of(depth, size)

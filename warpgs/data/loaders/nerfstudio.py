@@ -61,9 +61,10 @@ class NerfstudioLoader:
                     None if depth is None else partial(read_metric_depth, depth, unit=unit),
                 )
             )
-        val = _evaluated(transforms, {image.resolve(): name for image, name in zip(images, names, strict=True)})
-        kept = [frame for frame in frames if frame.name not in val.ignored]
-        return posed_capture(root, kept, val.names, _world(transforms, kept, options.undistort), options)
+        by_image = {image.resolve(): name for image, name in zip(images, names, strict=True)}
+        val, ignored = _evaluated(transforms, by_image)
+        kept = [frame for frame in frames if frame.name not in ignored]
+        return posed_capture(root, kept, val, _world(transforms, kept, options.undistort), options)
 
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:
@@ -82,18 +83,14 @@ def _depth_unit(transforms: Transforms) -> float:
     return unit
 
 
-class _Split:
-    """Names of the frames to evaluate on, and of those that a given split does not contain."""
+def _evaluated(transforms: Transforms, names: dict[Path, str]) -> tuple[set[str], set[str]]:
+    """Names of the frames to evaluate on, and of those to ignore.
 
-    def __init__(self, names: Sequence[str], ignored: Sequence[str] = ()) -> None:
-        self.names, self.ignored = frozenset(names), frozenset(ignored)
-
-
-def _evaluated(transforms: Transforms, names: dict[Path, str]) -> _Split:
-    """The split of train_filenames, val_filenames and test_filenames; every eighth frame without them."""
+    They are the split of train_filenames, val_filenames and test_filenames; every eighth frame without them.
+    """
     lists = {key: transforms.fields.get(f"{key}_filenames") for key in ("train", "val", "test")}
     if all(given is None for given in lists.values()):
-        return _Split(every_eighth([*names.values()]))
+        return set(every_eighth([*names.values()])), set()
     chosen: dict[str, set[str]] = {}
     for key, given in lists.items():
         entries = [{f"{key}_filenames": entry} for entry in given] if isinstance(given, list) else []
@@ -107,7 +104,7 @@ def _evaluated(transforms: Transforms, names: dict[Path, str]) -> _Split:
     held_out = chosen["val"] | chosen["test"]
     if both := held_out & chosen["train"]:
         raise ValueError(f"{transforms.path}: frame {min(both)} is listed for both training and evaluation")
-    return _Split([*held_out], [*({*names.values()} - held_out - chosen["train"])])
+    return held_out, {*names.values()} - held_out - chosen["train"]
 
 
 def _world(transforms: Transforms, frames: Sequence[PosedFrame], undistort: bool) -> World:

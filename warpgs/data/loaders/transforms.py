@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from warpgs.data.images import image_size
 from warpgs.data.lens import Lens
-from warpgs.files import read_json, read_numbers
+from warpgs.files import first_file, read_json, read_numbers
 
 from .posed import opencv_from_opengl, world_to_camera
 
@@ -70,8 +70,7 @@ class Transforms:
             return None
         if not isinstance(given, str) or not given or "\0" in given:
             raise ValueError(f"{self.path}: {key} must name a file, got {given!r:.60}")
-        found = (self.path.parent / f"{given}{suffix}" for suffix in SUFFIXES)
-        path = next((path for path in found if path.is_file()), None)
+        path = first_file(self.path.parent / f"{given}{suffix}" for suffix in SUFFIXES)
         if path is None:
             raise ValueError(f"{self.path.parent / given} is missing: {self.path.name} lists it as {key}")
         return path
