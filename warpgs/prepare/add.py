@@ -142,7 +142,7 @@ class _Job:
         """Writes masks of the ``missing`` ones of some frames, as all of these together show them."""
         method = MASKERS[self.options.masks]
         assert method is not None
-        folder = find_weights(method.network, self.options.weights) if method.network is not None else None
+        folder = find_weights(method.network, self.options.weights)
         frames = self._posed(names, WORKING_SIDE)
         if {"depth", "points"} & set(self.options.parts):
             frames.halved.triangulated = {}
@@ -243,7 +243,7 @@ class _Job:
             return self.estimated[name]
         method = DEPTHS[name]
         assert method is not None
-        folder = find_weights(method.network, self.options.weights) if method.network is not None else None
+        folder = find_weights(method.network, self.options.weights)
         frames = self._posed(names, MAX_SIDE, max_factor=1.0)
         if name == "flow" and not are_apart(camera_centers(frames.poses)):
             raise ValueError(f"{self.root}: all cameras are at one place, where optical flow says nothing about depth")

@@ -28,10 +28,6 @@ MAX_HALF = 1e3
 """Maximum of the stored inverse depth, relative to its median: half floats end at 65504."""
 
 
-def _flow(frames: PosedFrames, dynamic: Iterable[Bool[np.ndarray, "H W"]], weights: Path | None, quiet: bool) -> Planes:
-    return static_depth(frames, list(dynamic), quiet)
-
-
 def _anything(
     frames: PosedFrames, dynamic: Iterable[Bool[np.ndarray, "H W"]], weights: Path | None, quiet: bool
 ) -> Planes:
@@ -42,7 +38,7 @@ def _anything(
 
 
 DEPTHS: dict[str, DepthMethod | None] = {
-    "flow": DepthMethod(_flow),
+    "flow": DepthMethod(lambda frames, dynamic, weights, quiet: static_depth(frames, list(dynamic), quiet)),
     "anything": DepthMethod(_anything, DEPTH_ANYTHING),
     "none": None,
 }
@@ -68,7 +64,7 @@ def add_depth(
         OSError: If a file cannot be written; the message names it.
     """
     frames = load_posed_frames(root / "rgb/1x", cameras.undistorted(), MAX_SIDE, max_factor=1.0)
-    folder = find_weights(method.network, weights) if method.network is not None else None
+    folder = find_weights(method.network, weights)
     dynamic = _dynamic_masks(root, cameras, (frames.lens.width, frames.lens.height))
     planes = method.estimate(frames, dynamic, folder, quiet)
     for name, plane in zip(cameras.names, planes, strict=True):

@@ -26,10 +26,6 @@ INDEX = "masks.json"
 """Index of the masks in their folder, with ``dynamic_fraction`` and ``undistorted``."""
 
 
-def _motion(frames: PosedFrames, weights: Path | None, quiet: bool) -> DynamicMasks:
-    return find_dynamic(frames, quiet)
-
-
 def _sam2(frames: PosedFrames, weights: Path | None, quiet: bool) -> DynamicMasks:
     from .sam2 import track  # imports torch
 
@@ -38,7 +34,7 @@ def _sam2(frames: PosedFrames, weights: Path | None, quiet: bool) -> DynamicMask
 
 
 MASKERS: dict[str, Masker | None] = {
-    "motion": Masker(_motion),
+    "motion": Masker(lambda frames, weights, quiet: find_dynamic(frames, quiet)),
     "sam2": Masker(_sam2, SAM2),
     "none": None,
 }
@@ -109,7 +105,7 @@ def find_masks(
         half_size: Whether to find it on images of half the usual size.
         quiet: Whether to show no progress.
     """
-    folder = find_weights(masker.network, weights) if masker.network is not None else None
+    folder = find_weights(masker.network, weights)
     side = WORKING_SIDE // 2 if half_size else WORKING_SIDE
     masks = masker.find(load_posed_frames(images, cameras, side), folder, quiet)
     size = cameras.lens.width, cameras.lens.height

@@ -46,8 +46,8 @@ DEPTH_ANYTHING = Network(
 )
 
 
-def find_weights(network: Network, folder: Path | None) -> Path:
-    """The folder with config.json and weights of a network.
+def find_weights(network: Network | None, folder: Path | None) -> Path | None:
+    """The folder with config.json and weights of a network; None without a network.
 
     Args:
         network: The network.
@@ -57,6 +57,8 @@ def find_weights(network: Network, folder: Path | None) -> Path:
         ImportError: If the transformers package is missing.
         ValueError: If the weights are not found, which the message says how to get, or a file is not a regular one.
     """
+    if network is None:
+        return None
     if find_spec("transformers") is None:
         raise ImportError(f"{network.option} needs the package transformers: {install_command('networks')}")
     folders = _cached(network) if folder is None else [folder, *sorted(p for p in folder.glob("*") if p.is_dir())]
