@@ -3,8 +3,9 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
-from types import ModuleType
 from typing import Any
+
+import av
 
 BT709, LIMITED_RANGE = 1, 1
 """FFmpeg's numbers (libavutil/pixfmt.h) of BT.709, the same for colour space, primaries and transfer, and of a range of
@@ -20,6 +21,9 @@ WEBP_QUALITY = 90
 Convert = Callable[[Any], Iterator[Any]]
 """Converts an RGBA frame, or None after the last one, to the frames that the encoder can take by then."""
 
+Converter = Callable[[tuple[int, int], Fraction], Convert]
+"""Makes the conversion of frames of a (width, height) and a frame rate."""
+
 
 @dataclass(frozen=True)
 class Encoding:
@@ -29,7 +33,7 @@ class Encoding:
         codec: FFmpeg's encoder.
         muxer: FFmpeg's container.
         pixels: Pixel format of the encoder.
-        converter: Makes the conversion of RGBA frames of a (width, height) and a frame rate.
+        converter: See ``Converter``.
         max_rate: Maximum number of frames per second.
         is_even: Whether width and height must be even.
         has_alpha: Whether pixels can be transparent.
@@ -41,7 +45,7 @@ class Encoding:
     codec: str
     muxer: str
     pixels: str
-    converter: Callable[[ModuleType, tuple[int, int], Fraction], Convert]
+    converter: Converter
     max_rate: float = 1000.0
     is_even: bool = False
     has_alpha: bool = True
@@ -50,25 +54,19 @@ class Encoding:
     muxer_options: dict[str, str] = field(default_factory=dict)
 
 
-def _to_bt709(av: ModuleType, size: tuple[int, int], rate: Fraction) -> Convert:
+def _to(**target: Any) -> Converter:
+    """Every frame by itself, in the format that PyAV's ``reformat`` is asked for."""
+
     def convert(frame: Any) -> Iterator[Any]:
         if frame is not None:
-            yield frame.reformat(format="yuv420p", dst_colorspace=BT709, dst_color_range=LIMITED_RANGE)
+            yield frame.reformat(**target)
 
-    return convert
-
-
-def _to_bgra(av: ModuleType, size: tuple[int, int], rate: Fraction) -> Convert:
-    def convert(frame: Any) -> Iterator[Any]:
-        if frame is not None:
-            yield frame.reformat(format="bgra")
-
-    return convert
+    return lambda size, rate: convert
 
 
-def _to_palette(av: ModuleType, size: tuple[int, int], rate: Fraction) -> Convert:
+def _to_palette(size: tuple[int, int], rate: Fraction) -> Convert:
     """256 colours per frame, chosen for this frame, with dithering."""
-    graph = av.filter.Graph()
+    graph: Any = av.filter.Graph()
     source = graph.add_buffer(width=size[0], height=size[1], format="rgba", time_base=1 / rate)
     split, sink = graph.add("split"), graph.add("buffersink")
     palette, use = graph.add("palettegen", "stats_mode=single"), graph.add("paletteuse", "new=1")
@@ -95,7 +93,7 @@ ENCODINGS = {
         "libx264",
         "mp4",
         "yuv420p",
-        _to_bt709,
+        _to(format="yuv420p", dst_colorspace=BT709, dst_color_range=LIMITED_RANGE),
         is_even=True,  # yuv420p has one colour per 2 × 2 pixels
         has_alpha=False,
         color={"color_range": LIMITED_RANGE, "colorspace": BT709, "color_primaries": BT709, "color_trc": BT709},
@@ -109,7 +107,7 @@ ENCODINGS = {
         "libwebp_anim",
         "webp",
         "bgra",
-        _to_bgra,
+        _to(format="bgra"),
         codec_options={"quality": str(WEBP_QUALITY)},
         muxer_options={"loop": "0"},
     ),

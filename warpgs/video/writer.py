@@ -93,7 +93,7 @@ class Video:
         if self.path.is_dir():
             raise OSError(f"{self.path} could not be written: Is a directory")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._convert = encoding.converter(av, (width, height), self.rate)
+        self._convert = encoding.converter((width, height), self.rate)
         partial = str(partial_path(self.path))
         # FFmpeg takes the options that it uses out of the dicts.
         self._file = av.open(partial, "w", format=encoding.muxer, options=dict(encoding.muxer_options))
