@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8, UInt32
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8, UInt32
 
 Range = tuple[float, float] | tuple[np.ndarray, np.ndarray] | np.ndarray
 """A minimum and a maximum, each of a shape that broadcasts with the values."""
@@ -50,10 +50,7 @@ def unpack(words: UInt32[np.ndarray, " N"], widths: tuple[int, ...]) -> UInt32[n
 
 def pack_rotations(quats: Float32[np.ndarray, "N 4"]) -> UInt32[np.ndarray, " N"]:
     """Packs unit quaternions into 32 bits: the index of the largest component, then the others in 10 bits each."""
-    largest = np.abs(quats).argmax(1)
-    rows = np.arange(len(quats))
-    positive = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = positive[_smaller(largest)].reshape(-1, 3)
+    largest, others = smallest_three(quats)
     integers = quantise(others, COMPONENT_RANGE, ROTATION_BITS)
     return pack(np.concatenate([largest[:, None].astype(np.uint32), integers], 1), (2, *[ROTATION_BITS] * 3))
 
@@ -67,6 +64,13 @@ def unpack_rotations(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, "N 
     quats[_smaller(largest)] = others.reshape(-1)
     quats[np.arange(len(words)), largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(1)))
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
+    """[N] index of the largest component of quaternions, and [N, 3] the others if that is made positive."""
+    largest = np.abs(quats).argmax(1)
+    positive = quats * np.where(quats[np.arange(len(quats)), largest] < 0, -1.0, 1.0)[:, None]
+    return largest, positive[_smaller(largest)].reshape(-1, 3)
 
 
 def _smaller(largest: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from warpgs.ops.sh import degree_of
 
 from .cloud import Cloud, sigmoid
 from .compressed import morton_order
+from .packing import smallest_three
 from .per_time import per_time
 
 TABLE = 256
@@ -91,9 +92,7 @@ def _geometry(cloud: Cloud) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     logs = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
     low, high = logs.min(0), logs.max(0)
     positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
-    largest = np.abs(cloud.quats).argmax(1)
-    quats = cloud.quats * np.where(cloud.quats[np.arange(len(cloud)), largest] < 0, -1, 1)[:, None]
-    others = quats[np.arange(4) != largest[:, None]].reshape(-1, 3).astype(np.float64)
+    largest, others = smallest_three(cloud.quats)
     components = np.rint(255 * np.clip(others / np.sqrt(2) + 0.5, 0, 1))
     images = {
         "means_l.webp": _square((positions & 255).astype(np.uint8)),
