@@ -30,6 +30,9 @@ from .runtime.tape import Gradients, Recorded, Tape, differentiable
 
 DEFAULTS = RenderSettings()
 
+MIN_ALPHA = 0.5
+"""A pixel has an inverse depth where it is at least this opaque."""
+
 
 class Layer(NamedTuple):
     """One image.
@@ -44,6 +47,13 @@ class Layer(NamedTuple):
     image: Float[Tensor, "H W C"]
     alpha: Float[Tensor, "H W"]
     depth: Float[Tensor, "H W"] | None
+
+    @property
+    def inverse_depth(self) -> Float[Tensor, "H W"]:
+        """[H, W] inverse depth; NaN where empty."""
+        assert self.depth is not None
+        visible = (self.alpha >= MIN_ALPHA) & (self.depth > 0)
+        return torch.where(visible, 1.0 / self.depth, torch.nan)
 
 
 @dataclass(frozen=True)

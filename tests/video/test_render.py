@@ -13,6 +13,7 @@ from PIL import Image
 
 from tests import tiny
 from tests.video.test_writer import frames_of
+from warpgs import rendering
 from warpgs.cli import main
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
@@ -203,7 +204,7 @@ def test_alpha_is_grey(run, capture, scene, tmp_path):
 
 def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):
     bounds, original = [], frames.depth_image
-    monkeypatch.setattr(frames, "MIN_ALPHA", 0.05)
+    monkeypatch.setattr(rendering, "MIN_ALPHA", 0.05)
     monkeypatch.setattr(frames, "depth_image", lambda *a, **k: bounds.append(k["bounds"]) or original(*a, **k))
     render(run, tmp_path, path="moving", layers="depth", frames=4)
     assert len(bounds) == 4

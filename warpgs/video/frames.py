@@ -20,9 +20,6 @@ from warpgs.visualize.images import to_bytes
 from . import camera_paths
 from .command import Render
 
-MIN_ALPHA = 0.5
-"""A pixel has a depth where it is at least this opaque."""
-
 NUM_SAMPLES = 8
 """Number of cameras that decide the range of depths of a path."""
 
@@ -98,10 +95,7 @@ def _depth_image(scene: TrainedScene, camera: Camera, depths: tuple[float, float
 def _inverse_depth(scene: TrainedScene, camera: Camera) -> Float[np.ndarray, "H W"]:
     """[H, W], NaN where empty."""
     settings = replace(scene.config.render_settings, depth=True)
-    layer = render(scene.splats(camera.time), camera, settings=settings).joint
-    assert layer.depth is not None
-    visible = (layer.alpha >= MIN_ALPHA) & (layer.depth > 0)
-    return torch.where(visible, 1.0 / layer.depth, torch.nan).cpu().numpy()
+    return render(scene.splats(camera.time), camera, settings=settings).joint.inverse_depth.cpu().numpy()
 
 
 def _averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:

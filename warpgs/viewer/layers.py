@@ -17,9 +17,6 @@ from warpgs.visualize.images import to_bytes
 
 Image = UInt8[np.ndarray, "H W 3"]
 
-MIN_ALPHA = 0.5
-"""A pixel has a depth where it is at least this opaque."""
-
 
 def joint(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """All Gaussians."""
@@ -38,10 +35,7 @@ def dynamic(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
 
 def depth(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """Inverse depth in colours: red is near, blue is far, black is empty."""
-    image = render(splats, camera, settings=replace(settings, depth=True)).joint
-    assert image.depth is not None
-    visible = (image.alpha >= MIN_ALPHA) & (image.depth > 0)
-    return depth_image(torch.where(visible, 1.0 / image.depth, torch.nan).cpu().numpy())
+    return depth_image(render(splats, camera, settings=replace(settings, depth=True)).joint.inverse_depth.cpu().numpy())
 
 
 def alpha(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
