@@ -23,12 +23,13 @@ from warpgs.video.camera_paths import evenly_spaced
 from .baking import PARTS, Baked, Branch, bake, texture_bytes
 from .cosines import Levels
 from .job import Job, Writer
+from .moving import KEYS, SECONDS
 from .packing import to_planes
 from .start_camera import StartView, start_view
 
 VERSION = 2
-KEYS, SECONDS, MAX_MEGABYTES = 30, 5.0, 256.0
-"""Defaults of the options."""
+MAX_MEGABYTES = 256.0
+"""Default of the option."""
 
 MAX_KEYS = 256
 """Maximum number of key times: texture layers that every browser with WebGL2 supports."""

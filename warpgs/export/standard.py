@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.data.ply import read_ply
-from warpgs.model.gaussians import MAX_SH_DEGREE
-from warpgs.ops.sh import num_bases
+from warpgs.ops.sh import MAX_DEGREE, num_bases
 
 from .cloud import Cloud
 from .ply import column, write_ply
 
-REST_COUNTS = tuple(num_bases(degree) - 1 for degree in range(MAX_SH_DEGREE + 1))
+REST_COUNTS = tuple(num_bases(degree) - 1 for degree in range(MAX_DEGREE + 1))
 """Number of coefficients per channel of degree 1 and higher, by degree."""
 
 

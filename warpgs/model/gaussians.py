@@ -5,9 +5,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from warpgs.ops.activation import Raw
-
-MAX_SH_DEGREE = 3
-"""Maximum degree of spherical harmonics that the kernels support."""
+from warpgs.ops.sh import MAX_DEGREE
 
 SH_C0 = 0.28209479177387814
 """Value of the spherical harmonic of degree 0: colour = 0.5 + SH_C0 · coefficient."""
@@ -51,7 +49,7 @@ class Gaussians(nn.Module):
         colors: Float[Tensor, "N 3"],
         scales: Float[Tensor, " N"],
         opacity: float,
-        sh_degree: int = MAX_SH_DEGREE,
+        sh_degree: int = MAX_DEGREE,
     ) -> "Gaussians":
         """Isotropic Gaussians at points, with standard deviations ``scales``, colours in [0, 1] and one opacity."""
         N = points.shape[0]
@@ -67,7 +65,7 @@ class Gaussians(nn.Module):
         )
 
     @staticmethod
-    def empty(num: int, sh_degree: int = MAX_SH_DEGREE) -> "Gaussians":
+    def empty(num: int, sh_degree: int = MAX_DEGREE) -> "Gaussians":
         """``num`` Gaussians with arbitrary values, to load a state into."""
         # Only calls that make new tensors: on torch's "meta" device others import torch's compiler, a second and 90 MB.
         rest = (sh_degree + 1) ** 2 - 1
