@@ -24,11 +24,11 @@ from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.files import read_json, write_json, write_png
+from warpgs.files import read_json, write_json
 
 from .cameras import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION
-from .contact_sheet import choose_evenly, colored_depth, contact_sheet, overlay_mask
+from .contact_sheet import choose_evenly, colored_depth, overlay_mask, write_contact_sheet
 from .depth import DEPTHS, MAX_SIDE, as_half
 from .images import resize_to_side
 from .masks import MASKERS, WORKING_SIDE
@@ -153,9 +153,8 @@ class _Job:
                 lens = self._lens(name)
                 dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
                 writer.write_mask(self.root, name, ~dynamic, self._factors())
-        shown = choose_evenly(len(names))
-        painted = [overlay_mask(frames.images[k], masks[k]) for k in shown]
-        write_png(self.root / "masks.png", contact_sheet(painted, [names[k] for k in shown]))
+        shown = {k: overlay_mask(frames.images[k], masks[k]) for k in choose_evenly(len(names))}
+        write_contact_sheet(self.root / "masks.png", shown, names)
         fraction = float(np.mean([mask.mean() for mask in masks]))
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 
@@ -213,9 +212,8 @@ class _Job:
                 lens = self._lens(name)
                 lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
                 writer.write_depth(self.root, name, as_half(_resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)))
-        shown = choose_evenly(len(names))
-        sheet = contact_sheet([colored_depth(planes[k]) for k in shown], [names[k] for k in shown])
-        write_png(self.root / "depth.png", sheet)
+        shown = {k: colored_depth(planes[k]) for k in choose_evenly(len(names))}
+        write_contact_sheet(self.root / "depth.png", shown, names)
         known = float(np.mean([np.isfinite(plane).mean() for plane in planes]))
         self._say(f"depth: {len(missing)} frames, known on {known:.0%} of the pixels: look at depth.png")
 

@@ -1,12 +1,14 @@
 """Contact sheets: thumbnails of many frames with their masks or depth."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.files import write_png
 from warpgs.visualize.depth import depth_image
 
 MAX_THUMBNAILS = 30
@@ -14,12 +16,16 @@ COLUMNS = 6
 THUMBNAIL_WIDTH = 256
 
 
-def contact_sheet(images: Sequence[UInt8[np.ndarray, "H W 3"]], captions: Sequence[str]) -> UInt8[np.ndarray, "A B 3"]:
-    """[A, B, 3] the images as captioned thumbnails, six in a row."""
-    thumbnails = [_thumbnail(image, caption) for image, caption in zip(images, captions, strict=True)]
+def write_contact_sheet(path: Path, images: Mapping[int, UInt8[np.ndarray, "H W 3"]], names: Sequence[str]) -> None:
+    """Writes images by index as thumbnails, captioned by the name of that index, six in a row.
+
+    Raises:
+        OSError: If the file cannot be written; the message names it.
+    """
+    thumbnails = [_thumbnail(image, names[k]) for k, image in images.items()]
     columns = min(COLUMNS, len(thumbnails))
     thumbnails += [np.zeros_like(thumbnails[0])] * (-len(thumbnails) % columns)
-    return np.vstack([np.hstack(thumbnails[k : k + columns]) for k in range(0, len(thumbnails), columns)])
+    write_png(path, np.vstack([np.hstack(thumbnails[k : k + columns]) for k in range(0, len(thumbnails), columns)]))
 
 
 def choose_evenly(count: int) -> list[int]:

@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float
 
 from warpgs.data.images import read_mask
 from warpgs.data.writer import write_depth
-from warpgs.files import write_png
 
 from .cameras import Cameras
-from .contact_sheet import choose_evenly, colored_depth, contact_sheet
+from .contact_sheet import choose_evenly, colored_depth, write_contact_sheet
 from .flow_depth import static_depth
 from .methods import DepthMethod, Planes
 from .posed_frames import PosedFrames, load_posed_frames
@@ -71,9 +70,8 @@ def add_depth(
         write_depth(root, name, as_half(plane))
     if not cameras.have_parallax:
         _place_points(root, cameras, planes)
-    chosen = choose_evenly(len(planes))
-    sheet = contact_sheet([colored_depth(planes[k]) for k in chosen], [cameras.names[k] for k in chosen])
-    write_png(root / "depth.png", sheet)
+    shown = {k: colored_depth(planes[k]) for k in choose_evenly(len(planes))}
+    write_contact_sheet(root / "depth.png", shown, cameras.names)
     known = [float(np.isfinite(plane).mean()) for plane in planes]
     unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
     notes = [f"depth is unknown everywhere in {', '.join(unknown)}"] if unknown else []

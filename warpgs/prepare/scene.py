@@ -11,10 +11,9 @@ from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
-from warpgs.files import write_png
 
 from .cameras import Cameras
-from .contact_sheet import choose_evenly, contact_sheet, overlay_mask
+from .contact_sheet import choose_evenly, overlay_mask, write_contact_sheet
 from .frames import Frames
 from .images import brighten, read_images
 from .masks import Masks
@@ -73,8 +72,8 @@ def write_capture(
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
     if fraction > DOUBTFUL_FRACTION:
         notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
-    painted = [overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)]
-    write_png(root / "masks.png", contact_sheet(painted, [cameras.names[k] for k in shown]))
+    painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
+    write_contact_sheet(root / "masks.png", painted, cameras.names)
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
 
 
