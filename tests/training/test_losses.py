@@ -11,7 +11,6 @@ from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, Tra
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import render
 from warpgs.training.loss_terms import TERMS
 from warpgs.training.losses import DepthTrust, LossTerm, dynamic_loss, image_loss, static_loss
@@ -169,60 +168,6 @@ def test_a_perfect_dynamic_image_over_another_background_has_a_loss():
     static_fraction = 1.0 - 8 * 7 / (HEIGHT * WIDTH)
     expected = static_fraction * PURPLE.double().mean()
     assert error(dynamic_loss(perfect, TRUTH, MASK, 0.0, PURPLE), expected) < 1e-6
-
-
-# Eq. 14 --------------------------------------------------------------------------------------------------------------
-
-DEPTH = 1.0 + IMAGE[..., 0]
-TARGET = 1.0 + TRUTH[..., 0]
-OPAQUE = torch.full((HEIGHT, WIDTH), 0.9)
-ALIGNMENT = torch.tensor([0.5, 0.1])
-
-
-def compared_depth(depth, alpha, target, region):
-    """The depth loss against a target, which is passed as inverse depth before alignment."""
-    scale, offset = ALIGNMENT.double()
-    inverse_depth = ((1.0 / target.double() - offset) / scale).float()
-    return depth_error(depth, alpha, inverse_depth, ALIGNMENT, region, torch.tensor(0.0))
-
-
-def test_the_depth_loss_is_that_of_equation_14():
-    expected = ((DEPTH.double() - TARGET.double()) * MASK).abs().sum() / (HEIGHT * WIDTH)
-    assert error(compared_depth(DEPTH, OPAQUE, TARGET, MASK), expected) < 1e-6
-
-
-def test_depth_is_unconstrained_outside_the_region():
-    assert not gradient(compared_depth, DEPTH, OPAQUE, TARGET, MASK)[~MASK].any()
-
-
-def test_gradients_of_depth_are_signs_of_its_error():
-    expected = (DEPTH.double() - TARGET.double()).sign() / (HEIGHT * WIDTH)
-    assert error(gradient(compared_depth, DEPTH, OPAQUE, TARGET, torch.ones_like(MASK)), expected) < 1e-9
-
-
-@pytest.mark.parametrize("unknown", [torch.nan, torch.inf])
-def test_pixels_of_unknown_depth_are_ignored(unknown):
-    target, known = TARGET.clone(), MASK.clone()
-    target[0] = unknown
-    known[0] = False
-    expected = compared_depth(DEPTH, OPAQUE, TARGET, known)
-    assert error(compared_depth(DEPTH, OPAQUE, target, MASK), expected) < 1e-7
-    v_depth = gradient(compared_depth, DEPTH, OPAQUE, target, MASK)
-    assert v_depth.isfinite().all()
-    assert not v_depth[0].any()
-
-
-def test_pixels_with_low_alpha_are_ignored():
-    alpha, opaque = OPAQUE.clone(), MASK.clone()
-    alpha[1] = 0.4
-    opaque[1] = False
-    assert error(compared_depth(DEPTH, alpha, TARGET, MASK), compared_depth(DEPTH, OPAQUE, TARGET, opaque)) < 1e-7
-
-
-def test_without_any_known_depth_the_loss_is_zero():
-    target = torch.full_like(TARGET, torch.nan)
-    assert compared_depth(DEPTH, OPAQUE, target, MASK) == 0
-    assert not gradient(compared_depth, DEPTH, OPAQUE, target, MASK).any()
 
 
 # Eq. 15: the terms of an iteration -----------------------------------------------------------------------------------
