@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from tests import tiny
@@ -385,17 +384,9 @@ def test_the_error_names_a_moved_capture_and_data_replaces_it(damaged, capture, 
     assert f"{len(capture.val)} images" in render(damaged, tmp_path, data=Path(data))
 
 
-MEMORY_ERRORS = [
-    torch.OutOfMemoryError("CUDA out of memory."),
-    MemoryError("no"),
-    RuntimeError("can't allocate memory:\n9"),
-]
-
-
-@pytest.mark.parametrize("error", MEMORY_ERRORS)
-def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypatch, capsys, error):
+def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypatch, capsys):
     def fail(_):
-        raise error
+        raise MemoryError("no")
 
     monkeypatch.setattr(render_run, "render_run", fail)
     assert main(["render", str(run)]) == 2
@@ -403,21 +394,3 @@ def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypat
     assert message.startswith("warpgs: out of memory (")
     assert "smaller images or fewer Gaussians" in message
     assert message.count("\n") == 1
-
-
-def test_any_other_error_is_raised(run, monkeypatch):
-    def fail(_):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(render_run, "render_run", fail)
-    with pytest.raises(RuntimeError, match="a bug"):
-        main(["render", str(run)])
-
-
-def test_ctrl_c_ends_a_command_with_one_line(run, monkeypatch, capsys):
-    def stop(_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(render_run, "render_run", stop)
-    assert main(["render", str(run)]) == 130
-    assert capsys.readouterr().err == "warpgs: stopped\n"
