@@ -344,48 +344,7 @@ def test_a_missing_data_folder_is_refused(run, tmp_path):
         export(run, tmp_path, data=tmp_path / "nowhere")
 
 
-def command(run, capsys, *options):
-    """Exit code and error output of the command."""
-    return main(["export", str(run), *options]), capsys.readouterr().err
-
-
-def test_a_folder_that_is_not_a_run_ends_the_command_with_one_line(tmp_path, capsys):
-    code, error = command(tmp_path, capsys)
-    assert code == 2
-    assert error == f"warpgs: {tmp_path} is not a run folder: it has no config.json\n"
-
-
-def test_a_run_without_a_checkpoint_ends_the_command_with_one_line(stranded, capsys):
-    for path in (stranded / "checkpoints").iterdir():
-        path.unlink()
-    code, error = command(stranded, capsys)
-    assert code == 2
-    assert error == f"warpgs: {stranded} has no checkpoint yet\n"
-
-
-def test_a_damaged_checkpoint_ends_the_command_with_one_line(stranded, capsys):
-    path = checkpoint.list_checkpoints(stranded)[-1]
-    path.write_bytes(path.read_bytes()[:1000])
-    code, error = command(stranded, capsys)
-    assert code == 2
-    assert error.startswith(f"warpgs: {path} is damaged")
-    assert error.count("\n") == 1
-
-
-def test_a_checkpoint_with_missing_metadata_ends_the_command_with_one_line(stranded, capsys):
-    path = checkpoint.list_checkpoints(stranded)[-1]
-    tiny.edit_metadata(path, lambda values: values.pop("relit"))
-    assert command(stranded, capsys) == (2, f"warpgs: {path} is damaged: it has no relit\n")
-
-
-def test_a_run_of_another_version_ends_the_command_with_one_line(stranded, capsys):
-    config = stranded / "config.json"
-    config.write_text(json.dumps({**json.loads(config.read_text()), "future": 1}))
-    assert command(stranded, capsys) == (2, f"warpgs: {config} has fields of another version: future\n")
-
-
 def test_a_folder_that_cannot_be_written_ends_the_command_with_one_line(run, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    code, error = command(run, capsys, "--out", str(tmp_path / "file"))
-    assert code == 2
-    assert "scene.ply could not be written" in error
+    assert main(["export", str(run), "--out", str(tmp_path / "file")]) == 2
+    assert "scene.ply could not be written" in capsys.readouterr().err

@@ -375,10 +375,6 @@ def test_a_run_given_twice_is_refused(capsys, run):
     assert "is given twice" in error_line(capsys, run, run)
 
 
-def test_a_folder_that_is_not_a_run_is_refused(capsys, tmp_path):
-    assert "is not a run folder" in error_line(capsys, tmp_path)
-
-
 @pytest.mark.parametrize("name", ["metrics.json", "views.csv"])
 def test_a_run_that_was_not_evaluated_is_refused_with_the_remedy(capsys, run, name):
     (run / name).unlink()
@@ -467,11 +463,6 @@ def test_damaged_views_are_refused_with_their_line(capsys, run, text, reason):
     error = error_line(capsys, run)
     assert "views.csv" in error
     assert reason in error
-
-
-def test_a_config_of_another_version_is_refused(capsys, run):
-    edit_json(run / "config.json", future=1)
-    assert "fields of another version: future" in error_line(capsys, run)
 
 
 def test_truncated_events_are_read_up_to_their_end(tmp_path, run):

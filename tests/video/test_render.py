@@ -14,7 +14,6 @@ from tests import tiny
 from tests.video.test_writer import frames_of
 from warpgs import rendering
 from warpgs.cli import main
-from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video import frames, render_run, writer
@@ -337,11 +336,6 @@ def test_without_an_encoder_the_error_suggests_png(run, tmp_path, monkeypatch):
     assert len(images_in(tmp_path)) == 3
 
 
-def test_a_folder_that_is_not_a_run_ends_the_command_with_one_line(tmp_path, capsys):
-    assert main(["render", str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"warpgs: {tmp_path} is not a run folder: it has no config.json\n"
-
-
 @pytest.fixture
 def damaged(run, tmp_path):
     """A copy of the run to damage."""
@@ -354,26 +348,6 @@ def error_line(capsys, run):
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     return message
-
-
-def test_a_run_without_a_checkpoint_ends_the_command_with_one_line(damaged, capsys):
-    shutil.rmtree(damaged / "checkpoints")
-    assert error_line(capsys, damaged) == f"warpgs: {damaged} has no checkpoint yet\n"
-
-
-def test_a_damaged_checkpoint_ends_the_command_with_one_line(damaged, capsys):
-    path = checkpoint.list_checkpoints(damaged)[-1]
-    path.write_bytes(path.read_bytes()[:1000])
-    assert f"warpgs: {path} is damaged" in error_line(capsys, damaged)
-
-
-@pytest.mark.parametrize(("change", "words"), [('"sead": 1, ', "fields of another version: sead"), ("[" * 100_000, "")])
-def test_an_unknown_or_damaged_config_ends_the_command_with_one_line(damaged, capsys, change, words):
-    text = (damaged / "config.json").read_text()
-    (damaged / "config.json").write_text("{" + change + text[1:])
-    message = error_line(capsys, damaged)
-    assert message.startswith(f"warpgs: {damaged / 'config.json'} ")
-    assert words in message
 
 
 def test_the_error_names_a_moved_capture_and_data_replaces_it(damaged, capture, tmp_path, capsys):

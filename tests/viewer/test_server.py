@@ -192,25 +192,6 @@ def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, 
     assert f"the viewer needs viser: {install_command('viewer')}" in error_line(capsys, run)
 
 
-def test_a_folder_that_is_not_a_run_is_refused_in_one_line(tmp_path, capsys):
-    assert f"{tmp_path} is not a run folder" in error_line(capsys, tmp_path, "--port", 0)
-
-
-def test_a_run_of_another_version_is_refused_in_one_line(run, tmp_path, capsys):
-    copy = shutil.copytree(run, tmp_path / "run")
-    text = (copy / "config.json").read_text()
-    (copy / "config.json").write_text(text.replace('"seed"', '"sead"'))
-    assert "config.json has fields of another version: sead" in error_line(capsys, copy, "--port", 0)
-
-
-def test_a_damaged_checkpoint_is_refused_in_one_line(run, tmp_path, capsys):
-    copy = shutil.copytree(run, tmp_path / "run")
-    next((copy / "checkpoints").iterdir()).write_bytes(b"nonsense")
-    for path in (copy / "checkpoints").iterdir():
-        path.write_bytes(b"nonsense")
-    assert "is damaged" in error_line(capsys, copy, "--port", 0)
-
-
 def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_path):
     copy = shutil.copytree(run, tmp_path / "run")
     text = (copy / "config.json").read_text()
