@@ -2,9 +2,13 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pytest
+
+from warpgs.data.loaders import load_capture
 
 SIZE = (40, 24)
 """(width, height) of the full-size images [px]."""
@@ -101,3 +105,16 @@ def write_capture(root: Path, dataset: str = "nerfds") -> Path:
     write_json(root / "scene.json", {"center": CENTER, "scale": SCALE, "near": 0.1, "far": 2.0})
     write_array(root / "points.npy", np.arange(30, dtype=np.float64).reshape(10, 3))
     return root
+
+
+def refused(root: Path, match: str, dataset: str | None = None, **options: Any) -> None:
+    """The capture is refused in one line, on opening or when its frames are read."""
+    with pytest.raises(ValueError, match=match) as caught:
+        _read_all(root, dataset, **options)
+    assert "\n" not in str(caught.value)
+
+
+def _read_all(root: Path, dataset: str | None, **options: Any) -> None:
+    capture = load_capture(root, dataset, **options)
+    for name in (*capture.train, *capture.val):
+        capture.frame(name)

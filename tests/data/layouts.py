@@ -273,6 +273,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "vipe": write_vipe,
     "megasam": write_megasam,
 }
+ALL = {**WRITERS, "colmap as text": write_text_colmap}
 
 
 def edit_transforms(path: Path, **changes: object) -> None:

@@ -12,37 +12,11 @@ import numpy as np
 import pytest
 
 from tests.data import layouts
-from tests.data.captures import edit_json, write_array, write_png
+from tests.data.captures import edit_json, refused, write_array, write_png
 from warpgs.data.exr import read_exr_channel
-from warpgs.data.loaders import load_capture
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
 from warpgs.data.video_frames import VideoFrames
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    root = tmp_path_factory.mktemp("layouts")
-    return {name: write(root / name) for name, write in layouts.WRITERS.items()}
-
-
-@pytest.fixture
-def edited(written, tmp_path):
-    """A function that copies a layout's folder, to be damaged."""
-    return lambda layout: shutil.copytree(written[layout], tmp_path / "copy")
-
-
-def refused(root: Path, match: str, dataset: str | None = None) -> None:
-    """The capture is refused in one line, on opening or when its frames are read."""
-    with pytest.raises(ValueError, match=match) as caught:
-        read_all(root, dataset)
-    assert "\n" not in str(caught.value)
-
-
-def read_all(root: Path, dataset: str | None = None) -> None:
-    capture = load_capture(root, dataset)
-    for name in (*capture.train, *capture.val):
-        capture.frame(name)
 
 
 def edit_matrix(path: Path, change) -> None:

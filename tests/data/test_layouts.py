@@ -20,23 +20,9 @@ from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import blender, load_capture, recognize
 from warpgs.data.loaders.posed import plain_names, times_of_names
 
-ALL = {**layouts.WRITERS, "colmap as text": layouts.write_text_colmap}
-LAYOUTS = pytest.mark.parametrize("layout", ALL)
+LAYOUTS = pytest.mark.parametrize("layout", layouts.ALL)
 INDEX = {name: k for k, name in enumerate(layouts.NAMES)}
 SOME_POINTS = layouts.POINTS[:8]
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The folder of each layout, which tests leave as it is."""
-    root = tmp_path_factory.mktemp("layouts")
-    return {name: write(root / name) for name, write in ALL.items()}
-
-
-@pytest.fixture
-def edited(written, tmp_path):
-    """A function that copies a layout's folder, to be changed."""
-    return lambda layout: shutil.copytree(written[layout], tmp_path / "copy")
 
 
 def index_of(layout: str, name: str) -> int:

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.data.captures import edit_json, write_array, write_capture, write_json
+from tests.data.captures import edit_json, refused, write_array, write_capture, write_json
 from warpgs.config import MaskPerturbation
 from warpgs.data.loaders import load_capture
 
@@ -14,20 +14,6 @@ from warpgs.data.loaders import load_capture
 @pytest.fixture
 def root(tmp_path):
     return write_capture(tmp_path / "toy")
-
-
-def read_all(root, **options):
-    """Opens a capture and reads every frame."""
-    scene = load_capture(root, **options)
-    for name in (*scene.train, *scene.val):
-        scene.frame(name)
-
-
-def refused(root, match, **options):
-    """The capture is refused in one line, on opening or when its frames are read."""
-    with pytest.raises(ValueError, match=match) as caught:
-        read_all(root, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_given_dataset_overrides_recognition(root):

@@ -1,0 +1,20 @@
+"""Fixtures of the tests of layouts."""
+
+import shutil
+
+import pytest
+
+from tests.data import layouts
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    """The folder of each layout, which tests leave as it is."""
+    root = tmp_path_factory.mktemp("layouts")
+    return {name: write(root / name) for name, write in layouts.ALL.items()}
+
+
+@pytest.fixture
+def edited(written, tmp_path):
+    """A function that copies a layout's folder, to be changed."""
+    return lambda layout: shutil.copytree(written[layout], tmp_path / "copy")
