@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.loaders import load_capture
+from warpgs.files import write_array, write_png
 
 SIZE = (40, 24)
 """(width, height) of the full-size images [px]."""
@@ -28,18 +29,6 @@ def edit_json(path: Path, **changes: object) -> None:
     """Changes some entries of a JSON object; None removes an entry."""
     values = {**json.loads(path.read_text()), **changes}
     write_json(path, {key: value for key, value in values.items() if value is not None})
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
-    stored = pixels[..., order[pixels.shape[2]]] if pixels.ndim == 3 else pixels
-    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(stored))[1].tobytes())
-
-
-def write_array(path: Path, values: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, values)
 
 
 def camera_fields(k: int, size: tuple[int, int] = SIZE) -> dict[str, object]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.data.captures import edit_json
 from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
 from warpgs.config import TrainConfig
@@ -95,10 +96,6 @@ def edit_views(run, change):
         writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def edit_json(path, **changes):
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
 # Content --------------------------------------------------------------------------------------------------------------
@@ -235,7 +232,8 @@ def test_missing_events_are_pointed_out(tmp_path, run):
 
 def test_a_run_without_evaluation_views_is_reported(tmp_path, run):
     (run / "views.csv").write_text((run / "views.csv").read_text().splitlines()[0] + "\n")
-    edit_json(run / "metrics.json", psnr=None)
+    values = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps({**values, "psnr": None}))
     assert report(tmp_path, run).images() == []
 
 
