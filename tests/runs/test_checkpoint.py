@@ -204,9 +204,10 @@ def test_metadata_that_is_not_an_object_is_damage(tmp_path, text):
         checkpoint.load(path)
 
 
-def test_missing_metadata_is_named_with_the_file(path):
-    tiny.edit_metadata(path, lambda values: values.pop("sh_degree"))
-    with pytest.raises(ValueError, match=f"{path} is damaged: it has no sh_degree"):
+@pytest.mark.parametrize("missing", ["sh_degree", "moving", "train_seconds"])
+def test_missing_metadata_is_named_with_the_file(path, missing):
+    tiny.edit_metadata(path, lambda values: values.pop(missing))
+    with pytest.raises(ValueError, match=f"{path} is damaged: it has no {missing}"):
         checkpoint.load(path)
 
 
@@ -221,6 +222,8 @@ def test_missing_metadata_is_named_with_the_file(path):
         ("iteration", True),
         ("iteration", 10**400),
         ("train_seconds", "1"),
+        ("train_seconds", None),
+        ("rollbacks", -1),
         ("views", [1]),
     ],
 )

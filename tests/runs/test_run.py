@@ -12,7 +12,6 @@ from tests.scenes import error
 from warpgs.config import MaskPerturbation, RenderSettings, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
-from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_run
@@ -289,14 +288,6 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
     assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
 
 
-def test_a_run_is_locked_against_a_second_process(run):
-    opened = Run.open(run)
-    with opened.lock(), pytest.raises(ValueError, match="being trained by another process"), Run.open(run).lock():
-        pass
-    with opened.lock():
-        pass  # free again
-
-
 # The newest checkpoint ----------------------------------------------------------------------------------------------
 
 
@@ -322,15 +313,6 @@ def test_a_scene_is_not_read_with_the_config_of_another_run(run, data):
     other = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, width=16))
     with pytest.raises(ValueError, match="does not hold a scene of this run's config"):
         Run(run, other).trained_scene()
-
-
-@pytest.mark.parametrize("missing", ["moving", "train_seconds"])
-def test_a_missing_field_of_a_checkpoint_is_named(run, data, missing):
-    tiny.trainer(data, run).save()
-    path = checkpoint.list_checkpoints(run)[-1]
-    tiny.edit_metadata(path, lambda values: values.pop(missing))
-    with pytest.raises(ValueError, match=f"{path} is damaged: it has no {missing}"):
-        evaluate_run.evaluate_run(run, load_capture(data), quiet=True)
 
 
 # Corrected cameras --------------------------------------------------------------------------------------------------

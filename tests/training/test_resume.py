@@ -287,15 +287,6 @@ def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
         tiny.trainer(data, run).restore(checkpoint.list_checkpoints(run)[-1])
 
 
-@pytest.mark.parametrize(("name", "value"), [("iteration", "x"), ("train_seconds", None), ("rollbacks", -1)])
-def test_metadata_of_another_type_is_refused_by_name(data, tmp_path, name, value):
-    run = tmp_path / "run"
-    tiny.train(tiny.trainer(data, run))
-    tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values.update({name: value}))
-    with pytest.raises(ValueError, match=f"is damaged: {name} cannot be"):
-        tiny.trainer(data, run).restore(checkpoint.list_checkpoints(run)[-1])
-
-
 def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
     run = tmp_path / "run"
     tiny.train(tiny.trainer(data, run))
