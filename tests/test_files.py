@@ -241,8 +241,8 @@ def test_a_full_disk_is_reported_with_the_name_of_the_file(write, values, tmp_pa
 
 
 def test_numbers_that_are_not_finite_are_null_in_json(tmp_path):
-    write_json(tmp_path / "a.json", {"a": [float("nan"), 1.0], "b": float("inf")})
-    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": None}
+    write_json(tmp_path / "a.json", {"a": [math.nan, 1.0], "b": math.inf, "c": -math.inf})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": None, "c": None}
 
 
 def test_a_png_that_cannot_be_written_leaves_the_old_one(path, monkeypatch):
