@@ -31,6 +31,19 @@ def edit_json(path: Path, **changes: object) -> None:
     write_json(path, {key: value for key, value in values.items() if value is not None})
 
 
+def look_away(root: Path) -> None:
+    """Turns every camera around its vertical axis, so that it does not see the points."""
+    for path in (root / "camera").iterdir():
+        rotation = np.array(json.loads(path.read_text())["orientation"])
+        edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
+
+
+def stop_time(root: Path) -> None:
+    """Gives all frames one time."""
+    names = json.loads((root / "metadata.json").read_text())
+    write_json(root / "metadata.json", {name: {"time_id": 0} for name in names})
+
+
 def camera_fields(k: int, size: tuple[int, int] = SIZE) -> dict[str, object]:
     """A camera file: rotated, with the principal point off the image centre, not at the scene centre."""
     rotation = cv2.Rodrigues(np.array([0.1 * k, 0.3, -0.05 * k]))[0]

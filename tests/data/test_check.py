@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.data import captures, layouts
-from tests.data.captures import edit_json, write_array
+from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
 from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
 from warpgs.data.loaders import load_capture
@@ -124,9 +124,7 @@ def test_cameras_that_do_not_match_the_images_are_a_warning(root):
 
 
 def test_cameras_that_look_away_are_an_error(root):
-    for path in (root / "camera").iterdir():
-        rotation = np.array(json.loads(path.read_text())["orientation"])
-        edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
+    look_away(root)
     assert "do not see the points" in texts(check_capture(root), "error")
 
 
@@ -239,15 +237,13 @@ def test_depth_is_not_checked_without_points(root):
 
 
 def test_one_time_for_all_frames_is_an_error(root):
-    names = json.loads((root / "metadata.json").read_text())
-    (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
+    stop_time(root)
     assert "one time" in texts(check_capture(root), "error")
     assert "one time" in " ".join(f.text for f in quick_findings(load_capture(root)) if f.level == "error")
 
 
 def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_to_be_static(root):
-    names = json.loads((root / "metadata.json").read_text())
-    (root / "metadata.json").write_text(json.dumps({n: {"time_id": 0} for n in names}))
+    stop_time(root)
     findings = quick_findings(load_capture(root).assuming("static"))
     assert ["one time" in f.text for f in findings if f.topic == "time"] == [True]
     assert {f.level for f in findings} == {"warning"}
@@ -283,9 +279,7 @@ def test_the_quick_check_raises_on_damaged_frames(root):
 
 
 def test_the_quick_check_finds_cameras_that_look_away(root):
-    for path in (root / "camera").iterdir():
-        rotation = np.array(json.loads(path.read_text())["orientation"])
-        edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
+    look_away(root)
     assert [f.level for f in quick_findings(load_capture(root))] == ["error"]
 
 

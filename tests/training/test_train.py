@@ -21,7 +21,7 @@ import torch
 
 import warpgs
 from tests import tiny
-from tests.data.captures import edit_json
+from tests.data.captures import edit_json, look_away, stop_time
 from warpgs import cli
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
@@ -172,14 +172,6 @@ def test_a_damaged_image_is_refused_by_name(tmp_path, refused):
     assert "left_000003.png" in refused("--data", data, *QUICK, "--iterations", 40, "--out", tmp_path / "run")
 
 
-def look_away(data):
-    """Turns every camera around its vertical axis, so that it does not see the points."""
-    for path in (data / "camera").iterdir():
-        camera = json.loads(path.read_text())
-        camera["orientation"] = (np.diag([-1.0, 1.0, -1.0]) @ np.array(camera["orientation"])).tolist()
-        path.write_text(json.dumps(camera))
-
-
 def test_an_unfit_capture_is_refused_in_one_line_with_exit_code_1(tmp_path, train):
     data = builtin_capture(tmp_path, SMALL, quiet=True)
     look_away(data)
@@ -194,8 +186,7 @@ def test_an_unfit_capture_is_refused_in_one_line_with_exit_code_1(tmp_path, trai
 
 def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_static(tmp_path):
     root = tiny.write(tmp_path)
-    names = json.loads((root / "metadata.json").read_text())
-    (root / "metadata.json").write_text(json.dumps({name: {"time_id": 0} for name in names}))
+    stop_time(root)
     capture, lines = load_capture(root), []
     script.check_capture(capture, TrainConfig(assume="static"), lines.append)
     assert any(line.startswith("warning: all training frames have one time") for line in lines)
