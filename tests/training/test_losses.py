@@ -204,12 +204,9 @@ def changed_by(stage, loss=LOSS, at=0, **options):
     return {name.split(".")[0] if name.startswith(("deformation", "appearance")) else name for name in changed}
 
 
-def of_static(names):
-    return {name.removeprefix("static.") for name in names if name.startswith("static.")}
-
-
-def of_dynamic(names):
-    return {name.removeprefix("dynamic.") for name in names if name.startswith("dynamic.")}
+def of(branch, names):
+    """What comes after ``branch.`` in the names that begin with it."""
+    return {name.removeprefix(f"{branch}.") for name in names if name.startswith(f"{branch}.")}
 
 
 def view_truth():
@@ -234,12 +231,15 @@ def test_the_static_term_is_the_weighted_static_loss_in_every_stage(stage):
     assert error(terms["static"], expected) < 1e-6
 
 
-@pytest.mark.parametrize("stage", ["stage1", "stage2"])
-def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_sampled_background(stage):
-    terms, rendering = terms_of(stage)
+@pytest.mark.parametrize(("stage", "margin"), [("stage1", 0.0), ("stage2", 0.0), ("stage1", 1.6)])
+def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_sampled_background(stage, margin):
+    """It leaves out the margin of the mask, here in pixels."""
+    terms, rendering = terms_of(stage, dataclasses.replace(LOSS, mask_margin=margin / max(VIEW_MASK.shape)))
     dynamic = rendering.dynamic
     image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
     truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
+    if margin:
+        truth = torch.where(mask_border(VIEW_MASK, 2)[..., None], image, truth)
     assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
 
 
@@ -250,16 +250,6 @@ def test_along_the_borders_of_the_mask_the_dynamic_loss_is_that_of_its_own_image
     assert error(loss, compared(IMAGE, truth, 0.2)) < 1e-6
     assert not gradient(dynamic_loss, IMAGE, TRUTH, MASK, 0.0, PURPLE, border)[border].any()
     assert gradient(dynamic_loss, IMAGE, TRUTH, MASK, 0.0, PURPLE, border)[~border].any(1).all()
-
-
-def test_the_dynamic_term_leaves_out_the_margin_of_the_mask():
-    margin = 1.6 / max(VIEW_MASK.shape)
-    terms, rendering = terms_of("stage1", dataclasses.replace(LOSS, mask_margin=margin))
-    dynamic = rendering.dynamic
-    image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
-    truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
-    truth = torch.where(mask_border(VIEW_MASK, 2)[..., None], image, truth)
-    assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
 
 
 def test_the_schedule_compares_the_joint_image_in_stage_1_already():
@@ -382,7 +372,7 @@ def test_a_term_that_is_added_to_the_dictionary_is_trained_and_reported(monkeypa
     monkeypatch.setitem(TERMS, "sparsity", SPARSITY)
     terms, rendering = terms_of("stage1", NOTHING)
     assert error(terms["sparsity"], 0.25 * rendering.dynamic.alpha.double().mean()) < 1e-6
-    assert "logit_opacities" in of_dynamic(changed_by("stage1", NOTHING))
+    assert "logit_opacities" in of("dynamic", changed_by("stage1", NOTHING))
 
 
 def test_a_term_is_inactive_in_other_phases(monkeypatch):
@@ -406,53 +396,37 @@ EARLY_APPEARANCE = {"logit_opacities", "sh_dc"}
 
 def test_pretraining_trains_static_gaussians_only():
     changed = changed_by("pretrain")
-    assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
-    assert len(changed) == len(of_static(changed))
+    assert of("static", changed) == GEOMETRY | EARLY_APPEARANCE
+    assert len(changed) == len(of("static", changed))
 
 
-def test_in_stage_1_the_static_term_trains_static_gaussians_only():
-    changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0))
-    assert of_static(changed) == GEOMETRY | EARLY_APPEARANCE
-    assert len(changed) == len(of_static(changed))
-
-
-def test_in_stage_1_the_dynamic_term_trains_dynamic_gaussians_only():
-    changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0))
-    assert of_dynamic(changed) == GEOMETRY | EARLY_APPEARANCE
-    assert len(changed) == len(of_dynamic(changed))
-
-
-def test_in_stage_1_the_static_term_trains_the_appearance_network_once_it_is_in_use():
-    changed = changed_by("stage1", dataclasses.replace(NOTHING, static=1.0), at=150)
-    assert of_static(changed) >= GEOMETRY | EARLY_APPEARANCE
-    assert changed == {f"static.{name}" for name in of_static(changed)} | {"appearance"}
-
-
-def test_in_stage_1_the_dynamic_term_trains_the_deformation_network_once_it_is_in_use():
-    changed = changed_by("stage1", dataclasses.replace(NOTHING, dynamic=1.0), at=150)
-    assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
-    assert changed == {f"dynamic.{name}" for name in of_dynamic(changed)} | {"deformation"}
+@pytest.mark.parametrize(("branch", "network"), [("static", "appearance"), ("dynamic", "deformation")])
+@pytest.mark.parametrize("in_use", [False, True])
+def test_in_stage_1_the_term_of_a_branch_trains_its_gaussians_and_its_network_once_in_use(branch, network, in_use):
+    changed = changed_by("stage1", dataclasses.replace(NOTHING, **{branch: 1.0}), at=150 if in_use else 0)
+    expected = {f"{branch}.{name}" for name in GEOMETRY | EARLY_APPEARANCE}
+    assert changed == expected | ({network} if in_use else set())
 
 
 def test_in_stage_2_the_joint_term_trains_dynamic_gaussians_and_both_networks():
     changed = changed_by("stage2", dataclasses.replace(NOTHING, joint=1.0))
-    assert of_dynamic(changed) >= GEOMETRY | EARLY_APPEARANCE
+    assert of("dynamic", changed) >= GEOMETRY | EARLY_APPEARANCE
     assert {"deformation", "appearance"} <= changed
 
 
 def test_in_stage_2_static_gaussians_are_frozen():
-    assert of_static(changed_by("stage2")) == set()
+    assert of("static", changed_by("stage2")) == set()
 
 
 def test_the_config_lets_stage_2_train_the_geometry_of_static_gaussians():
-    assert of_static(changed_by("stage2", static_geometry=True)) == GEOMETRY
+    assert of("static", changed_by("stage2", static_geometry=True)) == GEOMETRY
 
 
 def test_the_config_lets_stage_2_train_the_appearance_of_static_gaussians():
-    assert of_static(changed_by("stage2", static_appearance=True)) == EARLY_APPEARANCE | {"sh_rest"}
+    assert of("static", changed_by("stage2", static_appearance=True)) == EARLY_APPEARANCE | {"sh_rest"}
 
 
 def test_without_the_appearance_network_stage_2_trains_the_appearance_of_static_gaussians():
     changed = changed_by("stage2", app=False)
-    assert of_static(changed) == EARLY_APPEARANCE | {"sh_rest"}
+    assert of("static", changed) == EARLY_APPEARANCE | {"sh_rest"}
     assert "appearance" not in changed
