@@ -57,9 +57,18 @@ def make_capture(points, colors=None, inverse_depth=None, num_frames=3):
     return Capture("made up", cameras, names, [], points, colors, read)
 
 
+def with_frames(capture, read):
+    """The capture, with frames as ``read`` returns them."""
+    return Capture("made up", capture.cameras, capture.train, [], capture.points, None, read)
+
+
+def views_of(capture):
+    return Views(capture, torch.device("cpu"), 1 << 30)
+
+
 def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None, fits=None):
     """The dynamic Gaussians of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
-    views = Views(capture, torch.device("cpu"), 1 << 30)
+    views = views_of(capture)
     fits = initialize.fits_motion(config, capture, views, alignments) if fits is None else fits
     protocol, deformation = Protocol(config, True, fits_motion=fits), deformation or torch.nn.Identity()
     return initialize.dynamic_gaussians(protocol, capture, views, alignments, deformation, generator())
@@ -96,9 +105,9 @@ def test_gaussians_start_at_their_points_with_an_opacity_of_a_tenth():
     assert error(gaussians.opacities, torch.full((20,), 0.1)) < 1e-6
 
 
-def test_coincident_points_have_a_positive_size():
-    points = torch.cat([random_points(20), torch.zeros(5, 3)])
-    gaussians = gaussians_at(points, torch.rand(25, 3), NETWORK)
+@pytest.mark.parametrize("points", [torch.cat([random_points(20), torch.zeros(5, 3)]), torch.ones(9, 3)])
+def test_coincident_points_have_a_positive_size(points):
+    gaussians = gaussians_at(points, torch.rand(len(points), 3), NETWORK)
     assert gaussians.log_scales.isfinite().all()
     assert (gaussians.scales > 0).all()
 
@@ -106,10 +115,6 @@ def test_coincident_points_have_a_positive_size():
 def test_the_size_of_a_distant_point_is_limited():
     points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]])])
     assert gaussians_at(points, torch.rand(28, 3), NETWORK).scales.max() <= 10.0 * 0.1 * 1.001
-
-
-def test_all_points_coincident_give_finite_sizes():
-    assert gaussians_at(torch.ones(9, 3), torch.rand(9, 3), NETWORK).log_scales.isfinite().all()
 
 
 def test_sizes_without_bounds_are_those_of_3dgs():
@@ -297,7 +302,7 @@ def test_metric_depth_is_not_aligned():
     capture = make_capture(points, inverse_depth=torch.full((HEIGHT, WIDTH), 0.25))
     for metric, expected in ((False, [torch.nan, torch.nan]), (True, [1.0, 0.0])):  # one value: nothing to fit
         capture.metric_depth = metric
-        found = initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30), smooth=True)
+        found = initialize.align_to_points(capture, views_of(capture), smooth=True)
         assert torch.equal(found.alignments.isnan(), torch.tensor([expected] * 3).isnan())
         assert metric == torch.equal(found.alignments, torch.tensor([expected] * 3))
     assert found.errors[:, 0].tolist() == pytest.approx([0.25] * 3)  # 3 m are 1 / 0.25 = 4 m in the files
@@ -306,7 +311,7 @@ def test_metric_depth_is_not_aligned():
 def test_metric_depth_that_is_unknown_is_not_used():
     capture = make_capture(random_points(9), inverse_depth=torch.full((HEIGHT, WIDTH), torch.nan))
     capture.metric_depth = True
-    found = initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30))
+    found = initialize.align_to_points(capture, views_of(capture))
     assert found.alignments.isnan().all()
 
 
@@ -433,7 +438,7 @@ def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
 def test_the_deformation_is_fitted_where_masks_and_depth_show_what_moves(assume, depth, steps, fits):
     capture = make_capture(random_points(50), inverse_depth=constant_depth() if depth else None).assuming(assume)
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=steps))
-    views = Views(capture, torch.device("cpu"), 1 << 30)
+    views = views_of(capture)
     assert initialize.fits_motion(config, capture, views, ALIGNMENT) == fits
 
 
@@ -449,8 +454,7 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
     def read(name):
         return dataclasses.replace(capture.frame(name), static_mask=static)
 
-    masked = Capture("made up", capture.cameras, capture.train, [], capture.points, None, read)
-    assert len(dynamic_gaussians(masked, ALIGNMENT)) == 0
+    assert len(dynamic_gaussians(with_frames(capture, read), ALIGNMENT)) == 0
 
 
 def test_gaussians_of_unknown_depth_are_small_enough_to_be_kept():
@@ -491,18 +495,27 @@ def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
 # Trust in depth ------------------------------------------------------------------------------------------------------
 
 
+def capture_of_grid(inverse_of):
+    """Points of random depth in every second row and column, and there ``inverse_of(depth, column)``."""
+    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
+    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
+    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
+    inverse_depth[row, column] = inverse_of(depth, column)
+    return make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
+
+
 def aligned(factor, signal=1.0):
     """The alignment of views whose inverse depth is the true one times ``signal``, times random numbers in 1 ± factor.
 
     What ``signal`` leaves out is a constant.
     """
-    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 4), torch.arange(1, WIDTH, 5)).T
-    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
-    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
-    noise = 1.0 + factor * (2.0 * torch.rand(len(row), generator=generator(4)) - 1.0)
-    inverse_depth[row, column] = (signal / depth + 0.4 * (1.0 - signal)) * noise
-    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
-    return initialize.align_to_points(capture, Views(capture, torch.device("cpu"), 1 << 30))
+
+    def inverse_of(depth, column):
+        noise = 1.0 + factor * (2.0 * torch.rand(len(depth), generator=generator(4)) - 1.0)
+        return (signal / depth + 0.4 * (1.0 - signal)) * noise
+
+    capture = capture_of_grid(inverse_of)
+    return initialize.align_to_points(capture, views_of(capture))
 
 
 def test_exact_depth_is_trusted_whatever_the_tolerance():
@@ -552,12 +565,8 @@ def test_without_points_nothing_is_refused():
 
 
 def test_depth_with_smooth_errors_is_brought_to_the_points():
-    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
-    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
-    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
-    inverse_depth[row, column] = (1.0 + 0.1 * torch.sin(column / 16.0)) / depth
-    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
-    views = Views(capture, torch.device("cpu"), 1 << 30)
+    capture = capture_of_grid(lambda depth, column: (1.0 + 0.1 * torch.sin(column / 16.0)) / depth)
+    views = views_of(capture)
     plain = initialize.align_to_points(capture, views)
     smooth = initialize.align_to_points(capture, views, smooth=True)
     assert (smooth.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
@@ -567,12 +576,8 @@ def test_depth_with_smooth_errors_is_brought_to_the_points():
 
 
 def test_depth_that_a_smooth_factor_makes_no_better_stays():
-    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
-    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
-    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
-    inverse_depth[row, column] = 1.0 / depth
-    capture = make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
-    views = Views(capture, torch.device("cpu"), 1 << 30)
+    capture = capture_of_grid(lambda depth, _: 1.0 / depth)
+    views = views_of(capture)
     before = views[0].inverse_depth.clone()
     initialize.align_to_points(capture, views, smooth=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))
@@ -591,9 +596,7 @@ def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch
             capture.frame(name), inverse_depth=torch.where(known, factors[name] / depth, torch.nan)
         )
 
-    views = Views(
-        Capture("made up", capture.cameras, capture.train, [], capture.points, None, read), torch.device("cpu"), 1 << 30
-    )
+    views = views_of(with_frames(capture, read))
     layer = SimpleNamespace(depth=depth, alpha=torch.ones(HEIGHT, WIDTH))
     monkeypatch.setattr(initialize, "render", lambda *_, **__: SimpleNamespace(joint=layer))
     before = torch.full((3, 2), 7.0)
