@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.errors import error_line
 from warpgs.bench import measure
 from warpgs.bench.command import Bench
 from warpgs.bench.measure import STAGES, time_in_turn
@@ -29,15 +30,6 @@ def report(tmp_path, **options):
     path = tmp_path / "report.json"
     bench(dataclasses.replace(OPTIONS, json=path, **options), [TINY], "cpu")
     return json.loads(path.read_text())
-
-
-def error_line(capsys, *arguments):
-    """The only line that a failing command prints."""
-    assert main(["bench", *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = captured.err.splitlines()
-    return line
 
 
 def test_the_report_names_the_machine_and_the_versions(tmp_path):
@@ -136,20 +128,20 @@ def tiny_workload():
 
 @pytest.mark.parametrize("option", [("--against", "gsplat"), ("--graph",)])
 def test_options_that_need_cuda_are_refused_on_cpu_with_one_line(capsys, option):
-    assert " ".join(option) + " needs --device cuda" in error_line(capsys, "--device", "cpu", *option)
+    assert " ".join(option) + " needs --device cuda" in error_line(capsys, "bench", "--device", "cpu", *option)
 
 
 def test_zero_repeats_are_refused_with_one_line(capsys):
-    assert "--repeats must be at least 1" in error_line(capsys, "--device", "cpu", "--repeats", "0")
+    assert "--repeats must be at least 1" in error_line(capsys, "bench", "--device", "cpu", "--repeats", "0")
 
 
 def test_a_missing_folder_is_refused_before_anything_is_measured(capsys, tmp_path):
     path = tmp_path / "missing" / "report.json"
-    assert "no such folder" in error_line(capsys, "--device", "cpu", "--json", str(path))
+    assert "no such folder" in error_line(capsys, "bench", "--device", "cpu", "--json", str(path))
 
 
 def test_a_folder_as_a_file_is_refused_before_anything_is_measured(capsys, tmp_path):
-    assert "it is a folder" in error_line(capsys, "--device", "cpu", "--profile", str(tmp_path))
+    assert "it is a folder" in error_line(capsys, "bench", "--device", "cpu", "--profile", str(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -19,11 +19,15 @@ def pair():
     return (truth + 0.2 * torch.randn(H, W, 3)).clamp(0, 1), truth
 
 
-@pytest.fixture
-def region():
+def block():
     region = torch.zeros(H, W, dtype=torch.bool)
     region[3:11, 5:20] = True
     return region
+
+
+@pytest.fixture
+def region():
+    return block()
 
 
 def gray(value):
@@ -133,12 +137,6 @@ def naive_masked_ssim(image, truth, region):
 
 def scattered():
     return torch.rand(H, W) < 0.1
-
-
-def block():
-    region = torch.zeros(H, W, dtype=torch.bool)
-    region[3:11, 5:20] = True
-    return region
 
 
 @pytest.mark.parametrize("make_region", [block, scattered, lambda: torch.ones(H, W, dtype=torch.bool)])

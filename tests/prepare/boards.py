@@ -152,6 +152,11 @@ def lens() -> Lens:
     return Lens(*SIZE, (FOCAL, FOCAL), (SIZE[0] / 2, SIZE[1] / 2))
 
 
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union of two masks."""
+    return (a & b).sum() / (a | b).sum()
+
+
 def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
     """A capture of the video with its true cameras and masks."""
     images, masks = record(num_frames)

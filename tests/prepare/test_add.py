@@ -54,10 +54,6 @@ def written_mask(root, name, size="1x"):
     return decode(root / f"resized_mask/{size}/{name}.png.png") == 0
 
 
-def overlap(a, b) -> float:
-    return (a & b).sum() / (a | b).sum()
-
-
 @pytest.mark.usefixtures("red")
 def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
     for k, name in enumerate(NAMES):
@@ -67,7 +63,7 @@ def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
     assert "masks: 12 frames" in capsys.readouterr().out
     for name in NAMES:
         image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
-        assert overlap(written_mask(root, name), is_red(image)) > 0.9, name
+        assert boards.overlap(written_mask(root, name), is_red(image)) > 0.9, name
         assert written_mask(root, name, "2x").shape == (96, 128)
     capture = load_capture(root)
     assert all(capture.frame(name).static_mask is not None for name in NAMES)
@@ -105,8 +101,10 @@ def test_masks_that_only_some_training_frames_lack_are_made(root):
     for name in NAMES:
         image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
         expected = drawn == 0 if name in NAMES[2:5] else is_red(image)
-        assert overlap(written_mask(root, name), expected) > 0.9, name
-        assert overlap(written_mask(root, name, "2x"), cv2.resize(expected.astype(np.uint8), (128, 96)) > 0) > 0.8
+        assert boards.overlap(written_mask(root, name), expected) > 0.9, name
+        assert (
+            boards.overlap(written_mask(root, name, "2x"), cv2.resize(expected.astype(np.uint8), (128, 96)) > 0) > 0.8
+        )
     assert (written_mask(root, NAMES[3]) == (drawn == 0)).all()
     assert load_capture(root, factor=2).frame(NAMES[3]).static_mask is not None
 

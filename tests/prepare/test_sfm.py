@@ -222,6 +222,18 @@ def set_focal(opened: pycolmap.Database, focal: float) -> None:
     opened.update_camera(camera)
 
 
+def agree_on(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
+    """Lets the pairs agree on a focal length."""
+
+    def calibrate(path: Path, options: object) -> bool:
+        opened = pycolmap.Database.open(path)
+        set_focal(opened, focal)
+        opened.close()
+        return True
+
+    monkeypatch.setattr(pycolmap, "calibrate_view_graph", calibrate)
+
+
 @pytest.mark.parametrize(
     ("agreed", "found", "starts", "kept"),
     [
@@ -237,12 +249,6 @@ def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
     """``found``: by start, the focal length and the reprojection error that mapping ends with."""
     names, started = wide_database(tmp_path / "features.db"), []
 
-    def calibrate(path: Path, options: object) -> bool:
-        opened = pycolmap.Database.open(path)
-        set_focal(opened, agreed)
-        opened.close()
-        return True
-
     def map_globally(path: Path, *rest: object) -> dict[int, SimpleNamespace]:
         opened = pycolmap.Database.open(path)
         started.append(opened.read_all_cameras()[0].params[0])
@@ -252,7 +258,7 @@ def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
         measures = {"num_reg_images": lambda: 6, "compute_mean_reprojection_error": lambda: error}
         return {0: SimpleNamespace(images={}, cameras={1: camera}, **measures)}
 
-    monkeypatch.setattr(pycolmap, "calibrate_view_graph", calibrate)
+    agree_on(monkeypatch, agreed)
     monkeypatch.setattr(pycolmap, "global_mapping", map_globally)
     job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
     model = _map_globally(job, tmp_path / "features.db", lambda *progress: None)
@@ -293,13 +299,7 @@ def test_a_far_focal_length_that_loses_frames_has_a_rival(placed, tried, tmp_pat
         measures = {"num_reg_images": lambda: placed, "compute_mean_reprojection_error": lambda: 0.5}
         return SimpleNamespace(cameras={1: SimpleNamespace(mean_focal_length=lambda: focal)}, **measures)
 
-    def calibrate(path: Path, options: object) -> bool:
-        opened = pycolmap.Database.open(path)
-        set_focal(opened, 240.0)
-        opened.close()
-        return True
-
-    monkeypatch.setattr(pycolmap, "calibrate_view_graph", calibrate)
+    agree_on(monkeypatch, 240.0)
     monkeypatch.setattr(colmap, "_map_from", map_from)
     job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
     assert _map_globally(job, tmp_path / "features.db", lambda *progress: None) is not None

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.data.captures import edit_json
+from tests.errors import error_line
 from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
 from warpgs.config import TrainConfig
@@ -78,14 +79,6 @@ def report(tmp_path, *folders, **options):
     out = tmp_path / "report.html"
     Report(folders, out=out, device="cpu", **options).run()
     return Page(out.read_text())
-
-
-def error_line(capsys, *arguments):
-    """The one line of an error of the command."""
-    assert main(["report", *map(str, arguments)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
 
 
 def edit_views(run, change):
@@ -366,17 +359,17 @@ def test_without_points_there_is_no_chart():
 
 
 def test_a_report_without_runs_is_refused(capsys):
-    assert "at least one run folder" in error_line(capsys)
+    assert "at least one run folder" in error_line(capsys, "report")
 
 
 def test_a_run_given_twice_is_refused(capsys, run):
-    assert "is given twice" in error_line(capsys, run, run)
+    assert "is given twice" in error_line(capsys, "report", run, run)
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "views.csv"])
 def test_a_run_that_was_not_evaluated_is_refused_with_the_remedy(capsys, run, name):
     (run / name).unlink()
-    error = error_line(capsys, run)
+    error = error_line(capsys, "report", run)
     assert f"{run} has no {name}" in error
     assert "warpgs eval" in error
 
@@ -385,7 +378,7 @@ def test_a_run_that_was_not_evaluated_is_refused_with_the_remedy(capsys, run, na
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
 def test_a_file_that_is_not_json_is_named(capsys, run, name, content):
     (run / name).write_bytes(content)
-    assert f"{name} is not valid JSON" in error_line(capsys, run)
+    assert f"{name} is not valid JSON" in error_line(capsys, "report", run)
 
 
 @pytest.mark.parametrize(
@@ -398,7 +391,7 @@ def test_a_file_that_is_not_json_is_named(capsys, run, name, content):
 )
 def test_metrics_that_are_not_an_object_of_values_are_refused(capsys, run, text, message):
     (run / "metrics.json").write_text(text)
-    assert message in error_line(capsys, run)
+    assert message in error_line(capsys, "report", run)
 
 
 @pytest.mark.parametrize("number", ["Infinity", "-Infinity", "NaN", "1" + 400 * "0", "1" + 5000 * "0"])
@@ -406,14 +399,14 @@ def test_metrics_that_are_not_an_object_of_values_are_refused(capsys, run, text,
 def test_impossible_metrics_of_a_run_are_refused(capsys, run, name, number):
     (run / "metrics.json").write_text(f'{{"{name}": {number}}}')
     reason = "is not valid JSON" if len(number) > 5000 else "is damaged"  # Python parses no longer integers
-    assert f"{run / 'metrics.json'} {reason}" in error_line(capsys, run, "--views", 0)
+    assert f"{run / 'metrics.json'} {reason}" in error_line(capsys, "report", run, "--views", 0)
 
 
 @pytest.mark.parametrize("name", ["psnr", "ssim", "time"])
 @pytest.mark.parametrize("number", ["1.7e308", "-1.7e308", "-inf"])
 def test_impossible_metrics_of_a_view_are_refused(capsys, run, name, number):
     edit_views(run, lambda rows: rows[1].update({name: number}))
-    assert f"views.csv: line 3: {name} cannot be" in error_line(capsys, run)
+    assert f"views.csv: line 3: {name} cannot be" in error_line(capsys, "report", run)
 
 
 def test_a_perfect_view_is_reported(tmp_path, run):
@@ -431,7 +424,7 @@ def test_impossible_settings_are_refused(capsys, run, name, number):
     else:
         values[first] = "HERE"
     (run / "config.json").write_text(json.dumps(values).replace('"HERE"', number))
-    assert f"{run / 'config.json'}" in error_line(capsys, run, "--views", 0)
+    assert f"{run / 'config.json'}" in error_line(capsys, "report", run, "--views", 0)
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "views.csv", "config.json"])
@@ -439,12 +432,12 @@ def test_a_device_is_not_read(capsys, run, name):
     """Reading it would never end, although its size is 0."""
     (run / name).unlink()
     (run / name).symlink_to("/dev/zero")
-    assert f"{run / name} is not a file" in error_line(capsys, run)
+    assert f"{run / name} is not a file" in error_line(capsys, "report", run)
 
 
 def test_a_missing_column_of_views_is_named(capsys, run):
     (run / "views.csv").write_text("name,time\na,0\n")
-    assert "columns of another version: it has no psnr" in error_line(capsys, run)
+    assert "columns of another version: it has no psnr" in error_line(capsys, "report", run)
 
 
 @pytest.mark.parametrize(
@@ -458,7 +451,7 @@ def test_a_missing_column_of_views_is_named(capsys, run):
 )
 def test_damaged_views_are_refused_with_their_line(capsys, run, text, reason):
     (run / "views.csv").write_text(text)
-    error = error_line(capsys, run)
+    error = error_line(capsys, "report", run)
     assert "views.csv" in error
     assert reason in error
 
@@ -477,7 +470,7 @@ def test_invalid_events_are_ignored(tmp_path, run):
 
 def test_a_fifo_among_the_events_is_refused(capsys, run):
     os.mkfifo(run / "events" / "events.out.tfevents.9")
-    assert "tfevents.9 is not a file" in error_line(capsys, run)
+    assert "tfevents.9 is not a file" in error_line(capsys, "report", run)
 
 
 def test_a_saved_image_that_is_damaged_or_of_absurd_size_is_not_shown(tmp_path, run):
@@ -491,11 +484,11 @@ def test_a_saved_image_that_is_damaged_or_of_absurd_size_is_not_shown(tmp_path, 
 
 def test_an_output_that_cannot_be_written_is_reported_in_one_line(capsys, run, tmp_path):
     (tmp_path / "taken").mkdir()
-    assert "taken could not be written" in error_line(capsys, run, "--out", tmp_path / "taken", "--views", 0)
+    assert "taken could not be written" in error_line(capsys, "report", run, "--out", tmp_path / "taken", "--views", 0)
 
 
 def test_a_negative_number_of_views_is_refused(capsys, run):
-    assert "--views must not be negative" in error_line(capsys, run, "--views", -1)
+    assert "--views must not be negative" in error_line(capsys, "report", run, "--views", -1)
 
 
 def test_the_report_of_one_run_is_written_into_its_folder(run, capsys):

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from tests import tiny
+from tests.errors import error_line
 from tests.video.test_writer import frames_of
 from warpgs import rendering
 from warpgs.cli import main
@@ -342,19 +343,11 @@ def damaged(run, tmp_path):
     return shutil.copytree(run, tmp_path / "damaged")
 
 
-def error_line(capsys, run):
-    """The only line that the failing command prints."""
-    assert main(["render", str(run), "--device", "cpu"]) == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    return message
-
-
 def test_the_error_names_a_moved_capture_and_data_replaces_it(damaged, capture, tmp_path, capsys):
     config = json.loads((damaged / "config.json").read_text())
     data = config["data"]
     (damaged / "config.json").write_text(json.dumps({**config, "data": str(tmp_path / "gone")}))
-    assert str(tmp_path / "gone") in error_line(capsys, damaged)
+    assert str(tmp_path / "gone") in error_line(capsys, "render", damaged, "--device", "cpu")
     assert f"{len(capture.val)} images" in render(damaged, tmp_path, data=Path(data))
 
 

@@ -16,6 +16,7 @@ sync_api = pytest.importorskip(
 )
 
 from tests.viewer import watched  # noqa: E402
+from tests.viewer.watched import until  # noqa: E402
 from warpgs.runs.trained import TrainedScene  # noqa: E402
 from warpgs.runtime import graphs  # noqa: E402
 from warpgs.viewer import source as source_module  # noqa: E402
@@ -98,13 +99,6 @@ def session(visit, viewer):
     session.panel.snap._impl.update_cb[0](None)
     settle(session)
     return session
-
-
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "timeout"
-        time.sleep(0.05)
 
 
 def settle(session):

@@ -6,7 +6,6 @@ import random
 import shutil
 import socket
 import threading
-import time
 import urllib.request
 import weakref
 from types import SimpleNamespace
@@ -16,7 +15,9 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
 
 from tests.campaign.browser import Browser
+from tests.errors import error_line
 from tests.viewer import watched
+from tests.viewer.watched import until
 from warpgs.cli import main
 from warpgs.command_line.version import install_command
 from warpgs.viewer import serve, server
@@ -38,14 +39,6 @@ def taken():
     """A port in use."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         yield listening.getsockname()[1]
-
-
-def error_line(capsys, *arguments):
-    """The one line of an error of the command."""
-    assert main(["view", *map(str, arguments)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    return error
 
 
 def test_only_this_machine_can_connect_by_default(run):
@@ -154,13 +147,6 @@ def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
         gc.enable()
 
 
-def until(condition):
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end, "timeout"
-        time.sleep(0.01)
-
-
 def test_a_port_is_free_again_after_the_viewer(run):
     with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
         port = viewer.port
@@ -169,14 +155,14 @@ def test_a_port_is_free_again_after_the_viewer(run):
 
 def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):
     assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use" in error_line(
-        capsys, run, "--port", taken
+        capsys, "view", run, "--port", taken
     )
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", ""])
 def test_a_host_of_another_machine_is_refused_in_one_line(run, capsys, host):
     if host:
-        assert f"cannot listen on {host}, port 8080" in error_line(capsys, run, "--host", host)
+        assert f"cannot listen on {host}, port 8080" in error_line(capsys, "view", run, "--host", host)
     else:
         with pytest.raises(OSError, match="port 70000"):
             check_address(host, 70000)
@@ -184,12 +170,14 @@ def test_a_host_of_another_machine_is_refused_in_one_line(run, capsys, host):
 
 @pytest.mark.parametrize("port", [-1, 65536, 99999])
 def test_an_invalid_port_is_refused_in_one_line(run, capsys, port):
-    assert f"cannot listen on port {port}: choose a --port from 0 to 65535" in error_line(capsys, run, "--port", port)
+    assert f"cannot listen on port {port}: choose a --port from 0 to 65535" in error_line(
+        capsys, "view", run, "--port", port
+    )
 
 
 def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    assert f"the viewer needs viser: {install_command('viewer')}" in error_line(capsys, run)
+    assert f"the viewer needs viser: {install_command('viewer')}" in error_line(capsys, "view", run)
 
 
 def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_path):

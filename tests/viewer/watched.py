@@ -2,6 +2,8 @@
 
 import dataclasses
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -44,3 +46,11 @@ def advance(run: Path, by: int = 1) -> Path:
 
 def same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return bool(torch.equal(a, b))
+
+
+def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
+    """Waits until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "timeout"
+        time.sleep(0.02)
