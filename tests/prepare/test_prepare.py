@@ -70,18 +70,15 @@ def test_every_frame_gets_its_true_camera(made):
     assert distances(capture).max() < 0.03
 
 
-def overlap(capture, count=24) -> float:
-    """Mean intersection over union of the masks and the true masks."""
-    truth, overlaps = boards.record(count)[1], []
-    for name in capture.cameras:
-        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
-        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
-    return float(np.mean(overlaps))
+def mean_overlap(capture, truth) -> float:
+    """Mean intersection over union of the dynamic regions of the frames and the true ones."""
+    frames = map(capture.frame, capture.cameras)
+    return float(np.mean([boards.overlap(~f.static_mask.numpy(), truth[int(f.name[6:])]) for f in frames]))
 
 
 def test_the_moving_board_is_masked(made):
     capture = load_capture(made)
-    assert overlap(capture) > 0.7
+    assert mean_overlap(capture, boards.record(24)[1]) > 0.7
     assert capture.estimated_masks
 
 
@@ -99,15 +96,6 @@ def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
     assert np.ptp(positions, axis=0).max() == 0.0
     distances = np.linalg.norm(capture.points.numpy() - positions[0], axis=1)
     assert np.allclose(distances, distances[0], rtol=1e-5)
-
-
-def mean_overlap(capture, truth) -> float:
-    """Mean intersection over union of the dynamic regions of the training frames and the true ones."""
-    overlaps = []
-    for name in capture.train:
-        dynamic, true = ~capture.frame(name).static_mask.numpy(), truth[int(name[6:])]
-        overlaps.append((dynamic & true).sum() / (dynamic | true).sum())
-    return float(np.mean(overlaps))
 
 
 def turned_cameras(folder, names, work, settings, quiet) -> Cameras:
@@ -147,12 +135,19 @@ def test_depth_that_says_nothing_places_no_points():
     assert len(points_around(cameras, [~mask for mask in masks])) == 0
 
 
-def test_masks_of_everything_leave_no_points_around_a_tripod(shots, tmp_path):
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ("moving", r"hardly any texture in static regions: 0 features .* check the masks"),
+        ("still", r"only 0 static points are left: nearly everything moves"),
+    ],
+)
+def test_masks_of_everything_are_refused_with_advice(shots, tmp_path, camera, message):
     (tmp_path / "masks").mkdir()
     for path in shots.iterdir():
         cv2.imwrite(str(tmp_path / "masks" / path.name), np.zeros(boards.SIZE[::-1], np.uint8))
-    with pytest.raises(ValueError, match=r"only 0 static points are left: nearly everything moves"):
-        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), camera="still")
+    with pytest.raises(ValueError, match=message):
+        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), camera=camera)
 
 
 def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):
@@ -171,7 +166,7 @@ def test_cameras_misled_by_dynamic_objects_are_recovered_without_them(tmp_path):
     capture = load_capture(tmp_path / "made")
     assert len(capture.train) == 12
     assert np.median(distances(capture, 12)) < 0.02
-    assert overlap(capture, 12) > 0.7
+    assert mean_overlap(capture, boards.record(12)[1]) > 0.7
 
 
 def test_a_prepared_capture_is_fit_to_train_on(made):
@@ -453,10 +448,7 @@ def test_frames_without_texture_are_refused_with_advice(tmp_path):
 
 
 def test_a_full_disk_is_reported_before_work_starts(shots, tmp_path, monkeypatch):
-    class Usage:
-        free = 5_000_000
-
-    monkeypatch.setattr("shutil.disk_usage", lambda path: Usage)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=5_000_000))
     with pytest.raises(OSError, match="of disk are needed, 5 MB are free"):
         prepare(shots, tmp_path / "made")
 
@@ -469,16 +461,14 @@ def test_a_replacement_does_not_keep_the_colors_of_old_points(tmp_path):
 
 
 def test_colmap_does_not_start_on_a_full_disk(shots, tmp_path, monkeypatch):
-    class Usage:
-        free = 10**12
-
-    monkeypatch.setattr("shutil.disk_usage", lambda path: Usage)
+    disk = SimpleNamespace(free=10**12)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: disk)
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", lambda *arguments: pytest.fail("was started"))
     clear = Journal.clear
 
     def clear_and_fill(self, keep):
         clear(self, keep)
-        monkeypatch.setattr(Usage, "free", 3_000_000)  # other programs fill the disk
+        disk.free = 3_000_000  # other programs fill the disk
 
     monkeypatch.setattr(Journal, "clear", clear_and_fill)
     message = "6 MB of disk are needed, 3 MB are free; free some disk space and run the same command again"
@@ -521,14 +511,6 @@ def test_unrelated_images_are_refused_with_advice(tmp_path):
     unrelated = [boards.texture(k, boards.COLORS[0], 256, (20, 60)) for k in range(10)]
     with pytest.raises(ValueError, match="no two frames show enough of the same static surfaces"):
         prepare(boards.write_folder(tmp_path / "unrelated", unrelated), tmp_path / "made")
-
-
-def test_masks_of_everything_are_refused_with_advice(shots, tmp_path):
-    (tmp_path / "masks").mkdir()
-    for path in shots.iterdir():
-        cv2.imwrite(str(tmp_path / "masks" / path.name), np.zeros(boards.SIZE[::-1], np.uint8))
-    with pytest.raises(ValueError, match=r"hardly any texture in static regions: 0 features .* check the masks"):
-        prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"))
 
 
 def test_if_nearly_everything_seems_to_move_the_error_suggests_masks(tmp_path, monkeypatch):
