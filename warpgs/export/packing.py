@@ -50,7 +50,7 @@ def unpack(words: UInt32[np.ndarray, " N"], widths: tuple[int, ...]) -> UInt32[n
 
 def pack_rotations(quats: Float32[np.ndarray, "N 4"]) -> UInt32[np.ndarray, " N"]:
     """Packs unit quaternions into 32 bits: the index of the largest component, then the others in 10 bits each."""
-    largest, others = smallest_three(quats)
+    largest, others = without_max_component(quats)
     integers = quantise(others, COMPONENT_RANGE, ROTATION_BITS)
     return pack(np.concatenate([largest[:, None].astype(np.uint32), integers], 1), (2, *[ROTATION_BITS] * 3))
 
@@ -66,8 +66,10 @@ def unpack_rotations(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, "N 
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
-def smallest_three(quats: Float[np.ndarray, "N 4"]) -> tuple[Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
-    """[N] index of the largest component of quaternions, and [N, 3] the others if that is made positive."""
+def without_max_component(
+    quats: Float[np.ndarray, "N 4"],
+) -> tuple[Int64[np.ndarray, " N"], Float64[np.ndarray, "N 3"]]:
+    """[N] index of the component of maximum magnitude, and [N, 3] the others, with signs that make it positive."""
     largest = np.abs(quats).argmax(1)
     positive = quats * np.where(quats[np.arange(len(quats)), largest] < 0, -1.0, 1.0)[:, None]
     return largest, positive[_smaller(largest)].reshape(-1, 3)

@@ -25,7 +25,7 @@ from warpgs.ops.sh import degree_of
 
 from .cloud import Cloud, sigmoid
 from .compressed import morton_order
-from .packing import smallest_three
+from .packing import without_max_component
 from .per_time import per_time
 
 TABLE = 256
@@ -92,7 +92,7 @@ def _geometry(cloud: Cloud) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     logs = np.sign(cloud.means) * np.log1p(np.abs(cloud.means.astype(np.float64)))
     low, high = logs.min(0), logs.max(0)
     positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
-    largest, others = smallest_three(cloud.quats)
+    largest, others = without_max_component(cloud.quats)
     components = np.rint(255 * np.clip(others / np.sqrt(2) + 0.5, 0, 1))
     images = {
         "means_l.webp": _square((positions & 255).astype(np.uint8)),

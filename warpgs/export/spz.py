@@ -20,7 +20,7 @@ from warpgs.ops.sh import degree_of
 
 from .cloud import Cloud, sigmoid
 from .moving import required
-from .packing import smallest_three
+from .packing import without_max_component
 from .per_time import per_time
 
 MAGIC = 0x5053474E
@@ -104,7 +104,7 @@ def _byte(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """[N] words: the index of the largest component in the order x, y, z, w, then a sign and 9 bits for each other."""
-    largest, others = smallest_three(np.roll(quats, -1, axis=1))
+    largest, others = without_max_component(np.roll(quats, -1, axis=1))
     size = np.floor(511 * np.abs(others) * np.sqrt(2) + 0.5).clip(0, 511).astype(np.uint32)
     words = largest.astype(np.uint32)
     for k in range(3):
