@@ -3,7 +3,8 @@
 One camera does not determine how far away something is that moves: twice as large, twice as far away and twice as fast
 looks the same. But the distance of an object that keeps its size is inversely proportional to the size at which it is
 seen, and the factor is bounded, because the object hides the static surfaces around it. Most objects stand on something
-or come close to it at least once, so the largest factor that the bound allows is a good one.
+or come close to it at least once, so the largest factor that the bound allows is a good one. Objects that the image
+border cuts off in most frames have no size; beside others that have one, they get the depth of what is around them.
 
 The depth of a network has the right order of magnitude, and misplaces each object as a whole by an amount that changes
 with time. Both depths are averaged then.
@@ -132,8 +133,6 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
     def factors(
         item: MovingObject, seen: dict[int, _ObjectView], points_of: Callable[[int], Points]
     ) -> dict[int, Float[Tensor, " P"]]:
-        if _is_mostly_cut(item):
-            return {}
         known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
@@ -220,21 +219,24 @@ def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
         By index of the frame, [h, w] depth in its scaled mask [scene units], NaN elsewhere: that of round objects, or,
         of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
-    return _by_object(capture, _depths)
+    return _by_object(capture, _depths, _depths_around)
 
 
 def _by_object(
-    capture: Capture, values_of: Callable[..., dict[int, Float[Tensor, " P"]]]
+    capture: Capture,
+    values_of: Callable[..., dict[int, Float[Tensor, " P"]]],
+    values_of_cut: Callable[..., dict[int, Float[Tensor, " P"]]] = lambda *_: {},
 ) -> dict[int, Float[Tensor, "h w"]]:
     """By index of the frame, [h, w] values of objects' pixels in its scaled mask, NaN elsewhere.
 
-    Objects that cannot be told apart have no values, and those that too few frames show whole only where no other
-    values are, and where there are others at all.
+    Objects that cannot be told apart have no values.
 
     Args:
         capture: The capture, with masks and static points.
         values_of: Given an object, how each frame sees it, and the static points that a frame shows: the values of its
             pixels by index of the frame.
+        values_of_cut: The same for objects that too few frames show whole. It is asked last, if others have values, and
+            fills pixels without one; by default it has none.
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     points_of = cache(partial(_static_points, capture))
@@ -245,7 +247,8 @@ def _by_object(
         if _is_mostly_cut(item) and not images:
             break  # without any depth, dynamic Gaussians start in front of the points around them
         seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
-        for index, found in values_of(item, seen, points_of).items():
+        choose = values_of_cut if _is_mostly_cut(item) else values_of
+        for index, found in choose(item, seen, points_of).items():
             size = scaled_size(capture.cameras[capture.train[index]])
             values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
             pixels = torch.from_numpy(item.pixels[index]).long()
@@ -274,13 +277,9 @@ def _depths(
 ) -> dict[int, Float[Tensor, " P"]]:
     """Depth of an object's pixels in each frame that shows it whole or beside another one; none if it cannot be told.
 
-    If it is hardly ever whole, its depth is that of the static points around it, in all frames that show it.
-
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
     """
-    if _is_mostly_cut(item):
-        return _depths_around(seen, points_of)
     choices = []
     for sizes, factor in _sizes(item, seen, points_of):
         if math.isnan(factor):
@@ -293,7 +292,7 @@ def _depths(
 
 
 def _depths_around(
-    seen: dict[int, "_ObjectView"], points_of: Callable[[int], Points]
+    item: MovingObject, seen: dict[int, "_ObjectView"], points_of: Callable[[int], Points]
 ) -> dict[int, Float[Tensor, " P"]]:
     """Depth of the static points around an object, smoothed over time, at its pixels by frame; none if unknown."""
     bounds = {index: view.bound(points_of(index)) for index, view in seen.items()}
@@ -304,7 +303,7 @@ def _depths_around(
     found = {}
     for index, view in seen.items():
         weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
-        found[index] = torch.full((view.num_pixels,), math.exp(np.average(logs, weights=weights)))
+        found[index] = torch.full((len(item.pixels[index]),), math.exp(np.average(logs, weights=weights)))
     return found
 
 
@@ -341,13 +340,12 @@ class _ObjectView:
 
     Attributes:
         is_cut: Whether it touches the image border.
-        num_pixels: Number of its pixels.
         time: Time of the frame in [0, 1].
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
         self._camera = camera.resized(*scaled_size(camera))
-        self.num_pixels, self.time = len(pixels), camera.time
+        self.time = camera.time
         width, height = self._camera.size
         rows, columns = np.divmod(pixels, width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
