@@ -22,6 +22,7 @@ from warpgs.runs.run import Run
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import GROUPS
+from warpgs.training.schedule import IterationPlan
 from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
@@ -96,6 +97,13 @@ def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
 def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
     with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, trainer.iteration) as logger:
         return trainer.train(logger, interrupt)
+
+
+def plan_to(trainer: Trainer, action: str) -> IterationPlan:
+    """The plan of the first iteration, after which only this is done."""
+    plan = trainer.protocol.at(0)
+    nothing = {field.name: False for field in dataclasses.fields(plan) if field.type is bool}
+    return dataclasses.replace(plan, **{**nothing, action: True})
 
 
 def finished(folder: Path) -> Path:

@@ -312,8 +312,7 @@ def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_al
     needles, extent = make_gaussians([SMALL]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
     trainer._set_scene(SplitScene(needles, copy.deepcopy(needles), NETWORK, torch.zeros(3), torch.ones(3)))
-    nothing = dict.fromkeys(("densify", "prune", "prune_weakest", "reseed", "reset", "realign"), False)
-    trainer._adapt(dataclasses.replace(trainer.protocol.at(0), shorten=True, **nothing), Mock(spec=TrainingLogger))
+    trainer._adapt(tiny.plan_to(trainer, "shorten"), Mock(spec=TrainingLogger))
     assert abs(extent - 1.0) > 0.1
     assert trainer.scene.static.scales.max().item() == pytest.approx(0.5 * extent, rel=1e-5)
     assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)

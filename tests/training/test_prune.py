@@ -239,8 +239,6 @@ def test_if_no_gaussian_contributes_all_stay():
 def test_only_a_pruning_that_removes_something_is_logged(tmp_path, monkeypatch, removed, lines):
     trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", tiny.CONFIG)
     monkeypatch.setattr("warpgs.training.trainer.prune_invisible", lambda *_: removed)
-    nothing = dict.fromkeys(("densify", "prune_weakest", "reseed", "reset", "realign", "shorten"), False)
-    plan = dataclasses.replace(trainer.protocol.at(0), prune=True, **nothing)
     logger = Mock(spec=TrainingLogger)
-    trainer._adapt(plan, logger)
+    trainer._adapt(tiny.plan_to(trainer, "prune"), logger)
     assert logger.log.call_count == lines
