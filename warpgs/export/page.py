@@ -1,11 +1,11 @@
 """One HTML file that plays a dynamic scene without a network: the integers of ``baking``, compressed, and a player.
 
 The player is in ``player/``: the page, its style sheet, two shaders, and two scripts, one of which sorts in a worker.
-The data are in the page as elements ``<script type="application/gzip;base64">`` next to a JSON object with their
-shapes and steps; browsers do not run scripts of this type. The player restores the values and packs them for the GPU.
+The data are in the page as elements ``<script type="application/gzip">`` next to a JSON object with their shapes and
+steps, as text of seven bits per character (``text``); browsers do not run scripts of this type. The player restores the
+values and packs them for the GPU.
 """
 
-import base64
 import html
 import json
 import re
@@ -26,8 +26,9 @@ from .job import Job, Writer
 from .moving import KEYS, SECONDS
 from .packing import to_planes
 from .start_camera import StartView, start_view
+from .text import to_text
 
-VERSION = 2
+VERSION = 3
 MAX_MEGABYTES = 256.0
 """Default of the option."""
 
@@ -63,8 +64,8 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -
     blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
     parts = [(name, part) for name in branches for part in PARTS]
     for name, part in progress(parts, "compressing", quiet):
-        content = base64.b64encode(_packed(part, getattr(branches[name], part))).decode()
-        blocks.append(_block("application/gzip;base64", f"{name}-{part}", content))
+        content = to_text(_packed(part, getattr(branches[name], part)))
+        blocks.append(_block("application/gzip", f"{name}-{part}", content))
     return write_bytes(path, [_player(start.title, "\n".join(blocks)).encode()])
 
 

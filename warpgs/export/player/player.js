@@ -12,10 +12,27 @@ function fail(text) {
 
 // Data ---------------------------------------------------------------------------------------------------------------
 
+const REPLACED = [0, 13, 60]; // NUL, CR and <, which a page cannot hold
+function bytesOf(text) {
+  // Seven bits per character; one from 128 on stands for a replaced one and the next, from 512 on for one without a next.
+  const bytes = new Uint8Array(text.length * 14 >> 3);
+  let count = 0, bits = 0, held = 0;
+  const add = (value) => {
+    bits = (bits << 7 | value) & 0x3fff;
+    held += 7;
+    if (held >= 8) bytes[count++] = bits >> (held -= 8);
+  };
+  for (let i = 0; i < text.length; i++) {
+    const code = text.charCodeAt(i);
+    if (code >= 128 && code < 512) add(REPLACED[(code >> 7) - 1]);
+    add(code & 127);
+  }
+  return bytes.subarray(0, count);
+}
+
 async function unpacked(name, part) {
   // Values as [key][channel][Gaussian], from quantised cosine coefficients.
-  const block = element(`${name}-${part}`), text = atob(block.textContent), packed = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
+  const block = element(`${name}-${part}`), packed = bytesOf(block.textContent);
   block.remove();
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
