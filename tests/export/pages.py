@@ -7,24 +7,33 @@ import re
 import numpy as np
 
 from warpgs.export.baking import PARTS, Baked, Branch
-from warpgs.export.cosines import Levels
 from warpgs.export.packing import from_planes
 from warpgs.export.text import from_text
+from warpgs.export.transform import Levels
 
 
 def read_page(path):
     blocks = dict(re.findall(r'<script type="[^"]+" id="([a-z_-]+)">([^<]*)</script>', path.read_bytes().decode()))
     metadata = json.loads(blocks["scene"])
-    branches = [
-        Branch(**{part: levels(blocks[f"{name}-{part}"], part, metadata["branches"][name][part]) for part in PARTS})
-        for name in ("static", "dynamic")
-    ]
+    branches = [branch(blocks, name, metadata["branches"][name]) for name in ("static", "dynamic")]
     return Baked(metadata["keys"], *branches)
 
 
-def levels(block, part, metadata):
-    planes = np.frombuffer(gzip.decompress(from_text(block)), np.uint8)
-    values = from_planes(planes, tuple(metadata["shape"]))
+def branch(blocks, name, metadata):
+    num = metadata["means"]["shape"][1]
+    octaves = integers(blocks[f"{name}-octaves"], (1, num, 1))[0, :, 0]
+    return Branch(**{part: levels(blocks, name, part, metadata[part], octaves) for part in PARTS})
+
+
+def levels(blocks, name, part, metadata, octaves):
+    shape = tuple(metadata["shape"])
+    values = integers(blocks[f"{name}-{part}"], shape)
     if part == "means":
         values[0] = np.cumsum(values[0], 0, np.int32)
-    return Levels(values, np.array(metadata["steps"], np.float64))
+    basis = integers(blocks[f"{name}-{part}-basis"], (shape[0], shape[0], 1))[:, :, 0]
+    octaves = octaves if part in ("colors", "rest") else np.zeros_like(octaves)
+    return Levels(values, np.array(metadata["steps"], np.float64), octaves, basis)
+
+
+def integers(block, shape):
+    return from_planes(np.frombuffer(gzip.decompress(from_text(block)), np.uint8), shape)

@@ -72,6 +72,16 @@ def test_the_least_visible_gaussians_are_omitted(clouds):
     assert (scenes.image(kept.at(0.5), camera) - rendered(clouds, camera)).abs().max() < 1e-4
 
 
+def test_visibility_is_the_largest_blend_weight_in_any_camera():
+    clouds = scenes.clouds()
+    away = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -90], [0, 0, 0, 1]])
+    behind = dataclasses.replace(scenes.camera(), viewmat=away)
+    seen, unseen = clouds.visibility([scenes.camera()]), clouds.visibility([behind])
+    assert (unseen == 0).all()
+    assert seen.max() > 1
+    assert (clouds.visibility([behind, scenes.camera(), behind]) == seen).all()
+
+
 def test_the_rows_are_the_same_at_every_time(clouds):
     kept = clouds.most_visible(11, [scenes.camera()])
     assert all((kept.at(time).means == clouds.at(time).means[kept.rows]).all() for time in (0.0, 0.6))

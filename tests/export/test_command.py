@@ -85,7 +85,7 @@ def test_a_compressed_file_renders_close_to_the_run(run, data, tmp_path):
 
 
 def test_a_page_renders_close_to_the_run(run, data, tmp_path):
-    summary = export(run, tmp_path, format="html", keys=3)
+    summary = export(run, tmp_path, format="html", keys=3, precision=4.0)
     assert "at 3 key times" in summary
     assert "\ncameras of " in summary
     camera = view(data, 0.5)

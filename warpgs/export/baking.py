@@ -1,9 +1,9 @@
 """A dynamic scene at several key times, quantised to integers: what a page plays.
 
 Static Gaussians have one geometry, and a colour and an opacity per key time; dynamic Gaussians have a geometry per key
-time and one colour. Both are stored as cosine coefficients over the key times (``cosines``), along a Morton curve,
-colours as luma and two chroma (YCoCg). Between key times, means, colours and logarithms of scales are interpolated
-linearly; rotations too, and are then normalised.
+time and one colour. Both are stored as coefficients over the key times (``transform``), along a Morton curve, colours
+as luma and two chroma (YCoCg), in coarser steps for Gaussians that are hardly visible. Between key times, means,
+colours and logarithms of scales are interpolated linearly; rotations too, and are then normalised.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -11,21 +11,26 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import Rotation
 
 from warpgs.model.gaussians import SH_C0
 
 from .cloud import ARRAYS, Cloud, logit, sigmoid
 from .compressed import morton_order
-from .cosines import Levels
+from .transform import Levels
 
-STEPS = {"rotations": 1 / 64, "log_scales": 1 / 16, "colors": 1 / 48, "opacities": 1 / 256, "rest": 1 / 64}
-"""Steps of quantisation; those of chroma are twice as coarse. With them images have about 40 dB and more
-against the scene (docs/viewing.md)."""
-
-MEAN_STEP = 1 / 8
-"""Step of a mean, as a fraction of the size of small Gaussians (10th percentile of the longest standard deviation)."""
+STEPS = {
+    "means": (1 / 6, 1 / 7),
+    "rotations": (1 / 70, 1 / 50),
+    "log_scales": (1 / 6, 1 / 16),
+    "colors": (1 / 100, 1 / 160),
+    "opacities": (1 / 100, 1 / 100),
+    "rest": (1 / 27, 1 / 38),
+}
+"""Steps of static and dynamic Gaussians, for values that are the same at all times (docs/design/page-size.md). Those of
+means are fractions of the size of small Gaussians (10th percentile of the longest standard deviation); those of chroma
+are twice as coarse. A coefficient of K times spreads its error over all of them, so its step is √K times as coarse."""
 
 SCALES = (-7.0, 9.0)
 """Bounds of log-scales, from that of the median Gaussian's longest axis: an axis that is e⁷ times shorter is flat, and
@@ -40,6 +45,12 @@ YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
 
 CHROMA = (1.0, 2.0, 2.0)
 """Factors of the steps of luma and chroma."""
+
+MAX_OCTAVES = 5
+"""Steps of colours are at most 2⁵ times finer or coarser than those of a Gaussian of average visibility."""
+
+MIN_WEIGHT = 0.01
+"""Blend weight added to all, as a fraction of the median: Gaussians that no training camera sees may be seen later."""
 
 TEXEL = {"geometry": 16, "colors": 4, "rest": 4}
 """Bytes that the player's textures take per Gaussian: of one time, of one time, and of one coefficient."""
@@ -58,7 +69,7 @@ class Branch:
         log_scales: [1 or K, N, 3].
         colors: [K or 1, N, 3] luma and chroma of the constant coefficient.
         opacities: [K or 1, N, 1].
-        rest: [1, N, 3 R] luma and chroma of the coefficients of degree 1 and higher, the same at all times.
+        rest: [R, N, 3] luma and chroma of the coefficients of degree 1 and higher, the same at all times.
     """
 
     means: Levels
@@ -70,6 +81,11 @@ class Branch:
 
     def __len__(self) -> int:
         return self.means.levels.shape[1]
+
+    @property
+    def octaves(self) -> Int32[np.ndarray, " N"]:
+        """The exponents of each Gaussian's steps of ``colors`` and ``rest``."""
+        return self.rest.octaves
 
     @cached_property
     def _values(self) -> dict[str, np.ndarray]:
@@ -83,9 +99,9 @@ class Branch:
 
     def at(self, position: float, is_dynamic: bool) -> Cloud:
         """The Gaussians at a position between key times, where key k is at position k."""
-        now = {name: _interpolated(values, position) for name, values in self._values.items()}
+        now = {name: _interpolated(values, position) for name, values in self._values.items() if name != "rest"}
         constant = (now["colors"] @ np.linalg.inv(YCOCG).T - 0.5) / SH_C0
-        rest = now["rest"].reshape(len(self), now["rest"].shape[1] // 3, 3) @ np.linalg.inv(YCOCG).T
+        rest = self._values["rest"].transpose(1, 0, 2) @ np.linalg.inv(YCOCG).T
         return Cloud(
             means=now["means"].astype(np.float32),
             quats=_normalized(now["rotations"]).astype(np.float32),
@@ -111,13 +127,19 @@ class Baked:
         return parts[0].replaced(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS})
 
 
-def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float], precision: float = 1.0) -> Baked:
+def bake(
+    cloud_at: Callable[[float], Cloud],
+    times: Iterable[float],
+    precision: float = 1.0,
+    weights: Float32[np.ndarray, " N"] | None = None,
+) -> Baked:
     """Quantises a scene at key times; Gaussians with values that are not finite at any of them are omitted.
 
     Args:
         cloud_at: The scene at a time, in the same rows at every time.
         times: At least one, evenly spaced over [0, 1].
         precision: All steps of quantisation are divided by it.
+        weights: How visible each Gaussian is, in any unit (``Clouds.visibility``); the same for all if None.
     """
     static_colors, dynamic_geometry, finite = [], [], np.ones(1, bool)
     for time in times:
@@ -128,13 +150,29 @@ def bake(cloud_at: Callable[[float], Cloud], times: Iterable[float], precision: 
         static_colors.append(_color(cloud.select(~is_dynamic)).astype(np.float16))
         dynamic_geometry.append([part[is_dynamic] for part in (cloud.means, cloud.quats, cloud.log_scales)])
     static, dynamic = cloud.select(~is_dynamic & finite), cloud.select(is_dynamic & finite)
+    weights = np.ones(len(cloud), np.float32) if weights is None else weights
+    octaves = [octaves_of(weights[rows & finite]) for rows in (~is_dynamic, is_dynamic)]
     tracks = [np.stack(parts)[:, finite[is_dynamic]] for parts in zip(*dynamic_geometry, strict=True)]
     geometry = [part[None] for part in (static.means, static.quats, static.log_scales)]
+    steps = [{name: pair[branch] / precision for name, pair in STEPS.items()} for branch in (0, 1)]
     return Baked(
         len(dynamic_geometry),
-        _branch(geometry, np.stack(static_colors)[:, finite[~is_dynamic]], static.sh[:, 1:], precision),
-        _branch(tracks, _color(dynamic)[None], dynamic.sh[:, 1:], precision),
+        _branch(geometry, np.stack(static_colors)[:, finite[~is_dynamic]], static.sh[:, 1:], octaves[0], steps[0]),
+        _branch(tracks, _color(dynamic)[None], dynamic.sh[:, 1:], octaves[1], steps[1]),
     )
+
+
+def octaves_of(weights: Float32[np.ndarray, " N"]) -> Int32[np.ndarray, " N"]:
+    """The exponents of steps for which the errors of all Gaussians change images equally.
+
+    The squared error of images is about the error of a colour squared times the blend weight, so steps are inverse to
+    its square root.
+    """
+    if len(weights) == 0 or np.median(weights) == 0.0:  # most are invisible: nothing is known of the steps
+        return np.zeros(len(weights), np.int32)
+    weights = weights.astype(np.float64) + MIN_WEIGHT * np.median(weights)
+    octaves = -0.5 * np.log2(weights)
+    return np.clip(np.rint(octaves - octaves.mean()), -MAX_OCTAVES, MAX_OCTAVES).astype(np.int32)
 
 
 def texture_bytes(num_static: int, num_dynamic: int, keys: int, rest: int) -> int:
@@ -148,7 +186,13 @@ def _color(cloud: Cloud) -> np.ndarray:
     return np.concatenate([np.clip(0.5 + SH_C0 * cloud.sh[:, 0], *COLORS), sigmoid(cloud.logit_opacities[:, None])], 1)
 
 
-def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray, precision: float) -> Branch:
+def _branch(
+    geometry: list[np.ndarray],
+    colors: np.ndarray,
+    rest: np.ndarray,
+    octaves: np.ndarray,
+    steps: Mapping[str, float],
+) -> Branch:
     order = morton_order(geometry[0][0])
     means, quats, log_scales = (part[:, order].astype(np.float64) for part in geometry)
     colors, rest = colors[:, order].astype(np.float64), np.clip(rest[order], *REST).astype(np.float64)
@@ -160,21 +204,18 @@ def _branch(geometry: list[np.ndarray], colors: np.ndarray, rest: np.ndarray, pr
         rotations = _signs_aligned(quats)
     middle = np.median(log_scales[0].max(1)) if len(order) else 0.0
     log_scales = np.clip(log_scales, middle + SCALES[0], middle + SCALES[1])
-    values = {
-        "means": means,
-        "rotations": rotations,
-        "log_scales": log_scales,
-        "colors": colors[..., :3] @ YCOCG.T,
-        "opacities": colors[..., 3:],
-        "rest": (rest @ YCOCG.T).reshape(1, len(rest), 3 * rest.shape[1]),
-    }
-    steps: Mapping[str, float] = {"means": MEAN_STEP * size, **STEPS}
-    factors = {"colors": CHROMA, "rest": CHROMA * rest.shape[1]}
+
+    def over_time(values: np.ndarray, step: float) -> Levels:
+        return Levels.of(values, np.full(values.shape[2], step * np.sqrt(len(values))))
+
+    chroma, octaves = np.array(CHROMA), octaves[order]
     return Branch(
-        **{
-            name: Levels.of(array, np.array(factors.get(name, (1.0,) * array.shape[2])) * steps[name] / precision)
-            for name, array in values.items()
-        }
+        means=over_time(means, steps["means"] * size),
+        rotations=over_time(rotations, steps["rotations"]),
+        log_scales=over_time(log_scales, steps["log_scales"]),
+        colors=Levels.of(colors[..., :3] @ YCOCG.T, chroma * steps["colors"] * np.sqrt(len(colors)), octaves),
+        opacities=over_time(colors[..., 3:], steps["opacities"]),
+        rest=Levels.of((rest @ YCOCG.T).transpose(1, 0, 2), chroma * steps["rest"], octaves, over_time=False),
     )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float32, Int64
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
@@ -32,6 +32,16 @@ class Clouds:
         cloud = Cloud.of_splats(self.scene.splats(time), self.scene.config.antialias)
         return cloud if self.rows is None else cloud.select(self.rows)
 
+    def visibility(self, cameras: Sequence[Camera], quiet: bool = True) -> Float32[np.ndarray, " N"]:
+        """The largest blend weight of each Gaussian in any of the cameras [px], each at its own time."""
+        settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
+        largest = np.zeros(len(self.at(0.0)), np.float32)
+        for camera in progress(cameras, "measuring visibility", quiet):
+            weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
+            assert weights is not None
+            largest = np.maximum(largest, weights.numpy())
+        return largest
+
     def most_visible(self, count: int, cameras: Sequence[Camera], quiet: bool = True) -> "Clouds":
         """The same scene with at most ``count`` Gaussians: those with the largest blend weight in any of the cameras.
 
@@ -45,13 +55,7 @@ class Clouds:
         """
         if count < 1:
             raise ValueError(f"expected at least 1 Gaussian to keep, got {count}")
-        settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
-        weight = np.zeros(len(self.at(0.0)))
-        if len(weight) <= count:
+        if len(self.at(0.0)) <= count:
             return self
-        for camera in progress(cameras, "ranking Gaussians", quiet):
-            weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
-            assert weights is not None
-            weight = np.maximum(weight, weights.numpy())
-        kept = np.sort(np.argsort(-weight, kind="stable")[:count])
+        kept = np.sort(np.argsort(-self.visibility(cameras, quiet), kind="stable")[:count])
         return dataclasses.replace(self, rows=kept if self.rows is None else self.rows[kept])

@@ -16,17 +16,20 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Int32
+
 from warpgs.command_line.progress import progress
 from warpgs.files import write_bytes
 from warpgs.video.camera_paths import evenly_spaced
 
 from .baking import PARTS, Baked, Branch, bake, texture_bytes
-from .cosines import Levels
 from .job import Job, Writer
 from .moving import KEYS, SECONDS
 from .packing import to_planes
-from .start_camera import StartView, start_view
+from .start_camera import StartView, sample_cameras, start_view
 from .text import to_text
+from .transform import Levels
 
 VERSION = 3
 MAX_MEGABYTES = 256.0
@@ -64,8 +67,10 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -
     blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
     parts = [(name, part) for name in branches for part in PARTS]
     for name, part in progress(parts, "compressing", quiet):
-        content = to_text(_packed(part, getattr(branches[name], part)))
-        blocks.append(_block("application/gzip", f"{name}-{part}", content))
+        levels: Levels = getattr(branches[name], part)
+        blocks.append(_packed(f"{name}-{part}", _differences(levels.levels) if part == DIFFERENCES else levels.levels))
+        blocks.append(_packed(f"{name}-{part}-basis", levels.basis[:, :, None]))
+    blocks += [_packed(f"{name}-octaves", branch.octaves[None, :, None]) for name, branch in branches.items()]
     return write_bytes(path, [_player(start.title, "\n".join(blocks)).encode()])
 
 
@@ -107,13 +112,16 @@ def _metadata(branch: Branch) -> dict[str, Any]:
     return {name: {"shape": part.levels.shape, "steps": part.steps.tolist()} for name, part in parts.items()}
 
 
-def _packed(name: str, part: Levels) -> bytes:
-    """A part as gzip; run lengths alone compress planes that are mostly zero better than repeated strings do."""
-    levels = part.levels.copy()
-    if name == DIFFERENCES:
-        levels[0, 1:] -= part.levels[0, :-1]
+def _packed(name: str, integers: Int32[np.ndarray, "K N C"]) -> str:
+    """Integers as gzip; run lengths alone compress planes that are mostly zero better than repeated strings do."""
     compressor = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS, strategy=zlib.Z_RLE)
-    return compressor.compress(to_planes(levels).tobytes()) + compressor.flush()
+    packed = compressor.compress(to_planes(integers).tobytes()) + compressor.flush()
+    return _block("application/gzip", name, to_text(packed))
+
+
+def _differences(levels: Int32[np.ndarray, "K N C"]) -> Int32[np.ndarray, "K N C"]:
+    """The levels, the first of each series as the difference from that of the neighbour."""
+    return np.concatenate([np.diff(levels[:1], axis=1, prepend=0), levels[1:]]).astype(np.int32)
 
 
 def _check_memory(job: Job, keys: int) -> None:
@@ -136,8 +144,9 @@ def _write(job: Job) -> str:
     keys = options.keys or KEYS
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
+    weights = job.clouds.visibility(sample_cameras(job.clouds, job.capture), options.quiet)
     times = progress(evenly_spaced(keys), "baking", options.quiet)
-    baked = bake(job.clouds.at, times, options.precision or 1.0)
+    baked = bake(job.clouds.at, times, options.precision or 1.0, weights)
     size = write_page(path, baked, start, options.quiet)
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
     return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.capture_note}"

@@ -12,6 +12,7 @@ function fail(text) {
 
 // Data ---------------------------------------------------------------------------------------------------------------
 
+const BASIS_UNIT = 1e-4;
 const REPLACED = [0, 13, 60]; // NUL, CR and <, which a page cannot hold
 function bytesOf(text) {
   // Seven bits per character; one from 128 on stands for a replaced one and the next, from 512 on for one without a next.
@@ -30,24 +31,25 @@ function bytesOf(text) {
   return bytes.subarray(0, count);
 }
 
-async function unpacked(name, part) {
-  // Values as [key][channel][Gaussian], from quantised cosine coefficients.
-  const block = element(`${name}-${part}`), packed = bytesOf(block.textContent);
+async function integers(id, count) {
+  const block = element(id), packed = bytesOf(block.textContent);
   block.remove();
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream('gzip'));
-  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
-  const {shape: [keys, num, channels], steps} = SCENE.branches[name][part], frame = num * channels, count = keys * frame;
-  const levels = new Uint32Array(count); // the lowest bit is the sign
-  for (let p = 0; p * count < planes.length; p++) for (let i = 0; i < count; i++) levels[i] |= planes[p * count + i] << (8 * p);
-  const values = new Float32Array(count);
-  for (let key = 0; key < keys; key++) {
-    const weights = Array.from({length: keys}, (_, t) =>
-      key ? Math.sqrt(2 / keys) * Math.cos(Math.PI * (t + 0.5) * key / keys) : Math.sqrt(1 / keys));
-    for (let c = 0; c < channels; c++) for (let i = 0, sum = 0; i < num; i++) {
-      const bits = levels[(key * channels + c) * num + i], level = (bits >>> 1) ^ -(bits & 1);
-      sum = part === 'means' && !key ? sum + level : level; // differences along the curve
-      if (sum) for (let t = 0; t < keys; t++) values[t * frame + c * num + i] += weights[t] * sum * steps[c];
-    }
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer()), values = new Int32Array(count);
+  for (let p = 0; p * count < planes.length; p++) for (let i = 0; i < count; i++) values[i] |= planes[p * count + i] << (8 * p);
+  return values.map((bits) => (bits >>> 1) ^ -(bits & 1)); // the lowest bit is the sign
+}
+
+async function unpacked(name, part, octaves) {
+  // Values as [key][channel][Gaussian], from quantised coefficients; the "keys" of rest are coefficients of harmonics.
+  const {shape: [keys, num, channels], steps} = SCENE.branches[name][part], frame = num * channels;
+  const levels = await integers(`${name}-${part}`, keys * frame), basis = await integers(`${name}-${part}-basis`, keys * keys);
+  const values = new Float32Array(keys * frame), coarser = part === 'colors' || part === 'rest';
+  for (let key = 0; key < keys; key++) for (let c = 0; c < channels; c++) for (let i = 0, sum = 0; i < num; i++) {
+    const level = levels[(key * channels + c) * num + i];
+    sum = part === 'means' && !key ? sum + level : level; // differences along the curve
+    const value = sum * steps[c] * BASIS_UNIT * (coarser ? 2 ** octaves[i] : 1);
+    if (value) for (let t = 0; t < keys; t++) values[t * frame + c * num + i] += basis[key * keys + t] * value;
   }
   return values;
 }
@@ -172,23 +174,23 @@ function texture(unit, name, values, count, layers, isInteger) {
 async function upload() {
   const means = [];
   for (const [branch, name] of NAMES.entries()) {
-    const {means: {shape, steps}, colors: {shape: [colorKeys]}, rest: {shape: [, , channels]}} = BRANCHES[branch], num = shape[1];
-    const parts = {};
-    for (const part of Object.keys(BRANCHES[branch])) parts[part] = await unpacked(name, part);
+    const {means: {shape, steps}, colors: {shape: [colorKeys]}, rest: {shape: [bases]}} = BRANCHES[branch], num = shape[1];
+    const parts = {}, octaves = await integers(`${name}-octaves`, num);
+    for (const part of Object.keys(BRANCHES[branch])) parts[part] = await unpacked(name, part, octaves);
     for (const part of ['colors', 'rest']) toColors(parts[part], num);
     const unit = NEARLY_LINEAR * steps[0], {words, ranges, sizes} = geometryOf(parts, shape, unit);
     const colors = boundsOf(parts.colors), rests = boundsOf(parts.rest);
     means.push(meansOf(parts.means, shape));
     texture(branch, `${name}Geometry`, words, num, shape[0], true);
     texture(2 + branch, `${name}Colors`, texelsOf(parts.colors, num, colors, parts.opacities), num, colorKeys, false);
-    texture(4 + branch, `${name}Rest`, texelsOf(parts.rest, num, rests), num, channels / 3, false);
+    texture(4 + branch, `${name}Rest`, texelsOf(parts.rest, num, rests), num, bases, false);
     gl.uniform3fv(uniform(`lowest[${branch}]`), ranges.map((range) => range[0]));
     gl.uniform3fv(uniform(`span[${branch}]`), ranges.map((range) => range[1] - range[0]));
     gl.uniform1f(uniform(`unit[${branch}]`), unit);
     gl.uniform2fv(uniform(`sizes[${branch}]`), sizes);
     gl.uniform2fv(uniform(`colors[${branch}]`), colors);
     gl.uniform2fv(uniform(`rests[${branch}]`), rests);
-    gl.uniform1i(uniform(`restBases[${branch}]`), channels / 3);
+    gl.uniform1i(uniform(`restBases[${branch}]`), bases);
   }
   gl.uniform1i(uniform('lastKey'), lastKey);
   gl.uniform1i(uniform('compensate'), START.antialias);
