@@ -32,7 +32,8 @@ def clouds():
 
 @pytest.fixture(scope="module")
 def baked(clouds):
-    return bake(clouds.at, evenly_spaced(5))
+    weights = np.geomspace(1.0, 100.0, len(clouds.at(0.0)))  # different steps
+    return bake(clouds.at, evenly_spaced(5), weights=weights.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
