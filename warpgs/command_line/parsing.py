@@ -105,11 +105,9 @@ def _unboxed(text: str) -> str:
 def flags(options: type, prefix: str = "") -> Iterator[str]:
     """All options of a dataclass of options: ``--out``, ``--no-graph``, ``--model.depth`` …"""
     for name, hint in typing.get_type_hints(options, include_extras=True).items():
-        settings = _settings(hint)
-        shown = (settings.name if settings and settings.name else name).replace("_", "-")
-        plain = _plain(hint)
+        shown, plain = _shown(name, hint), _plain(hint)
         if dataclasses.is_dataclass(plain):
-            yield from flags(typing.cast(type, plain), f"{prefix}{shown}.")
+            yield from flags(typing.cast(type, plain), f"{prefix}{shown}." if shown else prefix)
             continue
         yield f"--{prefix}{shown}"
         if plain is bool:
@@ -137,10 +135,9 @@ def documented(options: type, prefix: str = "") -> Iterator[Option]:
     hints, texts = typing.get_type_hints(options, include_extras=True), docstrings(options)
     for field in dataclasses.fields(options):
         hint = hints[field.name]
-        settings, plain = _settings(hint), _plain(hint)
-        shown = (settings.name if settings and settings.name else field.name).replace("_", "-")
+        settings, shown, plain = _settings(hint), _shown(field.name, hint), _plain(hint)
         if dataclasses.is_dataclass(plain):
-            yield from documented(typing.cast(type, plain), f"{prefix}{shown}.")
+            yield from documented(typing.cast(type, plain), f"{prefix}{shown}." if shown else prefix)
             continue
         metavar = (settings.metavar if settings else None) or _metavar(plain) or _repeated(plain)
         is_positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
@@ -212,6 +209,12 @@ def _default_hint(default: str) -> str:
 def _settings(hint: Any) -> Any:
     """What ``tyro.conf.arg`` says in an annotation; None without it."""
     return next((data for data in getattr(hint, "__metadata__", ()) if hasattr(data, "help_behavior_hint")), None)
+
+
+def _shown(name: str, hint: Any) -> str:
+    """The name of a field on the command line; empty for a dataclass whose options have no prefix."""
+    settings = _settings(hint)
+    return name.replace("_", "-") if settings is None or settings.name is None else settings.name
 
 
 def _plain(hint: Any) -> Any:

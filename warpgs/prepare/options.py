@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 LensModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 """COLMAP's lens models that a capture's cameras can represent."""
@@ -17,47 +19,43 @@ MAX_FRAMES = 1000
 
 @dataclass(frozen=True)
 class Selection:
-    """Which frames to take from a source, and their size.
-
-    Attributes:
-        fps: Frames per second of a video; None to use ``count``.
-        count: Number of frames; None for all frames of a folder and 150 of a video.
-        longest_side: Larger frames are scaled down to it [px].
-        start, end: Part of a video to take them from [s from its first frame]; None for its end.
-    """
+    """Which frames to take from a source, and their size."""
 
     fps: float | None = None
+    """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
-    longest_side: int = 960
+    """Number of frames to take; by default all frames of a folder and 150 of a video."""
     start: float = 0.0
+    """Take frames from this time of a video on [s]."""
     end: float | None = None
+    """Take frames up to this time of a video [s]."""
+    longest_side: int = 960
+    """Larger frames are scaled down to this [px]."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How to make a capture from a source.
+    """How to make a capture from a source."""
 
-    Attributes:
-        selection: Frames to take.
-        lens: COLMAP's lens model.
-        focal: Known focal length [px of the source]; None to find it.
-        intrinsics: File of the known lens, see ``intrinsics``; None to find it.
-        camera: How the camera moves.
-        masks: A name in ``masks.MASKERS``, or a folder of masks, 0 = dynamic.
-        depth: A name in ``depth.DEPTHS``; None for "flow", or "none" of a camera that stays at one place.
-        holdout: Every N-th frame is kept for evaluation; 0 for none.
-        weights: Folder with the weights of the networks; None for the Hugging Face cache.
-    """
-
-    selection: Selection = field(default_factory=Selection)
+    selection: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     lens: LensModel = "SIMPLE_RADIAL"
+    """COLMAP's lens model."""
     focal: float | None = None
+    """Known focal length [px of the source's frames]; found by default."""
     intrinsics: Path | None = None
+    """File of the known lens: COLMAP's cameras.txt, or JSON, YAML or XML of OpenCV; instead of --lens and --focal."""
     camera: CameraMotion = "moving"
+    """moving, turning (on the spot) or still (on a tripod). The last two give no depth, and no views from elsewhere."""
     masks: str = "motion"
+    """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
+    named like the source's files or like the capture's frames."""
     depth: str | None = None
+    """How to estimate depth: flow (static surfaces, by optical flow; the default of a moving camera), anything (all
+    pixels, by a network) or none."""
     holdout: int = 0
+    """Keep every N-th frame for evaluation (val_ids); 0 keeps none."""
     weights: Path | None = None
+    """Folder with the networks' weights; by default the Hugging Face cache. Nothing is downloaded."""
 
     @property
     def depth_method(self) -> str:
