@@ -134,17 +134,7 @@ def write_balls(folder: Path, size: BallsSize, quiet: bool = False) -> None:
 
 
 def balls_capture(cache_dir: Path | None = None, size: BallsSize | None = None, quiet: bool = False) -> Path:
-    """The folder of the capture, which is created on the first call.
-
-    Args:
-        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
-        size: Size of the capture; the default size if None.
-        quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
-
-    Raises:
-        ValueError: If there are fewer than two frames.
-        OSError: If it cannot be written; the message names the file or folder.
-    """
+    """The folder of the capture, which is created on the first call; see ``builtin_capture`` of synthetic.py."""
     size = size or BallsSize()
     folder = content_folder(cache_dir, ["balls", VERSION, asdict(size)]) / "balls"
     return cached(folder, lambda partial: write_balls(partial, size, quiet))

@@ -32,6 +32,7 @@ from .builtin_cache import cached, content_folder
 from .degraded_depth import DegradedDepth
 from .images import decode
 from .lens import Lens
+from .synthetic import BuiltinScene
 from .units import SceneUnits
 
 Depth = Literal["exact", "network", "none"]
@@ -52,15 +53,8 @@ Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
-class StudioSize:
-    """Size of the capture; numbers are compared at the default only.
-
-    Attributes:
-        width, height: Size of the images [px].
-        num_frames: Number of times; each has a training frame, every second one also an evaluation frame.
-        num_samples: Samples per pixel.
-        num_points: Number of sparse points.
-    """
+class StudioSize(BuiltinScene):
+    """Size of the capture; numbers are compared at the default only."""
 
     width: int = 480
     height: int = 270
@@ -211,18 +205,7 @@ def _surface_points(
 def studio_capture(
     depth: Depth = "exact", cache_dir: Path | None = None, size: StudioSize | None = None, quiet: bool = False
 ) -> Path:
-    """The folder of the capture, which is created on the first call.
-
-    Args:
-        depth: Exact, with the errors of a network, or none at all.
-        cache_dir: Folder to keep it in; $XDG_CACHE_HOME/warpgs or ~/.cache/warpgs if None.
-        size: Size of the capture; the default size if None.
-        quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
-
-    Raises:
-        ValueError: If there are fewer than two frames.
-        OSError: If it cannot be written; the message names the file or folder.
-    """
+    """The folder of the capture with exact depth, with the errors of a network, or without; see ``builtin_capture``."""
     size = size or StudioSize()
     root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
     exact = cached(root / "studio", lambda partial: write_studio(partial, size, quiet))
