@@ -34,6 +34,23 @@ def finished_run(tmp_path_factory) -> Path:
     return tiny.finished(tmp_path_factory.mktemp("finished"))
 
 
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """The folder of a small built-in capture, which tests leave as it is."""
+    from tests import tiny
+
+    return tiny.write(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="module")
+def quickly():
+    """Disables what costs more time than it saves in trainings of a second."""
+    from tests import tiny
+
+    with tiny.in_haste():
+        yield
+
+
 @pytest.fixture
 def contracts_off():
     """Turns the run-time checks of annotations off, so that the package's own checks have the word."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import jaxtyping
-import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -77,12 +76,6 @@ def in_haste():
     yield
     jaxtyping.config.update("jaxtyping_disable", disabled)
     torch.set_num_threads(threads)
-
-
-@pytest.fixture(scope="module")
-def quickly():
-    with in_haste():
-        yield
 
 
 def write(folder: Path) -> Path:

@@ -13,7 +13,6 @@ import pytest
 from tests.campaign.damage import Hang, bounded, damage
 from tests.data.captures import edit_json
 from tests.prepare.boards import write_video
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs import cli
 from warpgs.command_line.parsing import flags
 from warpgs.errors import FAILED

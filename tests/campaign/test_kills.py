@@ -11,7 +11,6 @@ import pytest
 
 from tests import tiny
 from tests.campaign.training import train
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.runs import checkpoint
 
 pytestmark = pytest.mark.usefixtures("quickly")

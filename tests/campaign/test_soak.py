@@ -9,7 +9,6 @@ import pytest
 
 from tests import tiny
 from tests.campaign.memory import MAX_GROWTH, growth, in_mebibytes, needs_proc, resident
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import scaled
 
 pytestmark = pytest.mark.usefixtures("quickly")

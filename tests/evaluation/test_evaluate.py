@@ -18,7 +18,6 @@ import torch
 
 from tests import tiny
 from tests.data.captures import write_png
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
@@ -378,7 +377,7 @@ def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def run(quickly, tmp_path_factory):  # noqa: F811  # the fixture
+def run(quickly, tmp_path_factory):
     """A run of train.py with its evaluation."""
     data = tiny.write(tmp_path_factory.mktemp("cache"))
     with pytest.MonkeyPatch.context() as patch:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests import tiny
 from tests.export import scenes
 from tests.export.pages import read_page
 from tests.export.test_gltf import decoded as gltf_of
@@ -30,7 +29,6 @@ from warpgs.runs.run import Run
 from warpgs.video import camera_paths
 
 pytestmark = pytest.mark.usefixtures("quickly")
-quickly = tiny.quickly
 
 
 @pytest.fixture(scope="module")

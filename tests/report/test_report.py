@@ -15,7 +15,6 @@ import pytest
 
 from tests.data.captures import edit_json
 from tests.errors import error_line
-from tests.tiny import quickly  # noqa: F401
 from warpgs.cli import main
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
@@ -34,7 +33,7 @@ EVIL = "<img src=x onerror=alert(1)>&\"'"
 
 
 @pytest.fixture(scope="module")
-def made(finished_run, tmp_path_factory, quickly):  # noqa: F811
+def made(finished_run, tmp_path_factory, quickly):
     """An evaluated run."""
     run = shutil.copytree(finished_run, tmp_path_factory.mktemp("made") / "run")
     with pytest.MonkeyPatch.context() as patch:

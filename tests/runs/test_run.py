@@ -34,11 +34,6 @@ def create(config, capture):
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
-
-
-@pytest.fixture(scope="module")
 def capture(data):
     return load_capture(data)
 

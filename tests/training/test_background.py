@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig, validate
 from warpgs.data.balls import BallsSize, balls_capture
 from warpgs.data.capture import background_color
@@ -43,7 +42,7 @@ def finished(data, out, **changes):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, quickly):  # noqa: F811
+def run(tmp_path_factory, quickly):
     """A finished run on a small capture over white; its folder has the capture as well."""
     folder = tmp_path_factory.mktemp("run")
     data = balls_capture(folder / "cache", BallsSize(side=16, num_frames=8, num_val=2), quiet=True)
@@ -191,7 +190,7 @@ def test_a_trainer_refuses_a_background_that_was_not_looked_up(run, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def mean_run(tmp_path_factory, quickly):  # noqa: F811
+def mean_run(tmp_path_factory, quickly):
     """A finished run on a small capture without a background of its own, over the mean colour of its frames."""
     folder = tmp_path_factory.mktemp("mean")
     loss = dataclasses.replace(tiny.CONFIG.loss, dynamic_background="black")

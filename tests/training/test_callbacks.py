@@ -11,7 +11,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import warpgs
 from tests import tiny
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
 from warpgs.runs import checkpoint, preview
 from warpgs.runs.config_file import read_config
@@ -26,11 +25,6 @@ pytestmark = pytest.mark.usefixtures("quickly")
 CHECK_EVERY = 4
 CALLED_AT = sorted({*range(4, 33, CHECK_EVERY), *range(7, 33, 7)})
 """Iterations of regular checks and of checkpoints."""
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
 
 
 class Watched:

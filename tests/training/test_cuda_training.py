@@ -25,11 +25,6 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 STEPS = 50
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
-
-
 def trainer_on_cuda(data, run, **changes):
     return tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, device="cuda", **changes))
 

@@ -92,11 +92,6 @@ def test_each_context_starts_without_a_request():
 # In training --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
-
-
 @pytest.fixture
 def config(data, tmp_path, contracts_off):
     return dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")

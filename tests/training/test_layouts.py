@@ -6,7 +6,6 @@ import pytest
 
 from tests import tiny
 from tests.data import layouts
-from tests.tiny import quickly  # noqa: F401
 from warpgs.data.loaders import load_capture
 from warpgs.training.fitting import fitted
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from tests import tiny, two_ranks
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture

@@ -8,7 +8,6 @@ import torch
 
 from tests import tiny, two_ranks
 from tests.scenes import relative_error
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
 from warpgs.runs import checkpoint
 from warpgs.training import optimizer, ranks
@@ -16,11 +15,6 @@ from warpgs.training import train as script
 from warpgs.training.step import Sample
 
 pytestmark = pytest.mark.usefixtures("quickly")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
 
 
 def config_of(data, folder, **changes):

@@ -20,13 +20,8 @@ from warpgs.training.schedule import Phase
 PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False)
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("reseed") / "capture")
-
-
 @pytest.fixture
-def trainer(capture, tmp_path):
+def trainer(data, tmp_path):
     """Its dynamic Gaussians are opaque, and its deformation network moves them a little."""
     config = dataclasses.replace(
         tiny.CONFIG,
@@ -34,7 +29,7 @@ def trainer(capture, tmp_path):
         densify=dataclasses.replace(tiny.CONFIG.densify, reseed=0.05, max_gaussians=1_000),
         schedule=dataclasses.replace(tiny.SCHEDULE, warmup=0),
     )
-    trainer = tiny.trainer(capture, tmp_path / "run", config)
+    trainer = tiny.trainer(data, tmp_path / "run", config)
     trainer._add_dynamic_gaussians()
     trainer.scene.dynamic.logit_opacities.data[:] = 3.0
     deform(trainer.scene, 0.05)

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.evaluation import evaluate_run
@@ -39,11 +38,6 @@ LONG = {
     "densify.every": 20,
     "densify.gradient": 1e-5,
 }
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="module")

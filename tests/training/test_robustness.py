@@ -13,7 +13,6 @@ import torch
 
 from tests import tiny
 from tests.data.captures import edit_json, write_png
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.evaluation import evaluate, evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.training import command, losses
@@ -25,15 +24,10 @@ pytestmark = pytest.mark.usefixtures("quickly")
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
-
-
 @pytest.fixture
-def data(original, tmp_path):
+def data(data, tmp_path):
     """A copy that a test may change."""
-    return shutil.copytree(original, tmp_path / "capture")
+    return shutil.copytree(data, tmp_path / "capture")
 
 
 @pytest.fixture

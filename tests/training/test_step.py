@@ -9,7 +9,6 @@ import torch
 
 from tests import tiny
 from tests.scenes import relative_error
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.training import ranks
 from warpgs.training.optimizer import GROUPS
@@ -70,11 +69,6 @@ def test_a_missing_input_is_an_error(name):
 
 
 # The phase decides ---------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    return tiny.write(tmp_path_factory.mktemp("cache"))
 
 
 class RecordedWork:

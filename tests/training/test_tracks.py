@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.tiny import quickly  # noqa: F401  # a fixture
 from warpgs.cameras import Camera
 from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.config.presets import PRESETS
@@ -202,7 +201,7 @@ def test_dynamic_gaussians_start_on_the_balls_at_all_times(trainer):
     assert torch.cat(distances).quantile(0.8) < 1.5 * RADIUS / UNITS
 
 
-def test_the_balls_are_still_there_after_training(trainer, capture, quickly):  # noqa: F811
+def test_the_balls_are_still_there_after_training(trainer, capture, quickly):
     assert tiny.train(trainer)
     alphas = []
     for name in capture.val:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests import tiny
 from tests.errors import error_line
 from tests.video.test_writer import frames_of
 from warpgs import rendering
@@ -22,7 +21,6 @@ from warpgs.video.command import Render
 from warpgs.visualize.images import to_bytes
 
 pytestmark = pytest.mark.usefixtures("quickly")
-quickly = tiny.quickly
 
 
 @pytest.fixture(scope="module")
