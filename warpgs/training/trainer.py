@@ -228,10 +228,8 @@ class Trainer:
         if found is not None:
             added = gaussians_that_show(found, scene, views, config, self.capture.extent)
             optim.append(self.step.optimizer, scene.dynamic, added)
-            logger.log(
-                f"iteration {self.iteration + 1}: no dynamic Gaussian shows {fraction:.0%} of the dynamic pixels; "
-                f"{len(added):,} added there"
-            )
+            where = f"{fraction:.0%} of the dynamic pixels, where there were none"
+            logger.log(f"iteration {self.iteration + 1}: {len(added):,} dynamic Gaussians added in {where}")
 
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
