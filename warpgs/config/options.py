@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from .bounds import Bounds, check_bounds
 from .densify import DensifyConfig
@@ -16,6 +16,8 @@ from .schedule import Schedule
 
 NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
+
+BackgroundName = Literal["capture", "mean", "black", "white"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class TrainConfig:
     try_masks: bool = False
     """Try out masks that `prepare` made in two short trainings, with them and without, before runs that are longer, and
     take everything as dynamic if held-out frames are better without."""
-    background: Literal["capture", "mean", "black", "white"] | tuple[float, float, float] = "capture"
+    background: BackgroundName | tuple[float, float, float] = "capture"
     """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
     same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
     static_geometry: bool = False
@@ -124,9 +126,10 @@ def validate(config: TrainConfig) -> None:
             "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "
             f"got {model.position_bands} and {model.time_bands}"
         )
-    named, rgb = config.background in ("capture", "mean", "black", "white"), config.background
-    if not named and not (isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)):
-        raise ValueError(f"background must be capture, mean, black, white, or three numbers in [0, 1], got {rgb!r}")
+    names, rgb = get_args(BackgroundName), config.background
+    is_rgb = isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)
+    if rgb not in names and not is_rgb:
+        raise ValueError(f"background must be {', '.join(names)}, or three numbers in [0, 1], got {rgb!r}")
     if schedule.stage1 + schedule.stage2 == 0:
         raise ValueError("schedule.stage1 and schedule.stage2 are both 0: nothing to train")
 
