@@ -82,16 +82,11 @@ def test_a_step_averages_gradients_and_adds_statistics_over_the_ranks(data, tmp_
 
 def test_a_step_is_as_much_larger_as_gsplat_and_grendel_scale_it(monkeypatch, data, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
-    rates = {
-        "extent": 1.0,
-        "progress": 0.5,
-        "settle_progress": 0.0,
-        "means_progress": dict.fromkeys(optimizer.BRANCHES, 0.5),
-    }
-    rates |= {name: dict.fromkeys(optimizer.NETWORKS, 0.5) for name in ("network_progress", "warmup_factors")}
-    alone = optimizer.learning_rates(tiny.CONFIG.optim, **rates)
+    networks = dict.fromkeys(optimizer.NETWORKS, 0.5)
+    at = optimizer.Progress(0.5, 0.0, dict.fromkeys(optimizer.BRANCHES, 0.5), networks, networks)
+    alone = optimizer.learning_rates(tiny.CONFIG.optim, 1.0, at)
     monkeypatch.setattr(ranks, "num_ranks", lambda: 4)
-    scaled = optimizer.learning_rates(tiny.CONFIG.optim, **rates)
+    scaled = optimizer.learning_rates(tiny.CONFIG.optim, 1.0, at)
     assert scaled == {name: 2.0 * rate for name, rate in alone.items()}
     adam = optimizer.make_optimizer(trainer.step.parameters(), tiny.equal_rates(0.1))
     assert adam.betas == pytest.approx((0.9**4, 0.999**4))

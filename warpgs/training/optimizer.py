@@ -9,6 +9,7 @@ gsplat's 1 − N (1 − β) agrees to first order, but is 0 for ten ranks.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Int64
@@ -71,25 +72,32 @@ def make_optimizer(parameters: Mapping[str, nn.Parameter], rates: Mapping[str, T
     return Adam(groups, (BETAS[0] ** num, BETAS[1] ** num), EPSILON / math.sqrt(num))
 
 
-def learning_rates(
-    config: OptimConfig,
-    extent: float,
-    progress: float,
-    settle_progress: float,
-    means_progress: Mapping[str, float],
-    network_progress: Mapping[str, float],
-    warmup_factors: Mapping[str, float],
-) -> dict[str, float]:
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is, for its learning rates.
+
+    Attributes:
+        progress: Fraction of the run done, in [0, 1].
+        settle_progress: Fraction done of the iterations in which Gaussians settle (``Schedule.settle``).
+        means_progress: By branch, fraction done of the decay of its positions' learning rate.
+        network_progress: By network, fraction done of the iterations in which it is trained.
+        warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
+    """
+
+    progress: float
+    settle_progress: float
+    means_progress: dict[str, float]
+    network_progress: dict[str, float]
+    warmup_factors: dict[str, float]
+
+
+def learning_rates(config: OptimConfig, extent: float, at: Progress) -> dict[str, float]:
     """Learning rate of each group of ``GROUPS``, for a step over as many views as there are ranks.
 
     Args:
         config: Rates of one view per step.
         extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
-        progress: Fraction of the run done, in [0, 1].
-        settle_progress: Fraction done of the iterations in which Gaussians settle.
-        means_progress: By branch, fraction done of the decay of its positions' rate.
-        network_progress: By network, fraction done of the iterations in which it is trained.
-        warmup_factors: By network, factor of its rate.
+        at: How far the run is.
     """
     scale = extent if config.means_scale is None else config.means_scale
     gaussians = {
@@ -99,14 +107,15 @@ def learning_rates(
         "sh_dc": config.sh_dc,
         "sh_rest": config.sh_rest,
     }
-    settled = exponential(1.0, SETTLE_DECAY, settle_progress)
+    settled = exponential(1.0, SETTLE_DECAY, at.settle_progress)
     rates = {f"{branch}.{name}": settled * rate for branch in BRANCHES for name, rate in gaussians.items()}
     for branch in BRANCHES:
-        rates[f"{branch}.means"] = exponential(config.means, MEANS_DECAY * config.means, means_progress[branch]) * scale
+        decayed = exponential(config.means, MEANS_DECAY * config.means, at.means_progress[branch])
+        rates[f"{branch}.means"] = decayed * scale
     for name in NETWORKS:
-        rate = exponential(config.networks, config.networks_end, network_progress[name])
-        rates[name] = warmup_factors[name] * rate
-    rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, progress)
+        rate = exponential(config.networks, config.networks_end, at.network_progress[name])
+        rates[name] = at.warmup_factors[name] * rate
+    rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, at.progress)
     return {name: math.sqrt(ranks.num_ranks()) * rate for name, rate in rates.items()}
 
 

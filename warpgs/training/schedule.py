@@ -5,7 +5,7 @@ from typing import Literal
 
 from warpgs.config import LossConfig, TrainConfig
 
-from .optimizer import BRANCHES, exponential
+from .optimizer import BRANCHES, Progress, exponential
 
 NOISE = 0.1
 """Initial standard deviation of the noise on time, in frame intervals (Deformable-3DGS)."""
@@ -58,16 +58,11 @@ def compares_branches(stage: StageName, config: LossConfig) -> bool:
 
 
 @dataclass(frozen=True)
-class IterationPlan:
+class IterationPlan(Progress):
     """What the schedule says of one iteration.
 
     Attributes:
         phase: Everything that the training step branches on.
-        progress: Fraction of the run done.
-        settle_progress: Fraction done of the iterations in which Gaussians settle (``Schedule.settle``).
-        means_progress: By branch, fraction done of the decay of its positions' learning rate.
-        network_progress: By network, fraction done of the iterations in which it is trained.
-        warmup_factors: By network, factor of its learning rate; rises from 0 to 1 once the network is in use.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
         densify, reset, prune, prune_weakest, reseed, realign, shorten: What to do after the iteration: densify, reset
@@ -77,11 +72,6 @@ class IterationPlan:
     """
 
     phase: Phase
-    progress: float
-    settle_progress: float
-    means_progress: dict[str, float]
-    network_progress: dict[str, float]
-    warmup_factors: dict[str, float]
     depth_weight: float
     time_noise: float
     densify: bool

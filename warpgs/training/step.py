@@ -115,8 +115,6 @@ class Step:
 
     def __call__(self, plan: IterationPlan, sample: Sample) -> None:
         """Runs one iteration."""
-        progress = (plan.progress, plan.settle_progress, plan.means_progress, plan.network_progress)
-        rates = optim.learning_rates(self.config.optim, self.extent, *progress, plan.warmup_factors)
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
         background = background_color(self.views.background)
         self._inputs.send(
@@ -125,7 +123,7 @@ class Step:
             background=background,
             dynamic_background=background if self.views.background == "white" else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
-            learning_rates=rates,
+            learning_rates=optim.learning_rates(self.config.optim, self.extent, plan),
         )
         self.views.select(sample.view)
         if self._graphs is None:
