@@ -40,26 +40,20 @@ def test_a_report_is_one_line(tmp_path, capsys):
         assert part in output
 
 
-def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 0) as log:
-        clock[0] += 100.0
-        log.report(status(100))
-        clock[0] += 20.0
-        log.report(status(200))
+@pytest.mark.parametrize(
+    ("start", "reports", "speed", "later"),
+    [(0, {100.0: 100, 20.0: 200}, "1.0", "5.0 it/s  60 s"), (400, {5.0: 450, 20.0: 460}, "10.0", "0.5 it/s  80 s")],
+)
+def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(
+    tmp_path, capsys, clock, start, reports, speed, later
+):
+    with TrainingLogger(tmp_path, 500, start) as log:
+        for seconds, iteration in reports.items():
+            clock[0] += seconds
+            log.report(status(iteration))
     first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith("1.0 it/s")  # which includes the compilation of kernels
-    assert "5.0 it/s  60 s left" in second
-
-
-def test_the_speed_of_a_resumed_run_covers_its_own_iterations(tmp_path, capsys, clock):
-    with TrainingLogger(tmp_path, 500, 400) as log:
-        clock[0] += 5.0
-        log.report(status(450))
-        clock[0] += 20.0
-        log.report(status(460))
-    first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith("10.0 it/s")
-    assert "0.5 it/s  80 s left" in second
+    assert first.endswith(f" {speed} it/s")  # which includes the compilation of kernels
+    assert f"{later} left" in second
 
 
 def test_lines_have_a_minimum_distance_in_time(tmp_path, capsys, clock):

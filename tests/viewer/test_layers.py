@@ -30,22 +30,11 @@ def sides(layer, scene=None):
     return image[12, 8].tolist(), image[12, 24].tolist()
 
 
-def test_the_joint_layer_shows_all_gaussians():
-    left, right = sides("joint")
-    assert left[0] > 200
-    assert right[1] > 200
-
-
-def test_the_static_layer_shows_only_static_gaussians():
-    left, right = sides("static")
-    assert left[0] > 200
-    assert right == BLACK
-
-
-def test_the_dynamic_layer_shows_only_dynamic_gaussians():
-    left, right = sides("dynamic")
-    assert left == BLACK
-    assert right[1] > 200
+@pytest.mark.parametrize("layer", ["joint", "static", "dynamic"])
+def test_a_layer_shows_the_gaussians_of_its_branch(layer):
+    left, right = sides(layer)
+    assert left == BLACK if layer == "dynamic" else left[0] > 200
+    assert right == BLACK if layer == "static" else right[1] > 200
 
 
 def test_alpha_is_white_where_the_image_is_opaque():
