@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -79,6 +80,19 @@ class Camera:
         pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(depth)], 1)
         viewed = (pixels @ torch.linalg.inv(self.K).T) * depth[:, None]
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
+
+    @staticmethod
+    def posed(
+        rotation: Float[np.ndarray, "3 3"],
+        position: Float[np.ndarray, "3"],
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        time: float = 0.0,
+    ) -> "Camera":
+        """A camera with a world-to-camera rotation and a position, which are combined before they are rounded."""
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+        return Camera(torch.tensor(viewmat, dtype=torch.float32), torch.tensor(K, dtype=torch.float32), *size, time)
 
     @staticmethod
     def looking_at(

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from warpgs.cameras import Camera
@@ -47,14 +46,11 @@ def read_camera(
     rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
     if not is_rotation(rotation):
         raise ValueError(f"{path}: orientation is not a rotation")
-    viewmat = np.eye(4)
     try:
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ units.from_world(position)
-        K = pinhole_matrix(lens.checked())
+        K, center = pinhole_matrix(lens.checked()), units.from_world(position)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    viewmat_tensor, K_tensor = (torch.tensor(m, dtype=torch.float32) for m in (viewmat, K))
-    return Camera(viewmat_tensor, K_tensor, lens.width, lens.height, time), lens
+    return Camera.posed(rotation, center, K, (lens.width, lens.height), time), lens
 
 
 def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:

@@ -114,12 +114,9 @@ def _pose(time: float, shift: float) -> tuple[Float[np.ndarray, "3 3"], Vector]:
 
 def _camera(time: float, shift: float, size: StudioSize) -> Camera:
     rotation, position = _pose(time, shift)
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.from_numpy(rotation)
-    viewmat[:3, 3] = torch.from_numpy(-(rotation @ position))
     focal = 0.82 * size.width
-    K = torch.tensor([[focal, 0.0, 0.5 * size.width], [0.0, focal, 0.5 * size.height], [0.0, 0.0, 1.0]])
-    return Camera(viewmat, K, size.width, size.height, time)
+    K = np.array([[focal, 0.0, 0.5 * size.width], [0.0, focal, 0.5 * size.height], [0.0, 0.0, 1.0]])
+    return Camera.posed(rotation, position, K, (size.width, size.height), time)
 
 
 def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:

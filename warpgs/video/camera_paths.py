@@ -167,10 +167,11 @@ def interpolated(
     positions, focals, others = (_linear(x, columns, wanted) for columns in values)
     if smooth:
         positions = PchipInterpolator(x, values[0])(wanted)
-    return [
-        _camera(first, r, p, (*np.exp(f), *o[:2]), o[2])
-        for r, p, f, o in zip(rotations, positions, focals, others, strict=True)
-    ]
+    path = []
+    for r, p, (fx, fy), (cx, cy, time) in zip(rotations, positions, np.exp(focals), others, strict=True):
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        path.append(Camera.posed(r, p, K, first.size, float(time)))
+    return path
 
 
 def _linear(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -184,25 +185,11 @@ def _smoothed(path: list[Camera], sigma: float) -> list[Camera]:
     mixed = gaussian_filter1d(np.stack([_rotation(c) for c in path]), sigma, axis=0, mode="nearest")
     U, _, Vt = np.linalg.svd(mixed)  # the rotation nearest to each mean
     rotations = U @ Vt
-    return [
-        _camera(c, r, p, (float(c.K[0, 0]), float(c.K[1, 1]), float(c.K[0, 2]), float(c.K[1, 2])), c.time)
-        for c, r, p in zip(path, rotations, positions, strict=True)
-    ]
+    return [Camera.posed(r, p, c.K.numpy(), c.size, c.time) for c, r, p in zip(path, rotations, positions, strict=True)]
 
 
 def _rotation(camera: Camera) -> np.ndarray:
     return camera.viewmat[:3, :3].double().cpu().numpy()
-
-
-def _camera(
-    like: Camera, rotation: np.ndarray, position: np.ndarray, intrinsics: tuple[float, ...], time: float
-) -> Camera:
-    """A camera of the size of ``like`` with this world-to-camera rotation, position and (fx, fy, cx, cy)."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return Camera(torch.from_numpy(viewmat).float(), K, like.width, like.height, float(time))
 
 
 def focus(camera: Camera, points: Float[Tensor, "P 3"]) -> float:

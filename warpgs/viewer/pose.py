@@ -4,7 +4,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from warpgs.cameras import Camera
@@ -41,13 +40,10 @@ def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
     if not all(map(math.isfinite, (*pose.wxyz, *pose.position))) or not any(pose.wxyz) or not 0 < pose.fov < math.pi:
         raise ValueError(f"the browser sent an invalid camera: {pose}")
     world_to_camera = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = world_to_camera
-    viewmat[:3, 3] = -world_to_camera @ np.array(pose.position)
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * pose.fov)
-    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
-    return Camera(torch.tensor(viewmat, dtype=torch.float32), torch.tensor(K), width, height, time)
+    K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    return Camera.posed(world_to_camera, np.array(pose.position), K, size, time)
 
 
 def pose_of(camera: Camera) -> Pose:

@@ -221,16 +221,13 @@ def _depth_view(frame: PosedFrame, undistorted: bool) -> DepthView:
 
 
 def _camera(frame: PosedFrame, lens: Lens, units: SceneUnits, time: float) -> Camera:
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = frame.pose[:, :3]
-    viewmat[:3, 3] = -frame.pose[:, :3] @ units.from_world(frame.center)
-    K = pinhole_matrix(lens.checked())
-    if not np.isfinite(viewmat.astype(np.float32)).all():
+    K, center = pinhole_matrix(lens.checked()), units.from_world(frame.center)
+    camera = Camera.posed(frame.pose[:, :3], center, K, (lens.width, lens.height), time)
+    if not camera.viewmat.isfinite().all():
         raise ValueError("the pose is not finite in scene units")
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"the time {time} is not in [0, 1]")
-    viewmat_tensor, K_tensor = (torch.tensor(m, dtype=torch.float32) for m in (viewmat, K))
-    return Camera(viewmat_tensor, K_tensor, lens.width, lens.height, time)
+    return camera
 
 
 @dataclass(frozen=True)
