@@ -8,18 +8,18 @@ import pytest
 
 from warpgs.sweep.formats import latex, markdown, means_csv
 from warpgs.sweep.peers import read_peers
-from warpgs.sweep.table import Measured, Statistic, best_means, make_tables
+from warpgs.sweep.table import Statistic, best_means, make_tables
 
 LABELS = {"a": "(a) S1", "b": "(b) 50% & more"}
 
 
 def measured(psnrs, **others):
-    """Cells from {(variant, scene): [PSNR of each seed]}; None = not finished."""
-    return [
-        Measured(variant, scene, seed, None if psnr is None else {"psnr": psnr, **others})
+    """Results from {(variant, scene): [PSNR of each seed]}; None = not finished."""
+    return {
+        (variant, scene, seed): None if psnr is None else {"psnr": psnr, **others}
         for (variant, scene), values in psnrs.items()
         for seed, psnr in enumerate(values)
-    ]
+    }
 
 
 def column(table, key):
@@ -59,14 +59,14 @@ def test_units_and_sums():
 
 
 def test_a_value_that_one_seed_lacks_has_no_mean():
-    cells = [Measured("a", "as", 0, {"psnr": 1.0, "lpips": None}), Measured("a", "as", 1, {"psnr": 1.0, "lpips": 0.5})]
-    (table,) = make_tables([*cells, Measured("b", "as", 0, {"psnr": 2.0, "lpips": 0.1})], LABELS, {})
+    cells = {("a", "as", 0): {"psnr": 1.0, "lpips": None}, ("a", "as", 1): {"psnr": 1.0, "lpips": 0.5}}
+    (table,) = make_tables({**cells, ("b", "as", 0): {"psnr": 2.0, "lpips": 0.1}}, LABELS, {})
     assert column(table, "lpips") == [None, Statistic(0.1, None)]
 
 
 def test_the_best_of_a_column_is_the_highest_or_the_lowest_and_ties_of_all_have_none():
-    cells = [Measured("a", "as", 0, {"psnr": 30.0, "lpips": 0.2, "ssim": 0.9})]
-    cells += [Measured("b", "as", 0, {"psnr": 31.0, "lpips": 0.1, "ssim": 0.90001})]
+    cells = {("a", "as", 0): {"psnr": 30.0, "lpips": 0.2, "ssim": 0.9}}
+    cells["b", "as", 0] = {"psnr": 31.0, "lpips": 0.1, "ssim": 0.90001}
     (table,) = make_tables(cells, LABELS, {})
     assert best_means(table) == [31.0, None, 0.1]
 
@@ -78,7 +78,7 @@ def test_a_line_that_lacks_seeds_is_never_the_best():
     text = markdown("Mine", tables, [])
     assert "| (b) 50% & more | 32.00 | 1 of 2 |" in text
     assert "| **30.50 ± 0.71** | 2 |" in text
-    (alone,) = make_tables(cells[:4], LABELS, {})
+    (alone,) = make_tables(dict([*cells.items()][:4]), LABELS, {})
     assert best_means(alone) == [None]
 
 

@@ -11,14 +11,14 @@ from .cells import Cell
 from .formats import cells_csv, latex, markdown, means_csv
 from .page import write_page
 from .spec import SweepSpec
-from .table import Measured, Peers, Table, make_tables
+from .table import Peers, Table, make_tables
 
 
 def tables_of(board: Board, spec: SweepSpec, peers: Peers) -> list[Table]:
     """The tables of what has finished."""
     labels = {variant.name: variant.label for variant in spec.variants}
-    cells = [Measured(cell.variant, cell.scene, cell.seed, board.metrics.get(cell.name)) for cell in board.cells]
-    return make_tables(cells, labels, peers)
+    measured = {(cell.variant, cell.scene, cell.seed): board.metrics.get(cell.name) for cell in board.cells}
+    return make_tables(measured, labels, peers)
 
 
 def notes_of(board: Board) -> list[str]:

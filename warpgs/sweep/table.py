@@ -2,8 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 
@@ -58,23 +57,6 @@ class Statistic(NamedTuple):
     deviation: float | None
 
 
-@dataclass(frozen=True)
-class Measured:
-    """A cell with its results.
-
-    Attributes:
-        variant: Name of its variant.
-        scene: Name of its capture.
-        seed: Its seed.
-        metrics: Content of metrics.json; None if it is not finished.
-    """
-
-    variant: str
-    scene: str
-    seed: int
-    metrics: Mapping[str, Any] | None
-
-
 class Row(NamedTuple):
     """A line of a table.
 
@@ -110,40 +92,44 @@ class Table(NamedTuple):
     rows: tuple[Row, ...]
 
 
+Measured = Mapping[tuple[str, str, int], Mapping[str, Any] | None]
+"""Content of every cell's metrics.json by variant, capture and seed; None if it is not finished."""
+
 Peers = Mapping[str, Mapping[str, Mapping[str, Statistic]]]
 """Numbers of others by method, capture and metric."""
 
 
-def make_tables(cells: Sequence[Measured], labels: Mapping[str, str], peers: Peers) -> list[Table]:
+def make_tables(measured: Measured, labels: Mapping[str, str], peers: Peers) -> list[Table]:
     """The table of means over captures, if there are several, and one for each capture.
 
     Captures on which nothing has finished are omitted. A mean over captures exists for a seed that has finished on
     all others: each capture counts the same.
 
     Args:
-        cells: Every cell of the sweep.
+        measured: Results of every cell of the sweep.
         labels: Label of every variant, in the order of the lines.
         peers: Numbers of others, shown beside.
     """
-    planned = len({cell.scene for cell in cells})
-    scenes = list(dict.fromkeys(cell.scene for cell in cells if cell.metrics is not None))
+    planned = len({scene for _, scene, _ in measured})
+    scenes = list(dict.fromkeys(scene for (_, scene, _), metrics in measured.items() if metrics is not None))
     groups = [(scene, [scene]) for scene in scenes]
     if len(scenes) > 1:
         count = f"{planned}" if len(scenes) == planned else f"{len(scenes)} of {planned}"
         groups.insert(0, (f"Mean over {count} captures", scenes))
     tables = []
     for title, chosen in groups:
-        seeds = {v: _by_seed([c for c in cells if c.variant == v and c.scene in chosen]) for v in labels}
+        seeds = {v: _by_seed(measured, v, chosen) for v in labels}
         rows = [_row(labels[v], found, len(chosen)) for v, found in seeds.items()]
         rows += [row for name, numbers in peers.items() if (row := _peer_row(name, numbers, chosen))]
         tables.append(_without_empty(Table(title, METRICS, tuple(rows))))
     return tables
 
 
-def _by_seed(cells: Iterable[Measured]) -> dict[int, list[Mapping[str, Any] | None]]:
+def _by_seed(measured: Measured, variant: str, scenes: Sequence[str]) -> dict[int, list[Mapping[str, Any] | None]]:
     found: dict[int, list[Mapping[str, Any] | None]] = {}
-    for cell in cells:
-        found.setdefault(cell.seed, []).append(cell.metrics)
+    for (own, scene, seed), metrics in measured.items():
+        if own == variant and scene in scenes:
+            found.setdefault(seed, []).append(metrics)
     return found
 
 
