@@ -1,4 +1,7 @@
-"""Reading and writing files: atomic writes, bounded reads, JSON, PNG and .npy; every error names the file."""
+"""Reading and writing files: atomic writes, bounded reads, JSON, PNG and .npy.
+
+Every error names the file: writing functions raise an OSError if it cannot be written.
+"""
 
 import glob
 import io
@@ -160,30 +163,18 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def write_bytes(path: Path, parts: Iterable[bytes]) -> int:
-    """Writes ``parts`` one after the other; returns the size of the file [bytes].
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes ``parts`` one after the other; returns the size of the file [bytes]."""
     with atomic_path(path) as partial, open(partial, "wb") as file:
         return sum(file.write(part) for part in parts)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text as UTF-8.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes a text as UTF-8."""
     write_bytes(path, [text.encode()])
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes values as JSON; numbers that are not finite become null, which every reader understands.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes values as JSON; numbers that are not finite become null, which every reader understands."""
     write_text(path, json.dumps(_finite(values), indent=2) + "\n")
 
 
@@ -196,11 +187,7 @@ def _finite(values: Any) -> Any:
 
 
 def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W C"]) -> None:
-    """Writes a greyscale, RGB or RGBA image of 8 or 16 bits.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes a greyscale, RGB or RGBA image of 8 or 16 bits."""
     try:
         data = encode_png(image)
     except ValueError as error:
@@ -222,11 +209,7 @@ def encode_png(image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W C"]) -> by
 
 
 def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
-    """Writes an array as .npy.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes an array as .npy."""
     data = io.BytesIO()  # np.save to a file hides why it failed
     np.save(data, values)
     write_bytes(path, [data.getvalue()])

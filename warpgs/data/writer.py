@@ -1,7 +1,7 @@
 """Writes captures in the layout of NeRF-DS, as ``loaders`` reads them.
 
 One function per part: images, masks, depth and camera of each frame, then the scene, then the index. The index comes
-last, because its dataset.json makes the folder a capture.
+last, because its dataset.json makes the folder a capture. Each raises an OSError that names a file it cannot write.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -24,11 +24,7 @@ GIVEN, ESTIMATED = "given", "estimated"
 
 
 def write_image(root: Path, name: str, image: UInt8[np.ndarray, "H W 3"], factors: Sequence[int] = (1,)) -> None:
-    """Writes rgb/<factor>x/<name>.png for every downscaling factor.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
-    """
+    """Writes rgb/<factor>x/<name>.png for every downscaling factor."""
     for factor in factors:
         size = _reduced_size(image, factor)
         write_png(root / f"rgb/{factor}x/{name}.png", cv2.resize(image, size, interpolation=cv2.INTER_AREA))
@@ -38,9 +34,6 @@ def write_mask(root: Path, name: str, static_mask: Bool[np.ndarray, "H W"], fact
     """Writes resized_mask/<factor>x/<name>.png.png for every downscaling factor: 0 = dynamic, 255 = static.
 
     A pixel of a reduced mask is dynamic if any part of it is.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
     """
     dynamic = np.where(static_mask, 0, 255).astype(np.uint8)
     for factor in factors:
@@ -49,11 +42,7 @@ def write_mask(root: Path, name: str, static_mask: Bool[np.ndarray, "H W"], fact
 
 
 def write_covisible(root: Path, name: str, covisible: Bool[np.ndarray, "H W"], factors: Sequence[int] = (1,)) -> None:
-    """Writes covisible/<factor>x/val/<name>.png for every downscaling factor: 255 where masked metrics are computed.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
-    """
+    """Writes covisible/<factor>x/val/<name>.png for every downscaling factor: 255 where masked metrics are computed."""
     for factor in factors:
         bright = covisible.astype(np.uint8) * 255
         reduced = cv2.resize(bright, _reduced_size(bright, factor), interpolation=cv2.INTER_AREA) == 255
@@ -61,11 +50,7 @@ def write_covisible(root: Path, name: str, covisible: Bool[np.ndarray, "H W"], f
 
 
 def write_depth(root: Path, name: str, inverse_depth: Shaped[np.ndarray, "H W"]) -> None:
-    """Writes inverse depth, up to a scale and an offset: 8 or 16 bits as depth/1x/<name>.png, floats as .npy.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
-    """
+    """Writes inverse depth, up to a scale and an offset: 8 or 16 bits as depth/1x/<name>.png, floats as .npy."""
     if inverse_depth.dtype.kind == "f":
         write_array(root / f"depth/1x/{name}.npy", inverse_depth)
     else:
@@ -83,9 +68,6 @@ def write_camera(
         lens: Intrinsics of the image in full size.
         rotation: [3, 3] world-to-camera rotation, OpenCV axes.
         position: [3] camera centre in the world.
-
-    Raises:
-        OSError: If the file cannot be written; the message names it.
     """
     fields = {
         "orientation": rotation.tolist(),
@@ -117,9 +99,6 @@ def write_scene(
         points: [P, 3] sparse static points in the world.
         near, far: Depth range [scene units].
         colors: [P, 3] 8-bit RGB of the points; None if unknown.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
     """
     bbox = [[-1, -1, -1], [1, 1, 1]]
     scene = {"center": units.center.tolist(), "scale": units.scale, "bbox": bbox, "near": near, "far": far}
@@ -129,11 +108,7 @@ def write_scene(
 
 
 def write_points(root: Path, points: Float[np.ndarray, "P 3"], colors: UInt8[np.ndarray, "P 3"] | None = None) -> None:
-    """Writes points.npy, and point_colors.npy if the points have colours; see ``write_scene``.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
-    """
+    """Writes points.npy, and point_colors.npy if the points have colours; see ``write_scene``."""
     write_array(root / "points.npy", points)
     if colors is not None:
         write_array(root / "point_colors.npy", colors)
@@ -183,9 +158,6 @@ def write_index(
         val: Frames to evaluate on; all others are trained on.
         camera_ids: Camera of every frame; all are camera 0 if None.
         estimated_masks: Whether the masks are estimates, see ``Capture.estimated_masks``.
-
-    Raises:
-        OSError: If a file cannot be written; the message names it.
     """
     index = {step: k for k, step in enumerate(sorted(set(time_ids.values())))}
     metadata = {}
