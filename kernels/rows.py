@@ -14,7 +14,6 @@ features and the moments of s = alpha v_alpha over its pixels, and
 """
 
 import functools
-from typing import Literal
 
 import warp as wp
 
@@ -28,12 +27,8 @@ GEOMETRY_PARTS = wp.constant(2)
 NUM_MOMENTS = 6
 """Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy²."""
 
-OffsetGradient = Literal["absolute", "images"] | None
-"""What is reported as the gradient of the mean on screen instead of the gradient itself (None): the sum of its absolute
-values over the pixels, or the part of the images alone, without depth."""
-
 NUM_OFFSET_SUMS = 2
-"""Σ |s (conic d)_x| and Σ |s (conic d)_y|, or Σ s' (conic d)_x and Σ s' (conic d)_y with s' of the images alone."""
+"""Σ s' (conic d)_x and Σ s' (conic d)_y, with s' of the images alone, without depth."""
 
 
 # Warp's vec4 is aligned to 4 bytes, so a load or store takes four instructions; rows are aligned to 16: one is enough.
@@ -196,8 +191,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that turns a gradient row into the gradients of a splat, features and ``screen_offsets``.
 
     ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``v_screen_offsets``, which may be
-    missing, is the gradient of the mean in halves of the image size: the plain one if ``offset_sign`` is 0, otherwise
-    the sums of ``OffsetGradient`` times ``offset_sign``.
+    missing, is the gradient of the mean in halves of the image size; that of the images alone if ``imagegrad`` is 1.
     """
     num_channels = num_features + int(with_depth)
 
@@ -210,7 +204,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
         gradients: wp.array3d[float],
         half_width: float,
         half_height: float,
-        offset_sign: float,
+        imagegrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],
     ) -> Splat:
@@ -236,8 +230,8 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
             v_splat.conic = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
             v_splat.opacity = s[0] / opacities[i]
             v_offset = v_splat.mean
-            if offset_sign != 0.0:
-                v_offset = offset_sign * wp.vec2(s[6], s[7])
+            if imagegrad != 0:
+                v_offset = -wp.vec2(s[6], s[7])
         if v_screen_offsets.shape[0] > 0:
             v_screen_offsets[i] = wp.vec2(v_offset[0] * half_width, v_offset[1] * half_height)
         return v_splat
@@ -259,7 +253,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
         gradients: wp.array3d[float],
         half_width: float,
         half_height: float,
-        offset_sign: float,
+        imagegrad: int,
         v_means2d: wp.array[wp.vec2],
         v_conics: wp.array[wp.vec3],
         v_depths: wp.array[float],
@@ -269,7 +263,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
     ):
         i = first + wp.tid()
         v_splat = unpack_splat(
-            i, conics, opacities, rows, gradients, half_width, half_height, offset_sign, v_features, v_screen_offsets
+            i, conics, opacities, rows, gradients, half_width, half_height, imagegrad, v_features, v_screen_offsets
         )
         v_means2d[i] = v_splat.mean
         v_conics[i] = v_splat.conic
@@ -302,7 +296,7 @@ def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
         radii: wp.array[wp.vec2i],
         rows: wp.array2d[wp.vec4],
         gradients: wp.array3d[float],
-        offset_sign: float,
+        imagegrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],
         v_means: wp.array[wp.vec3],
@@ -324,7 +318,7 @@ def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
             gradients,
             half_width,
             half_height,
-            offset_sign,
+            imagegrad,
             v_features,
             v_screen_offsets,
         )

@@ -30,7 +30,7 @@ from warpgs.runtime.streams import concurrently
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 SETTINGS = [
     RenderSettings(),
-    RenderSettings(branches=True, statistics=True, absgrad=True),
+    RenderSettings(branches=True, statistics=True),
     RenderSettings(depth=True, antialias=True),
     RenderSettings(depth=True, branches=True, imagegrad=True),
 ]

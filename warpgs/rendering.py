@@ -15,7 +15,6 @@ from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, compo
 from .ops.projection import Geometry, View, project_bwd, project_fwd
 from .ops.rows import (
     DepthOrder,
-    OffsetGradient,
     PackedSplats,
     Rows,
     pack,
@@ -276,15 +275,15 @@ class _Backward:
 
     def composite(self) -> None:
         background, traversal = self.inputs.background, self.traversal
-        self.v_rows = composite_bwd(self._rows(), background, traversal, self.v_layers, self._offset_gradient())
+        self.v_rows = composite_bwd(self._rows(), background, traversal, self.v_layers, self._imagegrad())
         if _has_gradient(background):
             alphas = self.layers[-traversal.num_images :]
             self.v["background"] = background_bwd(background, alphas, self.v_layers[: traversal.num_images])
 
     def unpack(self) -> None:
         splats, with_offsets = (self.saved.conics, self.saved.opacities), _has_gradient(self.inputs.screen_offsets)
-        size, offset_gradient = self.request.size, self._offset_gradient()
-        self.v_splats = unpack(splats, self._rows(), self.v_rows, size, with_offsets, offset_gradient)
+        size = self.request.size
+        self.v_splats = unpack(splats, self._rows(), self.v_rows, size, with_offsets, self._imagegrad())
         self.v["appearance"], self.v["screen_offsets"] = self.v_splats.features, self.v_splats.screen_offsets
 
     def color(self) -> None:
@@ -315,7 +314,7 @@ class _Backward:
             PackedSplats(saved.conics, saved.opacities, saved.radii, self._rows()),
             self.v_rows,
             _has_gradient(inputs.screen_offsets),
-            self._offset_gradient(),
+            self._imagegrad(),
         )
         self.v |= v_geometry._asdict()
         self.v |= {"appearance": v_features, "viewmat": v_viewmat, "K": v_K, "screen_offsets": v_offsets}
@@ -333,12 +332,9 @@ class _Backward:
         features = self.saved.features.shape[1]
         return Rows(self.saved.packed, features, self.request.settings.depth)
 
-    def _offset_gradient(self) -> OffsetGradient:
-        """Which gradient ``screen_offsets`` get."""
-        if not _has_gradient(self.inputs.screen_offsets):
-            return None
-        settings = self.request.settings
-        return "absolute" if settings.absgrad else "images" if settings.imagegrad else None
+    def _imagegrad(self) -> bool:
+        """Whether ``screen_offsets`` get the gradient of the images alone."""
+        return self.request.settings.imagegrad and _has_gradient(self.inputs.screen_offsets)
 
 
 def _has_gradient(tensor: Tensor | None) -> bool:

@@ -17,8 +17,7 @@ class RenderSettings:
         branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
         depth: Also render depth, as one more channel.
         statistics: Also compute whether and how much each Gaussian contributed to the joint image.
-        absgrad: The gradient of ``screen_offsets`` is the sum of its absolute values over the pixels (AbsGS).
-        imagegrad: The gradient of ``screen_offsets`` is that of the images alone, without depth; not with absgrad.
+        imagegrad: The gradient of ``screen_offsets`` is that of the images alone, without depth.
         antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
         max_alpha: Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS.
         near: Near plane [scene units].
@@ -28,7 +27,6 @@ class RenderSettings:
     branches: bool = False
     depth: bool = False
     statistics: bool = False
-    absgrad: bool = False
     imagegrad: bool = False
     antialias: bool = False
     max_alpha: float = 0.999
@@ -39,7 +37,5 @@ class RenderSettings:
         if not 0 < self.near < math.inf:
             raise ValueError(f"near must be positive and finite, got {self.near}")
         ALPHA_BOUNDS.check("max_alpha", self.max_alpha)
-        if self.absgrad and self.imagegrad:
-            raise ValueError("expected absgrad or imagegrad, got both: both are the gradient of screen_offsets")
         if self.max_intersections is not None and not 0 < self.max_intersections < 1 << 30:
             raise ValueError(f"max_intersections must be between 1 and 2^30, got {self.max_intersections}")

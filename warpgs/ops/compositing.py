@@ -11,7 +11,7 @@ from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
-from warpgs.kernels.rows import OffsetGradient, gradient_stride
+from warpgs.kernels.rows import gradient_stride
 from warpgs.runtime.launch import launch, num_shards
 from warpgs.runtime.tape import Gradients
 
@@ -107,7 +107,7 @@ def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, 
 
 def _launch(
     make_kernel: Callable[..., Any],
-    variant: bool | OffsetGradient,
+    variant: bool,
     rows: Rows,
     background: Tensor | None,
     traversal: Traversal,
@@ -176,7 +176,7 @@ def composite_bwd(
     background: Tensor | None,
     traversal: Traversal,
     v_layers: Gradients,
-    offset_gradient: OffsetGradient = None,
+    imagegrad: bool = False,
 ) -> Tensor:
     """Sums for ``unpack``, [shards, N, gradient_stride].
 
@@ -184,7 +184,7 @@ def composite_bwd(
         rows, background: As in ``composite_fwd``.
         traversal: Its second result.
         v_layers: Gradients of ``Composite.layers``; None for zeros.
-        offset_gradient: Which other gradient of the means on screen to sum as well.
+        imagegrad: Whether to sum the gradient of the means on screen without depth, too.
     """
     num_images, images_with_gradient = traversal.num_images, 0  # a bit for each image
     v_arrays: list[Tensor | None] = [None] * (3 * NUM_BRANCH_IMAGES)  # images, alphas, depths
@@ -195,7 +195,7 @@ def composite_bwd(
     packed = rows.packed
     v_rows = packed.new_zeros(num_shards(packed.device), packed.shape[0], gradient_stride(rows.num_channels))
     inputs = (*traversal[3:], *v_arrays, images_with_gradient)
-    _launch(make_composite_bwd, offset_gradient, rows, background, traversal, *inputs, per_shard=v_rows)
+    _launch(make_composite_bwd, imagegrad, rows, background, traversal, *inputs, per_shard=v_rows)
     return v_rows
 
 

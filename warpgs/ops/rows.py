@@ -5,7 +5,6 @@ from typing import NamedTuple
 from torch import Tensor, int32
 
 from warpgs.kernels import rows as kernels
-from warpgs.kernels.rows import OffsetGradient
 from warpgs.runtime.launch import launch
 
 from .projection import Geometry, Projection, View, new_camera_gradients, new_geometry, sum_camera_gradients
@@ -92,7 +91,7 @@ def unpack(
     v_rows: Tensor,
     size: tuple[int, int],
     with_offsets: bool = False,
-    offset_gradient: OffsetGradient = None,
+    imagegrad: bool = False,
 ) -> PackGradients:
     """The backward pass of ``pack``.
 
@@ -102,7 +101,7 @@ def unpack(
         v_rows: [shards, N, gradient_stride] sums from ``composite_bwd``.
         size: (width, height) of the image [px].
         with_offsets: Whether to return the gradient of ``screen_offsets``.
-        offset_gradient: As in ``composite_bwd``.
+        imagegrad: As in ``composite_bwd``.
     """
     conics = splats[0]
     N = conics.shape[0]
@@ -114,13 +113,9 @@ def unpack(
         features=conics.new_empty(N, rows.num_features),
         screen_offsets=conics.new_empty(N, 2) if with_offsets else None,
     )
-    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], _SIGNS[offset_gradient])
+    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], int(imagegrad))
     launch(kernels.make_unpack(rows.num_features, rows.with_depth), N, *inputs, *v_splats)
     return v_splats
-
-
-_SIGNS: dict[OffsetGradient, float] = {None: 0.0, "absolute": 1.0, "images": -1.0}
-"""How kernels are told which gradient ``screen_offsets`` get."""
 
 
 def unpack_and_unproject(
@@ -130,14 +125,14 @@ def unpack_and_unproject(
     splats: PackedSplats,
     v_rows: Tensor,
     with_offsets: bool = False,
-    offset_gradient: OffsetGradient = None,
+    imagegrad: bool = False,
 ) -> tuple[Geometry, tuple[Tensor | None, Tensor | None], Tensor, Tensor | None]:
     """The backward pass of ``project_and_pack``, in one kernel.
 
     Args:
         geometry, view, antialias: As in the forward pass.
         splats: Its first result.
-        v_rows, with_offsets, offset_gradient: As in ``unpack``.
+        v_rows, with_offsets, imagegrad: As in ``unpack``.
 
     Returns:
         Gradients of the geometry; of ``viewmat`` and ``K``, if one of them requires a gradient; of the features; and of
@@ -147,7 +142,7 @@ def unpack_and_unproject(
     N = means.shape[0]
     v_features, v_offsets = means.new_empty(N, rows.num_features), means.new_empty(N, 2) if with_offsets else None
     v_geometry, v_cameras = new_geometry(geometry), new_camera_gradients(view, N)
-    inputs = (*geometry, *view, int(antialias), *projection, rows.packed, v_rows, _SIGNS[offset_gradient])
+    inputs = (*geometry, *view, int(antialias), *projection, rows.packed, v_rows, int(imagegrad))
     kernel = kernels.make_unpack_and_unproject(rows.num_features, rows.with_depth)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras, None)
     return v_geometry, sum_camera_gradients(view, v_cameras), v_features, v_offsets
