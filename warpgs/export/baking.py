@@ -50,7 +50,7 @@ MAX_OCTAVES = 5
 """Steps of colours are at most 2⁵ times finer or coarser than those of a Gaussian of average visibility."""
 
 MIN_WEIGHT = 0.01
-"""Blend weight added to all, as a fraction of the median: Gaussians that no training camera sees may be seen later."""
+"""Blend weight added to all, as a fraction of the median of visible Gaussians: the others may be seen later."""
 
 TEXEL = {"geometry": 16, "colors": 4, "rest": 4}
 """Bytes that the player's textures take per Gaussian: of one time, of one time, and of one coefficient."""
@@ -146,8 +146,7 @@ def bake(
         cloud = cloud_at(time)
         finite = finite & cloud.finite
         is_dynamic = cloud.is_dynamic
-        # half precision has 11 bits, more than are kept
-        static_colors.append(_color(cloud.select(~is_dynamic)).astype(np.float16))
+        static_colors.append(_color(cloud.select(~is_dynamic)))
         dynamic_geometry.append([part[is_dynamic] for part in (cloud.means, cloud.quats, cloud.log_scales)])
     static, dynamic = cloud.select(~is_dynamic & finite), cloud.select(is_dynamic & finite)
     weights = np.ones(len(cloud), np.float32) if weights is None else weights
@@ -168,9 +167,9 @@ def octaves_of(weights: Float32[np.ndarray, " N"]) -> Int32[np.ndarray, " N"]:
     The squared error of images is about the error of a colour squared times the blend weight, so steps are inverse to
     its square root.
     """
-    if len(weights) == 0 or np.median(weights) == 0.0:  # most are invisible: nothing is known of the steps
+    if not weights.any():  # nothing is known of the steps
         return np.zeros(len(weights), np.int32)
-    weights = weights.astype(np.float64) + MIN_WEIGHT * np.median(weights)
+    weights = weights.astype(np.float64) + MIN_WEIGHT * np.median(weights[weights > 0])
     octaves = -0.5 * np.log2(weights)
     return np.clip(np.rint(octaves - octaves.mean()), -MAX_OCTAVES, MAX_OCTAVES).astype(np.int32)
 

@@ -33,7 +33,7 @@ class Clouds:
         return cloud if self.rows is None else cloud.select(self.rows)
 
     def visibility(self, cameras: Sequence[Camera], quiet: bool = True) -> Float32[np.ndarray, " N"]:
-        """The largest blend weight of each Gaussian in any of the cameras [px], each at its own time."""
+        """Each Gaussian's sum of blend weights in the image [px], the maximum over cameras, each at its own time."""
         settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
         largest = np.zeros(len(self.at(0.0)), np.float32)
         for camera in progress(cameras, "measuring visibility", quiet):
@@ -43,7 +43,7 @@ class Clouds:
         return largest
 
     def most_visible(self, count: int, cameras: Sequence[Camera], quiet: bool = True) -> "Clouds":
-        """The same scene with at most ``count`` Gaussians: those with the largest blend weight in any of the cameras.
+        """The same scene with at most ``count`` Gaussians: those of maximum ``visibility``.
 
         Args:
             count: Maximum number of Gaussians, at least 1.

@@ -57,7 +57,7 @@ class Levels:
         basis = principal_basis(scaled, over_time)
         coefficients = np.tensordot(np.linalg.inv(basis.T * BASIS_UNIT), scaled, 1)
         levels = np.clip(np.rint(coefficients), -MAX_LEVEL, MAX_LEVEL).astype(np.int32)
-        used = (levels != 0).any(axis=(1, 2), keepdims=True)[:, :, 0]
+        used = (levels != 0).any(axis=(1, 2))[:, None]
         return Levels(levels, steps, octaves, np.where(used, basis, 0))  # zeros take no bytes
 
     @property

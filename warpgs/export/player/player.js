@@ -16,7 +16,7 @@ const BASIS_UNIT = 1e-4;
 const REPLACED = [0, 13, 60]; // NUL, CR and <, which a page cannot hold
 function bytesOf(text) {
   // Seven bits per character; one from 128 on stands for a replaced one and the next, from 512 on for one without a next.
-  const bytes = new Uint8Array(text.length * 14 >> 3);
+  const bytes = new Uint8Array(Math.ceil(text.length * 14 / 8));
   let count = 0, bits = 0, held = 0;
   const add = (value) => {
     bits = (bits << 7 | value) & 0x3fff;
@@ -44,11 +44,11 @@ async function unpacked(name, part, octaves) {
   // Values as [key][channel][Gaussian], from quantised coefficients; the "keys" of rest are coefficients of harmonics.
   const {shape: [keys, num, channels], steps} = SCENE.branches[name][part], frame = num * channels;
   const levels = await integers(`${name}-${part}`, keys * frame), basis = await integers(`${name}-${part}-basis`, keys * keys);
-  const values = new Float32Array(keys * frame), coarser = part === 'colors' || part === 'rest';
+  const values = new Float32Array(keys * frame), ownSteps = part === 'colors' || part === 'rest';
   for (let key = 0; key < keys; key++) for (let c = 0; c < channels; c++) for (let i = 0, sum = 0; i < num; i++) {
     const level = levels[(key * channels + c) * num + i];
     sum = part === 'means' && !key ? sum + level : level; // differences along the curve
-    const value = sum * steps[c] * BASIS_UNIT * (coarser ? 2 ** octaves[i] : 1);
+    const value = sum * steps[c] * BASIS_UNIT * (ownSteps ? 2 ** octaves[i] : 1);
     if (value) for (let t = 0; t < keys; t++) values[t * frame + c * num + i] += basis[key * keys + t] * value;
   }
   return values;
