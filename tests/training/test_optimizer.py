@@ -14,7 +14,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import (
     BRANCHES,
     GROUPS,
-    Progress,
+    RatePlan,
     exponential,
     gather,
     learning_rates,
@@ -77,7 +77,7 @@ def rates_at(
     progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM, means_progress=None, settle=0.0
 ):
     means_progress = dict.fromkeys(BRANCHES, progress) if means_progress is None else means_progress
-    at = Progress(progress, settle, means_progress, network_progress, warmup_factors)
+    at = RatePlan(progress, settle, means_progress, network_progress, warmup_factors)
     return learning_rates(config, extent, at)
 
 

@@ -18,6 +18,7 @@ NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
 BackgroundName = Literal["capture", "mean", "black", "white"]
+"""Backgrounds that have a name."""
 
 
 @dataclass(frozen=True)

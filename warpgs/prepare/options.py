@@ -25,12 +25,12 @@ class Selection:
     """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
     """Number of frames to take; by default all frames of a folder and 150 of a video."""
+    longest_side: int = 960
+    """Larger frames are scaled down to this [px]."""
     start: float = 0.0
     """Take frames from this time of a video on [s]."""
     end: float | None = None
     """Take frames up to this time of a video [s]."""
-    longest_side: int = 960
-    """Larger frames are scaled down to this [px]."""
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,8 @@ def make_optimizer(parameters: Mapping[str, nn.Parameter], rates: Mapping[str, T
 
 
 @dataclass(frozen=True)
-class Progress:
-    """How far a run is, for its learning rates.
+class RatePlan:
+    """What the learning rates of an iteration depend on.
 
     Attributes:
         progress: Fraction of the run done, in [0, 1].
@@ -91,13 +91,13 @@ class Progress:
     warmup_factors: dict[str, float]
 
 
-def learning_rates(config: OptimConfig, extent: float, at: Progress) -> dict[str, float]:
+def learning_rates(config: OptimConfig, extent: float, at: RatePlan) -> dict[str, float]:
     """Learning rate of each group of ``GROUPS``, for a step over as many views as there are ranks.
 
     Args:
         config: Rates of one view per step.
         extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
-        at: How far the run is.
+        at: Of the iteration.
     """
     scale = extent if config.means_scale is None else config.means_scale
     gaussians = {

@@ -5,7 +5,7 @@ from typing import Literal
 
 from warpgs.config import LossConfig, TrainConfig
 
-from .optimizer import BRANCHES, Progress, exponential
+from .optimizer import BRANCHES, RatePlan, exponential
 
 NOISE = 0.1
 """Initial standard deviation of the noise on time, in frame intervals (Deformable-3DGS)."""
@@ -58,7 +58,7 @@ def compares_branches(stage: StageName, config: LossConfig) -> bool:
 
 
 @dataclass(frozen=True)
-class IterationPlan(Progress):
+class IterationPlan(RatePlan):
     """What the schedule says of one iteration.
 
     Attributes:
