@@ -54,9 +54,11 @@ def test_help_of_train_is_short_and_help_all_complete(capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "shown"),
-    [(["train", "--help-all"], b"max-gaussians INT"), (["check", "missing \N{RIGHTWARDS ARROW}"], rb"missing \u2192")],
+    [(["train", "--help-all"], b"max-gaussians INT"), (["check", "empty \N{RIGHTWARDS ARROW}"], rb"empty \u2192")],
 )
-def test_what_the_output_cannot_represent_is_escaped(arguments, shown, monkeypatch):
+def test_what_the_output_cannot_represent_is_escaped(arguments, shown, monkeypatch, tmp_path):
+    (tmp_path / "empty \N{RIGHTWARDS ARROW}").mkdir()
+    monkeypatch.chdir(tmp_path)
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "cp1252", write_through=True))
     with contextlib.suppress(SystemExit):

@@ -89,6 +89,11 @@ def test_entirely_dynamic_masks_are_an_error(root):
     assert "everything as dynamic" in texts(check_capture(root), "error")
 
 
+def test_a_path_that_does_not_exist_is_no_capture_to_report_on(tmp_path):
+    with pytest.raises(ValueError, match="nowhere does not exist"):
+        check_capture(tmp_path / "nowhere")
+
+
 def test_missing_masks_are_an_error_that_says_how_to_make_them(root):
     shutil.rmtree(root / "resized_mask")
     report = check_capture(root, "nerfds")

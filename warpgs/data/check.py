@@ -108,7 +108,13 @@ class Report:
 
 
 def check_capture(root: Path, dataset: str | None = None, factor: int | None = None) -> Report:
-    """Reads every frame of a capture and checks it; arguments as for ``load_capture``."""
+    """Reads every frame of a capture and checks it; arguments as for ``load_capture``.
+
+    Raises:
+        ValueError: If there is no such folder.
+    """
+    if not root.exists():
+        raise ValueError(f"{root} does not exist")
     try:
         capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)
     except ValueError as error:

@@ -149,7 +149,7 @@ def _write(job: Job) -> str:
     baked = bake(job.clouds.at, times, options.precision or 1.0, weights)
     size = write_page(path, baked, start, options.quiet)
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
-    return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.capture_note}"
+    return f"{path}: {count}, {size / 1e6:.1f} MB\nviews and camera path: {job.capture_note}"
 
 
 PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"), ".html")

@@ -208,7 +208,9 @@ def _number(value: float | None) -> str:
 
 def _config(runs: Sequence[EvaluatedRun]) -> str:
     rows = config_rows([run.config for run in runs])
-    title = "Settings that differ" if len(runs) > 1 else "Settings that differ from the preset"
+    title = (
+        "Settings that differ" if len(runs) > 1 else "Settings as this run had them, where they differ from the preset"
+    )
     if not rows:
         return f"<h2>{title}</h2><p class=note>none</p>"
     body = "".join(
