@@ -1,10 +1,17 @@
-"""Fixtures of the tests of layouts."""
+"""Fixtures of the tests of captures and layouts."""
 
 import shutil
 
 import pytest
 
 from tests.data import layouts
+from tests.data.captures import write_capture
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A capture in the layout of NeRF-DS."""
+    return write_capture(tmp_path / "toy")
 
 
 @pytest.fixture(scope="session")

@@ -6,14 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.data.captures import edit_json, refused, write_array, write_capture, write_json
+from tests.data.captures import edit_json, refused, write_array, write_json
 from warpgs.config import MaskPerturbation
 from warpgs.data.loaders import load_capture
-
-
-@pytest.fixture
-def root(tmp_path):
-    return write_capture(tmp_path / "toy")
 
 
 def test_the_given_dataset_overrides_recognition(root):

@@ -25,11 +25,6 @@ DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
 
 
 @pytest.fixture
-def root(tmp_path):
-    return write_capture(tmp_path / "toy")
-
-
-@pytest.fixture
 def iphone(tmp_path):
     return write_capture(tmp_path / "toy", "iphone")
 
@@ -40,13 +35,10 @@ def hypernerf(tmp_path):
 
 
 @DATASETS
-def test_each_dataset_is_recognized_from_its_files(tmp_path, dataset):
-    assert recognize(write_capture(tmp_path / "vrig-misleading", dataset)) == dataset
-
-
-@DATASETS
-def test_each_dataset_is_read_completely(tmp_path, dataset):
-    scene = load_capture(write_capture(tmp_path / "toy", dataset))
+def test_each_dataset_is_recognized_from_its_files_and_read_completely(tmp_path, dataset):
+    root = write_capture(tmp_path / "vrig-misleading", dataset)
+    assert recognize(root) == dataset
+    scene = load_capture(root)
     train, val = captures.ids_of(dataset)
     assert (scene.train, scene.val) == (tuple(train), tuple(val))
     size = (SIZE[0] // captures.FACTORS[dataset], SIZE[1] // captures.FACTORS[dataset])
@@ -141,7 +133,7 @@ def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
 
 
 @pytest.mark.parametrize("k1", [0.8, -500.0])
-@pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
+@DATASETS
 def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_their_centre(tmp_path, dataset, k1):
     plain, bent = (write_capture(tmp_path / name, dataset) for name in ("plain", "bent"))
     for path in (bent / "camera").iterdir():
@@ -179,24 +171,19 @@ def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
     assert not load_capture(iphone).metric_depth
 
 
-def test_captures_of_two_cameras_can_have_a_factor_of_their_own(hypernerf):
+def test_captures_of_two_cameras_can_have_a_factor_of_their_own_as_in_the_preset_paper(hypernerf):
     for path in (hypernerf / "rgb/2x").iterdir():
         captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
     sizes = {vrig: load_capture(hypernerf, vrig_factor=vrig).cameras["left_000000"].width for vrig in (None, 4)}
     assert sizes == {None: SIZE[0] // 2, 4: SIZE[0] // 4}
     assert load_capture(hypernerf, factor=2, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
+    config = dataclasses.replace(PRESETS["paper"], data=hypernerf)
+    assert open_capture(config).cameras["left_000000"].width == SIZE[0] // 4
 
 
 def test_captures_of_one_camera_keep_the_factor_of_the_dataset(hypernerf):
     edit_json(hypernerf / "dataset.json", val_ids=[])
     assert load_capture(hypernerf, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
-
-
-def test_the_preset_paper_reads_captures_of_two_cameras_at_a_quarter(hypernerf):
-    for path in (hypernerf / "rgb/2x").iterdir():
-        captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
-    config = dataclasses.replace(PRESETS["paper"], data=hypernerf)
-    assert open_capture(config).cameras["left_000000"].width == SIZE[0] // 4
 
 
 def test_iphone_depth_is_unknown_where_the_sensor_has_no_value_or_a_clamped_one(iphone):
@@ -260,8 +247,7 @@ def test_without_a_points_file_points_and_colours_of_a_colmap_model_are_read(roo
     assert scene.point_colors.tolist() == [[0, 20, 30], [10, 20, 30]]
 
 
-def test_a_single_time_is_0(tmp_path):
-    root = write_capture(tmp_path / "toy")
+def test_a_single_time_is_0(root):
     edit_json(root / "dataset.json", train_ids=["left_000000"], val_ids=["right_000000"])
     assert [camera.time for camera in load_capture(root).cameras.values()] == [0.0, 0.0]
 
@@ -278,9 +264,8 @@ def test_an_undistorted_image_agrees_with_opencv(root):
 
 
 def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_halfway(hypernerf):
-    ids = [name for pair in zip(*captures.ids_of("hypernerf"), strict=False) for name in pair]
-    for name in captures.ids_of("hypernerf")[0][2:]:
-        ids.append(name)
+    train, val = captures.ids_of("hypernerf")
+    ids = [train[0], val[0], train[1], val[1], *train[2:]]
     edit_json(hypernerf / "dataset.json", ids=ids, train_ids=ids, val_ids=[])
     scene = load_capture(hypernerf)
     assert (scene.train, scene.val) == ((ids[0], ids[4]), (ids[2],))

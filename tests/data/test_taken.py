@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.data import captures
-from tests.data.captures import edit_json, image_of, write_capture
+from tests.data.captures import edit_json, image_of
 from warpgs.cameras import Camera
 from warpgs.data.capture import Frame
 from warpgs.data.lens import Lens
@@ -57,8 +57,7 @@ def test_distortion_that_cannot_be_inverted_is_refused():
         taken_frame(frame_of(folded), folded)
 
 
-def test_a_capture_reads_frames_as_they_are_in_its_files(tmp_path):
-    root = write_capture(tmp_path / "toy")
+def test_a_capture_reads_frames_as_they_are_in_its_files(root):
     assert load_capture(root).read_taken is None
     for path in (root / "camera").iterdir():
         edit_json(path, radial_distortion=[-0.1, 0.0, 0.0])

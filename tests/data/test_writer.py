@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.data.captures import edit_json
 from warpgs.data import writer
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import load_capture
@@ -48,8 +49,7 @@ def test_the_index_says_whether_masks_are_estimates(root):
     assert not load_capture(root).estimated_masks
     writer.write_index(root, TIMES, estimated_masks=True)
     assert load_capture(root).estimated_masks
-    index = json.loads((root / "dataset.json").read_text())
-    (root / "dataset.json").write_text(json.dumps({**index, "masks": "guessed"}))
+    edit_json(root / "dataset.json", masks="guessed")
     with pytest.raises(ValueError, match=r"dataset\.json: masks must be 'given' or 'estimated', got 'guessed'"):
         load_capture(root)
 
