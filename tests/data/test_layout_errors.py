@@ -13,6 +13,7 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, refused, write_array, write_png
+from tests.data.layouts import edit_transforms
 from warpgs.data.exr import read_exr_channel
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
@@ -23,7 +24,7 @@ def edit_matrix(path: Path, change) -> None:
     values = json.loads(path.read_text())
     matrix = np.array(values["frames"][0]["transform_matrix"])
     change(matrix)
-    layouts.edit_transforms(path, transform_matrix=matrix.tolist())
+    edit_transforms(path, transform_matrix=matrix.tolist())
 
 
 def save_npz(path: Path, **changes) -> None:
@@ -49,6 +50,8 @@ def shift_far(matrix: np.ndarray) -> None:
     matrix[0, 3] = np.nan
 
 
+CAMERAS = "sparse/0/cameras.bin"
+SMALL = np.zeros((9, 9, 3), np.uint8)
 FIELD_OF_VIEW = cameras_bin(7, [*layouts.PARAMS[:4], 0.9])
 BENT = [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0]
 ROW = np.zeros((layouts.COUNT, 17))
@@ -57,27 +60,19 @@ INDICES = np.arange(layouts.COUNT)
 DAMAGES = [
     ("colmap", lambda r: (r / "images/frame_00003.png").unlink(), r"frame_00003\.png is missing: the COLMAP model"),
     ("colmap", lambda r: (r / "sparse/0/images.bin").unlink(), "is not a COLMAP model"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(FIELD_OF_VIEW), "FOV is not supported; first"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(4, BENT)), "too strong"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
-    ("colmap", lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
-    (
-        "colmap",
-        lambda r: (r / "sparse/0/cameras.bin").write_bytes(cameras_bin(0, [5.0, 1, 1], (10**9, 5))),
-        "out of range",
-    ),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(FIELD_OF_VIEW), "FOV is not supported; first"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(4, BENT)), "too strong"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [5.0, 1, 1], (10**9, 5))), "out of range"),
     (
         "colmap",
         lambda r: (r / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", 2**60)),
         r"points3D\.bin is damaged",
     ),
-    (
-        "colmap",
-        lambda r: write_png(r / "images/frame_00002.png", np.zeros((9, 9, 3), np.uint8)),
-        "has not the shape of",
-    ),
-    ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", np.zeros((9, 9), np.uint8)), "the mask is 9×9"),
+    ("colmap", lambda r: write_png(r / "images/frame_00002.png", SMALL), "has not the shape of"),
+    ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", SMALL[..., 0]), "the mask is 9×9"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[3]), "frames must be a list"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR is"),
@@ -89,20 +84,16 @@ DAMAGES = [
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["x.png"]), r"x\.png is missing"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["points.ply"]), "which is not a frame"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", val_filenames=7), "must be a list of files"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path=None), "no file_path"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path=7), "must name a file, got 7"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", file_path="/dev/zero"), "is missing"),
-    (
-        "nerfstudio",
-        lambda r: layouts.edit_transforms(r / "transforms.json", mask_path="m.png"),
-        "lists it as mask_path",
-    ),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", transform_matrix=None), "transform_matrix"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", transform_matrix=[[1]]), "shape"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path=None), "no file_path"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path=7), "must name a file, got 7"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path="/dev/zero"), "is missing"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", mask_path="m.png"), "lists it as mask_path"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", transform_matrix=None), "transform_matrix"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", transform_matrix=[[1]]), "shape"),
     ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", unrotate), "is not a rotation"),
     ("nerfstudio", lambda r: edit_matrix(r / "transforms.json", shift_far), "finite"),
-    ("nerfstudio", lambda r: layouts.edit_transforms(r / "transforms.json", fl_x=0), "focal lengths"),
-    ("blender", lambda r: layouts.edit_transforms(r / "transforms_train.json", time=1.5), r"time must be in \[0, 1\]"),
+    ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", fl_x=0), "focal lengths"),
+    ("blender", lambda r: edit_transforms(r / "transforms_train.json", time=1.5), r"time must be in \[0, 1\]"),
     ("blender", lambda r: edit_json(r / "transforms_test.json", camera_angle_x=4), "between 0 and π"),
     ("blender", lambda r: edit_json(r / "transforms_train.json", camera_angle_x=None), "no fl_x or camera_angle_x"),
     ("llff", lambda r: write_array(r / "poses_bounds.npy", ROW), "not a rotation"),
@@ -110,11 +101,7 @@ DAMAGES = [
     ("llff", lambda r: write_array(r / "poses_bounds.npy", np.load(r / "poses_bounds.npy")[1:]), "has 11 poses, but"),
     ("llff", lambda r: shutil.rmtree(r / "images"), "images is missing"),
     ("llff", lambda r: (r / "mv_images/00002/cam02.png").rename(r / "mv_images/00002/cam77.png"), "cam01 to cam12"),
-    (
-        "llff",
-        lambda r: write_png(r / "images/frame_00002.png", np.zeros((9, 9, 3), np.uint8)),
-        "which has not the shape",
-    ),
+    ("llff", lambda r: write_png(r / "images/frame_00002.png", SMALL), "which has not the shape"),
     ("vipe", lambda r: (r / "intrinsics/clip_camera.txt").write_text("0: MEI\n"), "camera model MEI is not supported"),
     ("vipe", lambda r: save_npz(r / "intrinsics/clip.npz", data=np.ones((12, 5))), "those of pinhole cameras"),
     ("vipe", lambda r: save_npz(r / "intrinsics/clip.npz", inds=INDICES + 1), "no intrinsics of frame 0"),

@@ -84,17 +84,12 @@ def test_images_are_those_of_their_cameras(written, layout):
 
 @LAYOUTS
 def test_static_masks_are_false_where_something_moves(written, layout):
-    frame = load_capture(written[layout]).frame("train_r_000" if layout == "blender" else load_first(written[layout]))
-    if layout == "blender":
-        assert np.array_equal(frame.static_mask.numpy(), ~layouts.static_mask(0))  # the masks are its alpha
-    elif layout == "megasam":
-        assert frame.static_mask is None
+    capture = load_capture(written[layout])
+    mask = capture.frame(capture.train[0]).static_mask
+    if layout == "megasam":
+        assert mask is None
     else:
-        assert np.array_equal(frame.static_mask.numpy(), layouts.static_mask(0))
-
-
-def load_first(root) -> str:
-    return load_capture(root).train[0]
+        assert np.array_equal(~mask if layout == "blender" else mask, layouts.static_mask(0))  # blender: of its alpha
 
 
 @pytest.mark.parametrize("layout", ["nerfstudio", "vipe", "megasam"])
@@ -334,7 +329,7 @@ def test_without_undistortion_points_of_depth_are_those_of_pinhole_cameras(edite
     bent = shutil.copytree(plain, tmp_path / "bent")
     edit_json(bent / "transforms.json", k1=-50.0)
     points = load_capture(bent, undistort=False).points
-    assert len(points)
+    assert len(points) > 100
     assert torch.equal(points, load_capture(plain).points)
 
 
@@ -385,12 +380,6 @@ def test_nerfstudio_splits_and_times_are_used(edited):
     assert capture.cameras["frame_00011"].time == 0.0
 
 
-def test_nerfstudio_depth_is_where_points_come_from_if_there_is_no_ply(edited):
-    root = edited("nerfstudio")
-    edit_json(root / "transforms.json", ply_file_path=None)
-    assert len(load_capture(root).points) > 100
-
-
 def test_intrinsics_may_be_a_field_of_view_and_the_size_that_of_the_image(edited):
     root = edited("nerfstudio")
     values = json.loads((root / "transforms.json").read_text())
@@ -424,11 +413,7 @@ def test_only_training_masks_are_perturbed(written):
 
 @pytest.mark.parametrize(
     ("names", "times"),
-    [
-        (["frame_00004", "frame_00010"], [4, 10]),
-        (["cam1_7", "cam2_7"], [7, 7]),
-        (["9", "10b", "11"], [0, 1, 2]),
-    ],
+    [(["frame_00004", "frame_00010"], [4, 10]), (["cam1_7", "cam2_7"], [7, 7]), (["9", "10b", "11"], [0, 1, 2])],
 )
 def test_times_are_the_numbers_at_the_end_of_all_names_or_their_order(names, times):
     assert times_of_names(names) == times

@@ -43,9 +43,7 @@ def test_undistorting_a_grid_gives_the_image_of_the_pinhole(lens):
     undistorted = undistort(image_through(lens, grid), lens).astype(int)
     truth = image_of_pinhole(lens, grid).astype(int)
     distorted = image_through(lens, grid).astype(int)
-    assert (
-        np.abs(undistorted - truth)[2:-2, 2:-2].max() <= 12
-    )  # interpolation of 8-bit values; half a pixel would be 45
+    assert np.abs(undistorted - truth)[2:-2, 2:-2].max() <= 12  # rounded and interpolated; half a pixel would be 45
     assert np.abs(distorted - truth).max() > 100
 
 

@@ -11,10 +11,6 @@ STATIC = np.ones((120, 160), dtype=bool)
 STATIC[30:90, 40:110] = False
 
 
-def num_dynamic(static):
-    return int((~static).sum())
-
-
 def test_regions_are_connected_by_sides_and_have_a_minimum_area():
     mask = np.zeros((6, 8), bool)
     mask[0:2, 0:2] = mask[2:4, 2:5] = mask[5, 7] = True
@@ -30,7 +26,7 @@ def test_no_perturbation_changes_nothing():
 
 def test_erosion_removes_its_radius_on_every_side():
     eroded = perturb(STATIC, MaskPerturbation(erode=3), "a")
-    assert num_dynamic(eroded) == (60 - 6) * (70 - 6)
+    assert (~eroded).sum() == (60 - 6) * (70 - 6)
     assert not (~eroded & STATIC).any()
 
 
@@ -48,7 +44,7 @@ def test_objects_are_not_eroded_along_the_border_of_the_image():
 
 def test_holes_cover_about_their_fraction_of_the_dynamic_region_only():
     holed = perturb(STATIC, MaskPerturbation(holes=0.3), "a")
-    assert 0.3 <= 1 - num_dynamic(holed) / num_dynamic(STATIC) < 0.4
+    assert 0.3 <= 1 - (~holed).sum() / (~STATIC).sum() < 0.4
     assert not (~holed & STATIC).any()
 
 
@@ -64,9 +60,8 @@ def test_the_given_mask_is_unchanged():
     assert np.array_equal(given, STATIC)
 
 
-@pytest.mark.parametrize("perturbation", [MaskPerturbation(erode=3, dilate=3, holes=0.5)])
-def test_a_static_mask_stays_static(perturbation):
-    assert perturb(np.ones((9, 9), dtype=bool), perturbation, "a").all()
+def test_a_static_mask_stays_static():
+    assert perturb(np.ones((9, 9), dtype=bool), MaskPerturbation(erode=3, dilate=3, holes=0.5), "a").all()
 
 
 def test_an_entirely_dynamic_mask_can_be_perturbed():

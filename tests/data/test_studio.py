@@ -122,19 +122,11 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "builtin:",
-        "builtin:studi",
-        "builtin:studio?depth=",
-        "builtin:studio?",
-        "builtin:room?depth=none",
-        "builtin:studio?depth=depth=none",
-    ],
+    "name", ["", "studi", "studio?depth=", "studio?", "room?depth=none", "studio?depth=depth=none"]
 )
 def test_an_unknown_name_lists_those_that_are(name):
     with pytest.raises(ValueError, match=r"there is no built-in capture builtin:.*, expected one of builtin:room"):
-        load_capture(name)
+        load_capture(f"builtin:{name}")
 
 
 def test_a_single_frame_is_refused(tmp_path):

@@ -43,9 +43,8 @@ def test_without_a_home_the_cache_is_a_temporary_folder(tmp_path, monkeypatch, c
     assert list(folder.iterdir()) == []
     error = capsys.readouterr().err
     assert error.startswith("warpgs: no cache for built-in captures (")
-    assert error.endswith(
-        f"they are kept in {folder} until the program ends; set XDG_CACHE_HOME to a folder that can be written\n"
-    )
+    remedy = "until the program ends; set XDG_CACHE_HOME to a folder that can be written"
+    assert error.endswith(f"they are kept in {folder} {remedy}\n")
     assert error.count("\n") == 1
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert cache_folder("built-in captures") == tmp_path / "cache" / "warpgs"
@@ -124,9 +123,7 @@ def test_training_cameras_see_the_points(capture):
 def test_monocular_depth_is_inverse_depth_up_to_scale_and_offset(capture):
     _, _, depth, _ = trace(1 / 3, 0.0, SMALL, CPU)
     inverse = capture.frame("left_000001").inverse_depth.flatten()
-    truth = 1.0 / depth.flatten()
-    together = torch.stack([inverse, truth])
-    assert torch.corrcoef(together)[0, 1] > 0.9999
+    assert torch.corrcoef(torch.stack([inverse, 1.0 / depth.flatten()]))[0, 1] > 0.9999
 
 
 def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
@@ -139,25 +136,17 @@ def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
 
 
 def test_shadows_move_over_static_pixels():
-    camera, lamp, samples = synthetic._camera(0.0, SMALL, 0.0), synthetic._lamp(CPU), even_samples(4, CPU)
-    early, late = (
-        synthetic.raytrace(
-            as_tensors([*synthetic._static_bodies(), *synthetic._moving_bodies(time)], CPU),
-            lamp,
-            samples,
-            camera.viewmat,
-            camera.K,
-            camera.size,
-        )
-        for time in (0.0, 0.4)
-    )
+    camera = synthetic._camera(0.0, SMALL, 0.0)
+    view = (synthetic._lamp(CPU), even_samples(4, CPU), camera.viewmat, camera.K, camera.size)
+    bodies = ([*synthetic._static_bodies(), *synthetic._moving_bodies(time)] for time in (0.0, 0.4))
+    early, late = (synthetic.raytrace(as_tensors(at_time, CPU), *view) for at_time in bodies)
     static = (early.bodies == late.bodies) & (early.bodies < NUM_STATIC)
     change = (early.image - late.image).abs().mean(-1)
     assert (change[static] > 0.1).sum() > 10
 
 
-def test_the_capture_is_deterministic(tmp_path):
-    folders = [builtin_capture(tmp_path / name, SMALL, quiet=True) for name in ("a", "b")]
+def test_the_capture_is_deterministic(folder, tmp_path):
+    folders = [folder, builtin_capture(tmp_path, SMALL, quiet=True)]
     files = [sorted(p.relative_to(f) for p in f.rglob("*") if p.is_file()) for f in folders]
     assert files[0] == files[1]
     assert all((folders[0] / p).read_bytes() == (folders[1] / p).read_bytes() for p in files[0])

@@ -21,10 +21,8 @@ def matches(rotation: tuple, translation: tuple, outliers: float = 0.0, count: i
     return first, second
 
 
-def pairs(translation: float, turn: float = 0.01, outliers: float = 0.0) -> list:
-    return [
-        matches((0.3 * turn * k, turn * k, 0.0), (translation * k, 0.0, 0.0), outliers, 190 + k) for k in range(1, 13)
-    ]
+def pairs(step: float, turn: float = 0.01, outliers: float = 0.0) -> list:
+    return [matches((0.3 * turn * k, turn * k, 0.0), (step * k, 0.0, 0.0), outliers, 190 + k) for k in range(1, 13)]
 
 
 @pytest.mark.parametrize("focal", [None, FOCAL])
