@@ -13,11 +13,6 @@ from warpgs.model.splats import Splats
 from warpgs.runs.trained import TrainedScene
 
 
-@pytest.fixture(scope="module")
-def clouds():
-    return scenes.clouds()
-
-
 def rendered(clouds, camera):
     return clouds.scene.render(camera).joint.image.clamp(0, 1)
 

@@ -87,9 +87,8 @@ def test_a_page_renders_close_to_the_run(run, data, tmp_path):
     assert "at 3 key times" in summary
     assert "cameras of " in summary
     camera = view(data, 0.5)
-    assert (
-        scenes.psnr(scenes.image(read_page(tmp_path / "out" / "scene.html").at(0.5), camera), truth(run, camera)) > 45
-    )
+    image = scenes.image(read_page(tmp_path / "out" / "scene.html").at(0.5), camera)
+    assert scenes.psnr(image, truth(run, camera)) > 45
 
 
 def test_the_files_of_both_branches_hold_the_whole_scene(run, tmp_path):

@@ -17,11 +17,6 @@ from warpgs.runs.run import Run
 KEYS, SECONDS = 5, 2.0
 
 
-@pytest.fixture(scope="module")
-def clouds():
-    return scenes.clouds()
-
-
 def job(clouds, finished_run, folder, **options):
     options = {"keys": KEYS, "seconds": SECONDS, "up": "-y", **options}
     return Job(Run.open(finished_run, "cpu"), Export(finished_run, out=folder, quiet=True, **options), clouds)

@@ -52,15 +52,5 @@ def test_the_vertical_is_found_from_cameras_without_roll(arc, down):
     for k, turn in enumerate(torch.linspace(0, np.radians(arc), 9)):
         position = first * turn.cos() + second * turn.sin() + np.tan(np.radians(down)) * up
         cameras[str(k)] = Camera.looking_at(position, torch.zeros(3), up, 50.0, (20, 10))
-    capture = Capture(
-        name="arc",
-        cameras=cameras,
-        train=list(cameras),
-        val=[],
-        points=torch.zeros(0, 3),
-        point_colors=None,
-        read=lambda name: pytest.fail("read"),
-        cache_frames=0,
-    )
-    found = orientation.vertical(capture)
-    assert found == pytest.approx(up.numpy(), abs=1e-3)
+    capture = Capture("arc", cameras, list(cameras), [], torch.zeros(0, 3), None, lambda name: pytest.fail("read"), 0)
+    assert orientation.vertical(capture) == pytest.approx(up.numpy(), abs=1e-3)

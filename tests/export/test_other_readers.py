@@ -111,10 +111,7 @@ for (let k = 0; k < read.vertexCount; k++) {
 console.log(JSON.stringify(rows));
 """
 
-PROGRAMS = {
-    "@mkkellogg/gaussian-splats-3d": (GAUSSIAN_SPLATS_3D, [0, 1, 2]),
-    "gsplat": (GSPLAT_JS, [0]),
-}
+PROGRAMS = {"@mkkellogg/gaussian-splats-3d": (GAUSSIAN_SPLATS_3D, [0, 1, 2]), "gsplat": (GSPLAT_JS, [0])}
 """Programs that print mean, scale, quaternion, colour and the other coefficients of each Gaussian of a PLY file, by the
 package of npm whose loader they use, and the degrees that it reads."""
 

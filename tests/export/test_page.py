@@ -32,11 +32,6 @@ def start(title="scene", track=False):
 
 
 @pytest.fixture(scope="module")
-def clouds():
-    return scenes.clouds()
-
-
-@pytest.fixture(scope="module")
 def weights(clouds):
     return clouds.visibility([scenes.camera(time=time) for time in evenly_spaced(KEYS)])
 
@@ -49,11 +44,6 @@ def baked(clouds, weights):
 @pytest.fixture(scope="module")
 def fine(clouds):
     return bake(clouds.at, evenly_spaced(KEYS), precision=8.0)
-
-
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "scene.html"
 
 
 # Baking -------------------------------------------------------------------------------------------------------------
@@ -128,19 +118,13 @@ def test_a_gaussian_that_is_not_finite_at_one_time_is_omitted_at_all(clouds):
 
 def rows(cloud):
     """The Gaussians of a cloud without their order, which depends on all means."""
-    parts = (
-        cloud.means,
-        cloud.quats,
-        cloud.log_scales,
-        cloud.logit_opacities[:, None],
-        cloud.sh.reshape(len(cloud), -1),
-    )
+    coefficients = cloud.sh.reshape(len(cloud), -1)
+    parts = (cloud.means, cloud.quats, cloud.log_scales, cloud.logit_opacities[:, None], coefficients)
     return {tuple(row) for row in np.concatenate(parts, 1).tolist()}
 
 
 @pytest.mark.parametrize(
-    ("part", "value"),
-    [("log_scales", -46.0), ("means", 1e3), ("means", 1e30), ("sh", 1e3), ("sh", -1e3), ("sh", 1e30)],
+    ("part", "value"), [("log_scales", -46.0), ("means", 1e3), ("means", 1e30), ("sh", 1e3), ("sh", -1e3), ("sh", 1e30)]
 )
 def test_an_extreme_gaussian_leaves_the_others_exactly_as_they_are(clouds, part, value):
     def at(time):
@@ -168,9 +152,8 @@ def test_values_at_one_time_are_within_half_a_step(clouds):
     order = [morton_order(clouds.at(0.0).means[rows]) + rows.start for rows in BRANCHES]
     kept, cloud = bake(clouds.at, [0.0], precision=4.0), clouds.at(0.0).select(np.concatenate(order))
     back = kept.at(0.0)
-    assert np.abs(back.means - cloud.means).max() <= 0.501 * max(
-        kept.static.means.steps[0], kept.dynamic.means.steps[0]
-    )
+    step = max(kept.static.means.steps[0], kept.dynamic.means.steps[0])
+    assert np.abs(back.means - cloud.means).max() <= 0.501 * step
     assert np.abs(np.sort(back.log_scales) - np.sort(cloud.log_scales)).max() <= 0.501 * max(STEPS["log_scales"]) / 4
     opacities, truth = sigmoid(back.logit_opacities), sigmoid(cloud.logit_opacities)
     assert np.abs(opacities - truth).max() <= 0.501 * max(STEPS["opacities"]) / 4
@@ -208,16 +191,19 @@ def test_a_page_holds_the_baked_scene_exactly(path, baked):
                 assert (getattr(getattr(a, part), field) == getattr(getattr(b, part), field)).all()
 
 
-def test_writing_a_page_is_deterministic(path, baked):
+@pytest.fixture(scope="module")
+def text(baked, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "scene.html"
     write_page(path, baked, start())
-    first = path.read_bytes()
-    write_page(path, baked, start())
-    assert path.read_bytes() == first
+    return path.read_text()
 
 
-def test_a_page_contains_no_address(path, baked):
+def test_writing_a_page_is_deterministic(path, baked, text):
     write_page(path, baked, start())
-    text = path.read_text()
+    assert path.read_text() == text
+
+
+def test_a_page_contains_no_address(text):
     assert not re.search(r"https?:|//[a-z]+\.|@import|<link(?![^>]*data:)|src=", text)
     assert "default-src 'none'" in text
 
@@ -232,9 +218,7 @@ def test_a_title_is_escaped(path, baked, title):
     assert json.loads(re.search(r'id="scene">([^<]*)<', text)[1])["start"]["title"] == title
 
 
-def test_a_page_contains_every_part_of_the_player(path, baked):
-    write_page(path, baked, start())
-    text = path.read_text()
+def test_a_page_contains_every_part_of_the_player(text):
     assert not page.PLACEHOLDER.search(text)
     for part in ("class Orbit", "gl_Position", "discard", "postMessage({order", "touch-action"):
         assert part in text

@@ -26,11 +26,6 @@ ENDED = "['settled', 'failed'].includes(document.body?.dataset.state)"
 
 
 @pytest.fixture(scope="module")
-def clouds():
-    return scenes.clouds()
-
-
-@pytest.fixture(scope="module")
 def baked(clouds):
     weights = np.geomspace(1.0, 100.0, len(clouds.at(0.0)))  # different steps
     return bake(clouds.at, evenly_spaced(5), weights=weights.astype(np.float32))

@@ -15,11 +15,6 @@ from warpgs.export.cloud import Cloud, logit
 from warpgs.export.sog import fit_table, write_sog
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "a.sog"
-
-
 def parts(path):
     """The metadata and the images."""
     with zipfile.ZipFile(path) as file:
@@ -123,6 +118,6 @@ def test_equal_scenes_give_equal_files(path, tmp_path):
 
 
 def test_an_empty_cloud_is_refused(path):
-    with pytest.raises(ValueError, match=r"a\.sog: SOG needs at least one Gaussian"):
+    with pytest.raises(ValueError, match=f"{path}: SOG needs at least one Gaussian"):
         write_sog(path, scenes.cloud(0))
     assert not path.exists()

@@ -17,11 +17,6 @@ WIDTHS = (9, 1, 3, 3, 4)
 """Bytes per Gaussian of positions, opacities, colours, scales and rotations."""
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "a.spz"
-
-
 def parts(path):
     """The header and the streams of a file of version 3 or 4."""
     data = path.read_bytes()
@@ -115,7 +110,7 @@ def test_positions_use_all_bits_that_their_range_leaves(path, reach):
 
 def test_a_position_that_does_not_fit_is_refused(path):
     cloud = scenes.cloud(2)
-    with pytest.raises(ValueError, match=r"a\.spz: SPZ holds positions up to 8,388,608, got a larger one"):
+    with pytest.raises(ValueError, match=f"{path}: SPZ holds positions up to 8,388,608, got a larger one"):
         write_spz_gzip(path, dataclasses.replace(cloud, means=cloud.means * np.float32(1e9)))
     assert not path.exists()
 

@@ -15,11 +15,6 @@ from warpgs.export.standard import columns, read_standard, write_standard
 COLUMNS = columns(15)
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "a.ply"
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("num", [0, 1, 37])
 def test_a_cloud_is_read_back_exactly(path, degree, num):
