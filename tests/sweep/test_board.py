@@ -1,6 +1,7 @@
 """The live table."""
 
 import io
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -36,7 +37,7 @@ def test_running_and_failed_cells_come_first_with_their_host_and_reason(board, t
         (tmp_path / "running").mkdir()
         (tmp_path / "running/as-full-seed2").write_text("node7")
         board.tell(Event("as-full-seed4", "failed", "out of memory"))
-        monkeypatch.setattr(board, "_live", type("Shown", (), {"update": lambda *_: None, "stop": lambda *_: None})())
+        monkeypatch.setattr(board, "_live", Mock())
         board.poll()
         shown = text(board.table())
     assert "1 running, 1 failed, 3 queued" in shown
@@ -62,12 +63,10 @@ def test_running_cells_show_iterations_and_time_left_of_this_attempt(board, tmp_
     first, second = capsys.readouterr().out.splitlines()
     (tmp_path / "running").mkdir()
     (tmp_path / "logs").mkdir()
-    monkeypatch.setattr(board, "_live", type("Shown", (), {"update": lambda *_: None})())
+    monkeypatch.setattr(board, "_live", Mock())
     log("as-full-seed0", "node7: warpgs train --seed 0", first, second)
     log("as-full-seed1", "node7: warpgs train --seed 1", first)
-    log(
-        "as-full-seed2", "node7: warpgs train --seed 2", second, "node8: warpgs train --resume as-full-seed2", "reading"
-    )
+    log("as-full-seed2", "node7: warpgs train --seed 2", second, "node8: warpgs train --resume as-full-seed2", "read")
     (tmp_path / "running/as-full-seed3").write_text("node7")  # and no log yet
     board.poll()
     rows = [line for line in text(board.table()) if line.startswith("as-full")]

@@ -40,10 +40,8 @@ def test_there_is_a_cell_for_every_variant_capture_and_seed_and_seeds_come_last(
 
 
 def test_the_command_line_precedes_the_variant_which_precedes_the_file(tmp_path):
-    made = spec(
-        Variant("v", "", {"factor": 2, "loss": {"ssim": 0.5}}),
-        options={"factor": 1, "loss": {"ssim": 0.1, "depth": 9.0}},
-    )
+    variant = Variant("v", "", {"factor": 2, "loss": {"ssim": 0.5}})
+    made = spec(variant, options={"factor": 1, "loss": {"ssim": 0.1, "depth": 9.0}})
     assert (plan(made, out=tmp_path)[0].config.factor, plan(made, out=tmp_path, factor=4)[0].config.factor) == (2, 4)
     loss = plan(made, out=tmp_path)[0].config.loss
     assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["best"].loss.static)
@@ -138,8 +136,7 @@ def test_a_folder_of_captures_may_have_any_layout(write, tmp_path):
     for name in ("bell", "as"):
         write(tmp_path / name)
     (tmp_path / "notes.txt").write_text("")
-    found = find_scenes([str(tmp_path)])
-    assert list(found.items()) == [("as", str(tmp_path / "as")), ("bell", str(tmp_path / "bell"))]
+    assert list(find_scenes([str(tmp_path)]).items()) == [(name, str(tmp_path / name)) for name in ("as", "bell")]
     assert find_scenes([str(tmp_path / "bell")]) == {"bell": str(tmp_path / "bell")}
 
 
@@ -155,9 +152,8 @@ def test_captures_can_be_named_and_built_in_ones_keep_their_name(tmp_path):
 @pytest.mark.parametrize("name", ["", "../esc", "a/b", "a|b"])
 def test_a_name_of_a_capture_that_no_folder_can_have_is_refused(tmp_path, name):
     (tmp_path / "dataset.json").touch()
-    with pytest.raises(
-        ValueError, match=re.escape(f"there is no capture {name}={tmp_path}: {name!r} cannot be a name")
-    ):
+    message = re.escape(f"there is no capture {name}={tmp_path}: {name!r} cannot be a name")
+    with pytest.raises(ValueError, match=message):
         find_scenes([f"{name}={tmp_path}"])
 
 
@@ -187,9 +183,8 @@ def test_a_sweep_without_captures_is_refused():
 def test_a_query_is_appended_to_built_in_captures_only(tmp_path):
     made = spec(Variant("n", "", {}, "depth=network"))
     assert str(plan(made, {"s": "builtin:studio"}, tmp_path)[0].config.data) == "builtin:studio?depth=network"
-    with pytest.raises(
-        ValueError, match="variant n needs a plain built-in capture such as --data builtin:studio, got /as"
-    ):
+    message = "variant n needs a plain built-in capture such as --data builtin:studio, got /as"
+    with pytest.raises(ValueError, match=message):
         plan(made, {"as": "/as"}, tmp_path)
 
 

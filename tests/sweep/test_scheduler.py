@@ -57,11 +57,15 @@ def test_a_cell_under_which_every_node_is_lost_is_given_up():
     assert len(pool.ends["a"]) == 1
 
 
-def test_ctrl_c_stops_the_pool():
-    pool = Script({"a": [KeyboardInterrupt()]})
-    with pytest.raises(KeyboardInterrupt):
+def stopped_by(pool, error):
+    """Whether a pool of one job is stopped, in which an error ends the sweep."""
+    with pytest.raises(error):
         run_jobs(pool, [Job("a", "", "", "", (), "cpu")], lambda event: None, lambda: None)
-    assert pool.stopped
+    return pool.stopped
+
+
+def test_ctrl_c_stops_the_pool():
+    assert stopped_by(Script({"a": [KeyboardInterrupt()]}), KeyboardInterrupt)
 
 
 def test_ctrl_c_while_jobs_are_queued_stops_the_pool():
@@ -69,14 +73,8 @@ def test_ctrl_c_while_jobs_are_queued_stops_the_pool():
         def submit(self, job):
             raise KeyboardInterrupt
 
-    pool = Queueing({})
-    with pytest.raises(KeyboardInterrupt):
-        run_jobs(pool, [Job("a", "", "", "", (), "cpu")], lambda event: None, lambda: None)
-    assert pool.stopped
+    assert stopped_by(Queueing({}), KeyboardInterrupt)
 
 
 def test_a_cluster_that_is_gone_is_not_asked_to_stop():
-    pool = Script({"a": [ClusterGoneError("gone")]})
-    with pytest.raises(ClusterGoneError):
-        run_jobs(pool, [Job("a", "", "", "", (), "cpu")], lambda event: None, lambda: None)
-    assert not pool.stopped
+    assert not stopped_by(Script({"a": [ClusterGoneError("gone")]}), ClusterGoneError)
