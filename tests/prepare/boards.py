@@ -152,6 +152,20 @@ def lens() -> Lens:
     return Lens(*SIZE, (FOCAL, FOCAL), (SIZE[0] / 2, SIZE[1] / 2))
 
 
+def true_cameras(folder: object, names: list[str], *rest: object) -> Cameras:
+    """Takes the place of ``recover_cameras``."""
+    return Cameras(names, lens(), poses(len(names)), points(), 0.1, 10.0)
+
+
+def distances(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Distances of camera centres [F, 3] from the true ones after alignment by a similarity."""
+    a, b = found - found.mean(0), truth - truth.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    reflection = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * np.diag(reflection)).sum() / (a**2).sum()
+    return np.linalg.norm(scale * a @ (u @ reflection @ vt).T - b, axis=1)
+
+
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     """Intersection over union of two masks."""
     return (a & b).sum() / (a | b).sum()
@@ -162,7 +176,7 @@ def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
     images, masks = record(num_frames)
     write_folder(root / "frames", images)
     names = [path.stem for path in sorted((root / "frames").iterdir())]
-    cameras = Cameras(names, lens(), poses(num_frames), points(), 0.1, 10.0)
+    cameras = true_cameras(root, names)
     write_frames(root, root / "frames", cameras, masks)
     write_scene(root, cameras, {name: k for k, name in enumerate(names)}, holdout)
     return root

@@ -6,7 +6,6 @@ import sys
 
 from tests.prepare import boards
 from warpgs.cli import main
-from warpgs.prepare.cameras import Cameras
 
 
 def test_a_wrong_source_ends_with_exit_code_2_and_one_line(tmp_path, capsys):
@@ -20,11 +19,10 @@ def test_a_wrong_source_ends_with_exit_code_2_and_one_line(tmp_path, capsys):
 
 
 def test_after_an_interrupt_the_message_says_how_to_continue(tmp_path, capsys, monkeypatch):
-    shots = boards.write_folder(tmp_path / "shots", boards.record(10)[0])
-
     def interrupted(*arguments: object) -> None:
         raise KeyboardInterrupt
 
+    shots = boards.write_folder(tmp_path / "shots", boards.record(10)[0])
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", interrupted)
     assert main(["prepare", str(shots), str(tmp_path / "capture")]) == 130
     assert "run the same command again to continue" in capsys.readouterr().err
@@ -42,10 +40,7 @@ def test_sigterm_ends_with_one_line_while_colmap_runs(tmp_path):
 
 
 def test_only_existing_contact_sheets_are_mentioned(tmp_path, capsys, monkeypatch):
-    def recover(folder, names, *rest):
-        return Cameras(names, boards.lens(), boards.poses(len(names)), boards.points(), 0.1, 10.0)
-
-    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", boards.true_cameras)
     shots = boards.write_folder(tmp_path / "shots", boards.record(6)[0])
     arguments = ["prepare", str(shots), str(tmp_path / "made"), "--masks", "none", "--depth", "none"]
     assert main(arguments) == 0

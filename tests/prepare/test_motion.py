@@ -7,7 +7,6 @@ import pytest
 from tests.prepare import boards
 from warpgs.data.writer import write_depth
 from warpgs.prepare import motion_masks
-from warpgs.prepare.cameras import Cameras
 from warpgs.prepare.depth import add_depth, as_half
 from warpgs.prepare.flow import Flows
 from warpgs.prepare.flow_depth import _enlarged, static_depth
@@ -25,17 +24,14 @@ def video():
     return boards.record(24)
 
 
+def posed(images):
+    """Frames with their true cameras."""
+    return PosedFrames(images, boards.lens(), boards.poses(len(images)), boards.points())
+
+
 @pytest.fixture(scope="module")
 def frames(video):
-    return PosedFrames(video[0], boards.lens(), boards.poses(24), boards.points())
-
-
-def wall_depth(frame: int, row: int, column: int) -> float:
-    """Depth of the wall behind a pixel."""
-    view = boards.pose(frame / 23)
-    ray = np.array([(column + 0.5 - 128) / boards.FOCAL, (row + 0.5 - 96) / boards.FOCAL, 1.0])
-    center, direction = -view[:, :3].T @ view[:, 3], view[:, :3].T @ ray
-    return float((6.0 - center[2]) / direction[2])
+    return posed(video[0])
 
 
 def observation(rho: float, rotation: np.ndarray, translation: np.ndarray) -> Observation:
@@ -54,12 +50,7 @@ def test_depth_is_exact_for_exact_positions():
 
 
 def test_one_wrong_position_among_many_is_outvoted():
-    translations = [
-        np.array([0.3, 0.0, 0.0]),
-        np.array([-0.3, 0.0, 0.0]),
-        np.array([0.0, 0.3, 0.0]),
-        np.array([0.2, 0.2, 0]),
-    ]
+    translations = map(np.array, ([0.3, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.2, 0.2, 0.0]))
     wrong = observation(3.0, np.eye(3), np.array([0.25, 0.0, 0.0]))
     found = triangulate([*(observation(0.4, np.eye(3), t) for t in translations), wrong], 200.0)
     assert found.inverse_depth.item() == pytest.approx(0.4, rel=0.05)
@@ -140,7 +131,7 @@ def test_every_flow_is_computed_once_at_half_the_size(estimate, video, monkeypat
         return compute(self, a, b, *start, **options)
 
     monkeypatch.setattr(Flows, "compute", counted)
-    frames = PosedFrames(video[0], boards.lens(), boards.poses(24), boards.points())
+    frames = posed(video[0])
     find_dynamic(frames) if estimate == "masks" else static_depth(frames, video[1])
     assert len(pairs) == len(set(pairs)) > 100
     assert shapes == {(96, 128)}
@@ -148,7 +139,7 @@ def test_every_flow_is_computed_once_at_half_the_size(estimate, video, monkeypat
 
 def test_depth_of_frames_that_masks_were_found_on_is_the_same_without_flow_of_its_own(monkeypatch):
     images, dynamic = boards.record(10)
-    fresh, used = (PosedFrames(images, boards.lens(), boards.poses(10), boards.points()) for _ in range(2))
+    fresh, used = posed(images), posed(images)
     expected = static_depth(fresh, dynamic)
     used.halved.triangulated = {}
     find_dynamic(used)
@@ -259,24 +250,22 @@ def test_stripes_are_no_evidence_of_motion(witnesses):
 
 
 def test_nothing_is_masked_where_nothing_moves():
-    images, _ = boards.record(16, moves=False)
-    found = find_dynamic(PosedFrames(images, boards.lens(), boards.poses(16), boards.points()))
-    assert np.mean(found) < 0.02
+    assert np.mean(find_dynamic(posed(boards.record(16, moves=False)[0]))) < 0.02
 
 
-def test_depth_of_the_wall_is_correct_within_two_percent(video, frames):
-    planes = static_depth(frames, video[1])
-    errors = []
-    for frame in range(4, 20):
-        positions = [(row, column) for row in (150, 170, 180) for column in (110, 120, 130)]
-        values = [(planes[frame][position], wall_depth(frame, *position)) for position in positions]
-        errors += [abs(rho * depth - 1.0) for rho, depth in values if np.isfinite(rho)]
-    assert len(errors) > 50
-    assert np.median(errors) < 0.02
+@pytest.fixture(scope="module")
+def planes(video, frames):
+    return static_depth(frames, video[1])
 
 
-def test_depth_is_unknown_in_dynamic_regions(video, frames):
-    planes = static_depth(frames, video[1])
+def test_depth_of_the_wall_is_correct_within_two_percent(planes):
+    region = np.s_[[[150], [170], [180]], [110, 120, 130]]
+    errors = [planes[k][region] * boards.depth(boards.pose(k / 23))[region] - 1.0 for k in range(4, 20)]
+    assert np.isfinite(errors).sum() > 50
+    assert np.nanmedian(np.abs(errors)) < 0.02
+
+
+def test_depth_is_unknown_in_dynamic_regions(video, planes):
     assert all(np.isnan(plane[mask]).all() for plane, mask in zip(planes, video[1], strict=True))
     assert np.mean([np.isfinite(plane).mean() for plane in planes]) > 0.5
 
@@ -298,8 +287,7 @@ def test_depth_without_a_known_pixel_is_written_as_unknown(tmp_path):
 
 def test_a_frame_without_any_depth_is_named(tmp_path):
     boards.write_capture(tmp_path, 4)
-    names = [f"shot{k:03d}" for k in range(4)]
-    cameras = Cameras(names, boards.lens(), boards.poses(4), boards.points(), 0.1, 10.0)
+    cameras = boards.true_cameras(tmp_path, [f"shot{k:03d}" for k in range(4)])
 
     def estimate(frames: PosedFrames, dynamic: object, weights: None, quiet: bool) -> list[np.ndarray]:
         return [np.full((192, 256), np.nan if k == 2 else 0.5, np.float32) for k in range(4)]
@@ -318,8 +306,7 @@ def test_dark_images_are_brightened_to_middle_grey_and_black_ones_stay_black(vid
 @pytest.mark.parametrize("min_gap", MIN_GAPS)
 @pytest.mark.parametrize("num_frames", [24, 48])
 def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, num_frames):
-    images, _ = boards.record(num_frames)
-    frames = PosedFrames(images, boards.lens(), boards.poses(num_frames), boards.points())
+    frames = posed(boards.record(num_frames)[0])
     revisits = Revisits(frames, Flows(frames.images))
     gaps = [abs(k - num_frames // 2) for k in revisits.far_frames(num_frames // 2, 0.2, min_gap)]
     assert gaps
@@ -327,8 +314,7 @@ def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, num_frames):
 
 
 def test_evidence_is_found_beside_both_sets_of_far_frames():
-    images, _ = boards.record(48)
-    frames = PosedFrames(images, boards.lens(), boards.poses(48), boards.points())
+    frames = posed(boards.record(48)[0])
     flows = Flows(brighten(frames.images), frames.expected_flow)
     farther, nearer = Revisits(frames, flows).evidence(24).agreements
     assert farther.witnesses.max() > 2
@@ -441,9 +427,8 @@ def test_a_finger_of_the_colour_of_a_door_is_outlined_with_its_hand():
 def test_a_region_too_small_for_every_fourth_pixel_is_outlined():
     image = np.full((96, 128, 3), 90, np.uint8)
     image[40:43, 40:43] = 250
-    probability = cv2.circle(
-        np.zeros((96, 128), np.float32), (41, 41), 4, 0.9, -1
-    )  # blurred, above 0.5 in an odd row or column alone
+    probability = np.zeros((96, 128), np.float32)
+    cv2.circle(probability, (41, 41), 4, 0.9, -1)  # blurred, above 0.5 in an odd row or column alone
     found = outline(image, probability)
     assert found[39:44, 39:44].any()
     assert found.mean() < 0.01

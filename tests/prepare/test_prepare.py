@@ -3,7 +3,6 @@
 import dataclasses
 import errno
 import json
-import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.campaign.damage import replace_by_fifo
 from tests.prepare import boards
 from warpgs.data.check import check_capture
 from warpgs.data.lens import Lens, undistort
@@ -32,8 +32,11 @@ def interrupted(*arguments: object, **options: object) -> None:
     raise KeyboardInterrupt
 
 
-def true_cameras(folder, names, *rest) -> Cameras:
-    return Cameras(names, boards.lens(), boards.poses(len(names)), boards.points(), 0.1, 10.0)
+def interrupt_before_the_capture_is_written(shots, root, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("warpgs.prepare.steps.write_capture", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            prepare(shots, root, masks="none", depth="none")
 
 
 @pytest.fixture(scope="module")
@@ -56,11 +59,7 @@ def distances(capture, count=24) -> np.ndarray:
     poses = boards.poses(count)[[int(name[6:]) for name in names]]
     truth = -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
     found = np.array([capture.cameras[n].position.numpy() for n in names], np.float64)
-    a, b = found - found.mean(0), truth - truth.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    reflection = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * np.diag(reflection)).sum() / (a**2).sum()
-    return np.linalg.norm(scale * a @ (u @ reflection @ vt).T - b, axis=1) / np.ptp(truth, axis=0).max()
+    return boards.distances(found, truth) / np.ptp(truth, axis=0).max()
 
 
 def test_every_frame_gets_its_true_camera(made):
@@ -151,12 +150,9 @@ def test_masks_of_everything_are_refused_with_advice(shots, tmp_path, camera, me
 
 
 def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "warpgs.prepare.masks.find_dynamic", lambda frames, *rest: [i[..., 0] < 256 for i in frames.images]
-    )
-    with pytest.raises(
-        ValueError, match=r"100% of the pixels seem to move: the camera is not still; try another --camera"
-    ):
+    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda f, *rest: [i[..., 0] < 256 for i in f.images])
+    message = "100% of the pixels seem to move: the camera is not still; try another --camera"
+    with pytest.raises(ValueError, match=message):
         prepare(shots, tmp_path / "made", camera="still")
 
 
@@ -175,14 +171,11 @@ def test_a_prepared_capture_is_fit_to_train_on(made):
     assert "24 of 24 frames have masks, 24 have depth" in str(report)
 
 
-def test_a_contact_sheet_and_a_report_are_written(made):
+def test_a_contact_sheet_and_a_report_are_written_and_of_the_work_folder_only_the_state_remains(made):
     assert cv2.imread(str(made / "masks.png")).shape[1] == 6 * 256
     report = json.loads((made / "prepare.json").read_text())
     assert report["notes"] == []
     assert "24 of 24" in report["steps"]["cameras"]
-
-
-def test_only_the_state_remains_of_the_work_folder(made):
     assert [path.name for path in (made / ".prepare").iterdir()] == ["state.json"]
 
 
@@ -194,9 +187,9 @@ def test_a_finished_capture_is_not_changed(made, shots):
 
 def test_a_capture_finished_before_there_was_an_option_stays_finished(made, shots):
     path = made / ".prepare" / "state.json"
-    state = json.loads(path.read_text())
-    del state["options"]["camera"]
     copy = path.read_text()
+    state = json.loads(copy)
+    del state["options"]["camera"]
     path.write_text(json.dumps(state))
     prepare(shots, made, holdout=8)
     path.write_text(copy)
@@ -210,10 +203,7 @@ def test_other_options_require_force(made, shots):
 
 
 def test_an_interrupted_preparation_continues_after_the_last_finished_step(shots, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr("warpgs.prepare.steps.write_capture", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prepare(shots, tmp_path / "made", masks="none", depth="none")
+    interrupt_before_the_capture_is_written(shots, tmp_path / "made", monkeypatch)
     for finished in ("take_frames", "recover_cameras"):
         monkeypatch.setattr(f"warpgs.prepare.steps.{finished}", lambda *arguments: pytest.fail("finished before"))
     prepare(shots, tmp_path / "made", masks="none", depth="none")
@@ -227,32 +217,20 @@ def spoil_poses(path):
     cameras.save(path.with_suffix(""))
 
 
-def cut(path):
-    path.write_bytes(path.read_bytes()[:-200])
-
-
-def replace_with_fifo(path):
-    path.unlink()
-    os.mkfifo(path)
-
-
 DAMAGES = [
     ("frames/frames.json", lambda path: path.write_text("{}"), "frames"),
     ("frames/frames.json", lambda path: path.write_text('{"width": 3, "height": 3, "frames": [1]}'), "TypeError|not"),
-    ("frames/frames.json", replace_with_fifo, "is not a file"),
-    ("first-cameras.npz", cut, "zip"),
+    ("frames/frames.json", replace_by_fifo, "is not a file"),
+    ("first-cameras.npz", lambda path: path.write_bytes(path.read_bytes()[:-200]), "zip"),
     ("first-cameras.npz", spoil_poses, "a finite pose of every frame"),
-    ("first-cameras.npz", replace_with_fifo, "is not a file"),
+    ("first-cameras.npz", replace_by_fifo, "is not a file"),
 ]
 
 
 @pytest.mark.parametrize(("name", "damage", "reason"), DAMAGES, ids=[str(k) for k in range(len(DAMAGES))])
 def test_a_damaged_result_of_an_earlier_call_is_refused_by_name(shots, tmp_path, monkeypatch, name, damage, reason):
-    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", true_cameras)
-    with monkeypatch.context() as patch:
-        patch.setattr("warpgs.prepare.steps.write_capture", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            prepare(shots, tmp_path / "made", masks="none", depth="none")
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", boards.true_cameras)
+    interrupt_before_the_capture_is_written(shots, tmp_path / "made", monkeypatch)
     (path,) = (tmp_path / "made/.prepare").glob(name.replace("first-cameras", "*cameras*"))
     damage(path)
     with pytest.raises(ValueError, match=rf"of an earlier call, is damaged \(.*{reason}.*\): use --force"):
@@ -284,7 +262,7 @@ def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch)
 
     def recover(folder, names, work, settings, quiet):
         assert settings.known == Lens(*boards.SIZE, (230.0, 230.0), (130.0, 96.0))
-        return dataclasses.replace(true_cameras(folder, names), lens=settings.known)
+        return dataclasses.replace(boards.true_cameras(folder, names), lens=settings.known)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 512 384 460 460 260 192\n")
@@ -309,7 +287,7 @@ def test_masks_of_undistorted_frames_are_not_undistorted_again(ending, shots, tm
     distorted = dataclasses.replace(boards.lens(), radial=(-0.2, 0.0, 0.0))
 
     def recover(folder, names, *rest):
-        return dataclasses.replace(true_cameras(folder, names), lens=distorted)
+        return dataclasses.replace(boards.true_cameras(folder, names), lens=distorted)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
     mask = boards.record(24)[1][10]
@@ -373,9 +351,8 @@ def test_a_replacement_interrupted_while_files_are_removed_is_not_finished(made,
     root = shutil.copytree(made, tmp_path / "made")
     options = json.loads((root / ".prepare/state.json").read_text())["options"]
     assert Journal(root, options, force=False, log=None).is_finished
-    monkeypatch.setattr(
-        "warpgs.prepare.journal.shutil", SimpleNamespace(rmtree=interrupted, disk_usage=shutil.disk_usage)
-    )
+    interrupting = SimpleNamespace(rmtree=interrupted, disk_usage=shutil.disk_usage)
+    monkeypatch.setattr("warpgs.prepare.journal.shutil", interrupting)
     with pytest.raises(KeyboardInterrupt):
         prepare(shots, root, force=True, holdout=8)
     monkeypatch.undo()
@@ -392,8 +369,7 @@ def test_an_unfinished_capture_may_be_continued_with_other_options(shots, tmp_pa
 
 def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
     monkeypatch.setattr("warpgs.prepare.checks.find_weights", lambda *arguments: None)
-    (tmp_path / "resized_mask/1x").mkdir(parents=True)
-    inside = tmp_path / "resized_mask/1x"
+    (inside := tmp_path / "resized_mask/1x").mkdir(parents=True)
     for name, source, options in (
         ("source", inside, {}),
         ("masks", shots, {"masks": str(inside)}),
@@ -477,20 +453,16 @@ def test_colmap_does_not_start_on_a_full_disk(shots, tmp_path, monkeypatch):
             prepare(shots, tmp_path / "made")
 
 
-@pytest.mark.parametrize(
-    ("error", "falls_back"), [(NoCamerasError("few features"), True), (ValueError("COLMAP failed"), False)]
-)
-def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, falls_back, shots, tmp_path, monkeypatch):
+@pytest.mark.parametrize("error", [NoCamerasError("few features"), ValueError("COLMAP failed")])
+def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, shots, tmp_path, monkeypatch):
     def recover(folder, names, work, settings, quiet):
         if settings.masks is not None:
             raise error
-        return true_cameras(folder, names)
+        return boards.true_cameras(folder, names)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
-    monkeypatch.setattr(
-        "warpgs.prepare.masks.find_dynamic", lambda frames, *rest: [i[..., 0] > 255 for i in frames.images]
-    )
-    if falls_back:
+    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images])
+    if isinstance(error, NoCamerasError):
         notes = prepare(shots, tmp_path / "made", depth="none")["notes"]
         assert notes == ["the cameras are those of the first pass, without masks: with masks, few features"]
     else:
