@@ -31,6 +31,10 @@ def is_red(image):
     return (red > 1.6 * green) & (red > 1.6 * blue)
 
 
+def red_part(root, name):
+    return is_red(cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB))
+
+
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
     root = boards.write_capture(tmp_path_factory.mktemp("add") / "capture", COUNT, holdout=6)
@@ -50,6 +54,13 @@ def red(monkeypatch):
     monkeypatch.setitem(masks.MASKERS, "red", Masker(lambda frames, weights, quiet: [is_red(i) for i in frames.images]))
 
 
+STATIC = np.full((192, 256), 255, np.uint8)
+
+
+def write_mask(root, name, mask=STATIC):
+    captures.write_png(root / f"resized_mask/1x/{name}.png.png", mask)
+
+
 def written_mask(root, name, size="1x"):
     return decode(root / f"resized_mask/{size}/{name}.png.png") == 0
 
@@ -62,8 +73,7 @@ def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
     assert main(["prepare", str(root), "--add", "masks", "--masks", "red"]) == 0
     assert "masks: 12 frames" in capsys.readouterr().out
     for name in NAMES:
-        image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
-        assert boards.overlap(written_mask(root, name), is_red(image)) > 0.9, name
+        assert boards.overlap(written_mask(root, name), red_part(root, name)) > 0.9, name
         assert written_mask(root, name, "2x").shape == (96, 128)
     capture = load_capture(root)
     assert all(capture.frame(name).static_mask is not None for name in NAMES)
@@ -73,11 +83,8 @@ def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
 
 @pytest.mark.usefixtures("red")
 def test_masks_that_are_there_stay(root):
-    mask = np.full((192, 256), 255, np.uint8)
-    captures.write_png(root / "resized_mask/1x/shot003.png.png", mask)
     for name in NAMES:
-        if name != "shot003":
-            captures.write_png(root / f"resized_mask/1x/{name}.png.png", mask)
+        write_mask(root, name)
     lines = []
     add_parts(root, AddOptions(["masks"], masks="red"), lines.append)
     assert lines == ["masks: 12 frames had them in some sizes only", "masks: all frames have them"]
@@ -88,10 +95,10 @@ def test_masks_that_are_there_stay(root):
 @pytest.mark.usefixtures("red")
 def test_masks_that_only_some_training_frames_lack_are_made(root):
     """Three of twelve frames have masks, in one of two sizes."""
-    drawn = np.full((192, 256), 255, np.uint8)
+    drawn = STATIC.copy()
     drawn[40:80, 60:100] = 0
     for name in NAMES[2:5]:
-        captures.write_png(root / f"resized_mask/1x/{name}.png.png", drawn)
+        write_mask(root, name, drawn)
     with pytest.raises(ValueError, match=r"needs its mask; warpgs prepare .*capture --add masks makes those"):
         load_capture(root)
     lines = []
@@ -99,8 +106,7 @@ def test_masks_that_only_some_training_frames_lack_are_made(root):
     assert lines[0] == "masks: 3 frames had them in some sizes only"
     assert lines[1].startswith("masks: 9 frames")
     for name in NAMES:
-        image = cv2.cvtColor(decode(root / f"rgb/1x/{name}.png"), cv2.COLOR_BGR2RGB)
-        expected = drawn == 0 if name in NAMES[2:5] else is_red(image)
+        expected = drawn == 0 if name in NAMES[2:5] else red_part(root, name)
         assert boards.overlap(written_mask(root, name), expected) > 0.9, name
         halved = cv2.resize(expected.astype(np.uint8), (128, 96)) > 0
         assert boards.overlap(written_mask(root, name, "2x"), halved) > 0.8
@@ -122,14 +128,14 @@ def test_masks_are_known_as_estimates_if_the_next_part_fails(root, monkeypatch):
 @pytest.mark.usefixtures("red")
 def test_masks_of_one_size_in_a_folder_that_gets_no_new_ones_are_refused(root):
     for name in NAMES:
-        captures.write_png(root / f"mask/2x/{name}.png.png", np.full((96, 128), 255, np.uint8))
+        captures.write_png(root / f"mask/2x/{name}.png.png", STATIC[::2, ::2])
     with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
         add_parts(root, AddOptions(["masks"], masks="red"))
 
 
 def test_depth_is_not_added_beside_incomplete_masks(root):
     """What moves in the other frames would count as static."""
-    captures.write_png(root / f"resized_mask/1x/{NAMES[2]}.png.png", np.full((192, 256), 255, np.uint8))
+    write_mask(root, NAMES[2])
     with pytest.raises(ValueError, match="every training frame needs its mask"):
         add_parts(root, AddOptions(["depth"]))
 
@@ -139,7 +145,8 @@ def test_masks_are_not_split_over_two_folders(root):
     """Masks of the training frames in mask/, none of the evaluation frames."""
     train = load_capture(root).train
     for name in train:
-        captures.write_png(root / f"mask/1x/{name}.png.png", np.full((192, 256), 255, np.uint8))
+        write_mask(root, name)
+    (root / "resized_mask").rename(root / "mask")
     with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
         add_parts(root, AddOptions(["masks"], masks="red"))
     assert not (root / "resized_mask").exists()

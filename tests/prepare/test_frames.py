@@ -36,28 +36,19 @@ def test_the_sharpest_images_of_a_folder_are_taken(tmp_path, images):
     assert [frame.source for frame in frames.taken] == [f"shot{k:03d}.png" for k in (1, 5, 9, 13, 17)]
 
 
-def test_a_rate_is_the_number_of_frames_per_second(tmp_path, images):
+@pytest.mark.parametrize(("fps", "count"), [(5.0, 10), (1000.0, 20)])
+def test_a_rate_is_the_number_of_frames_per_second_and_at_most_that_of_the_video(tmp_path, images, fps, count):
     video = write_video(tmp_path / "video.mp4", images, rate=10.0)
-    assert len(take_frames(video, tmp_path / "frames", Selection(fps=5.0)).taken) == 10
+    assert len(take_frames(video, tmp_path / "frames", Selection(fps=fps)).taken) == count
 
 
-def test_a_rate_above_that_of_the_video_takes_every_frame(tmp_path, images):
-    video = write_video(tmp_path / "video.mp4", images, rate=10.0)
-    assert len(take_frames(video, tmp_path / "frames", Selection(fps=1000.0)).taken) == 20
-
-
-def test_large_images_are_scaled_down_and_small_ones_kept(tmp_path, images):
+def test_large_images_are_scaled_down_and_small_ones_kept_as_the_list_of_frames_says(tmp_path, images):
     shots = write_folder(tmp_path / "shots", images[:5])
-    take_frames(shots, tmp_path / "small", Selection(longest_side=128))
+    assert take_frames(shots, tmp_path / "small", Selection(longest_side=128)) == Frames.load(tmp_path / "small")
     take_frames(shots, tmp_path / "large", Selection(longest_side=5000))
     assert decode(tmp_path / "small/frame_000000.png").shape == (96, 128, 3)
     assert (Frames.load(tmp_path / "small").factor, Frames.load(tmp_path / "large").factor) == (0.5, 1.0)
     assert np.array_equal(decode(tmp_path / "large/frame_000000.png")[..., ::-1], images[0])
-
-
-def test_the_list_of_frames_is_read_back(tmp_path, images):
-    shots = write_folder(tmp_path / "shots", images[:6])
-    assert take_frames(shots, tmp_path / "frames", Selection()) == Frames.load(tmp_path / "frames")
 
 
 def test_an_image_is_rotated_by_its_orientation_tag(tmp_path, images):

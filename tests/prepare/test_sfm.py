@@ -41,11 +41,8 @@ def test_a_crash_is_one_line_with_its_signal(tmp_path, monkeypatch):
 
 
 def test_a_full_disk_is_named_as_such(tmp_path, monkeypatch):
-    class Usage:
-        free = 1000
-
     answer(monkeypatch, "import os; os.abort()")
-    monkeypatch.setattr(sfm.shutil, "disk_usage", lambda path: Usage)
+    monkeypatch.setattr(sfm.shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
     with pytest.raises(OSError, match="No space left on device"):
         recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
 
@@ -123,6 +120,14 @@ def test_frames_that_see_too_few_points_lose_their_camera():
     assert removed == [12]
 
 
+def recover(frames: Path, work: Path, **settings: object) -> Cameras:
+    """The cameras of all frames of a folder."""
+    names = [path.stem for path in sorted(frames.iterdir())]
+    found = recover_cameras(frames, names, work, Settings(**settings))
+    assert found.names == names
+    return found
+
+
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
     """A camera that pans over an image."""
@@ -130,16 +135,13 @@ def turning(tmp_path_factory) -> Path:
 
 
 def test_a_camera_that_only_turns_is_refused_and_named(turning, tmp_path):
-    names = [path.stem for path in sorted(turning.iterdir())]
     with pytest.raises(NoCamerasError, match=r"the camera only turns: a rotation explains \d+% of the matches"):
-        recover_cameras(turning, names, tmp_path / "work", Settings(thorough=False))
+        recover(turning, tmp_path / "work", thorough=False)
     assert not (tmp_path / "work/model").exists()  # it was refused before mapping
 
 
 def test_directions_and_focal_length_of_a_camera_that_turns_are_found(turning, tmp_path):
-    names = [path.stem for path in sorted(turning.iterdir())]
-    found = recover_cameras(turning, names, tmp_path / "work", Settings(turns=True))
-    assert found.names == names
+    found = recover(turning, tmp_path / "work", turns=True)
     assert abs(found.lens.focal[0] / boards.FOCAL - 1.0) < 0.01
     assert not found.have_parallax
     steps = [a.T @ b for a, b in itertools.pairwise(found.poses[:, :, :3])]
@@ -154,10 +156,7 @@ FISHEYE = Lens(*boards.SIZE, (112.0, 112.0), (130.0, 95.0), fisheye=(0.04, -0.01
 def test_cameras_with_a_fisheye_lens_are_found(known, tmp_path):
     """The lens sees 130° across, and 157° from corner to corner."""
     frames = boards.write_folder(tmp_path / "shots", boards.through_fisheye(8, FISHEYE))
-    names = [path.stem for path in sorted(frames.iterdir())]
-    settings = Settings(known=known) if known else Settings(lens="OPENCV_FISHEYE")
-    found = recover_cameras(frames, names, tmp_path / "work", settings)
-    assert found.names == names
+    found = recover(frames, tmp_path / "work", **({"known": known} if known else {"lens": "OPENCV_FISHEYE"}))
     assert found.lens.fisheye is not None
     assert known is None or found.lens == known
     u, v = np.meshgrid(np.linspace(20, 236, 9), np.linspace(20, 172, 7))
@@ -191,14 +190,12 @@ def test_a_camera_that_passes_a_wall_needs_its_focal_length(tmp_path, monkeypatc
 def test_refinement_uses_the_features_of_the_first_pass(tmp_path):
     images, masks = boards.record(12)
     frames = boards.write_folder(tmp_path / "shots", images)
-    names = [path.stem for path in sorted(frames.iterdir())]
-    for name, mask in zip(names, masks, strict=True):
-        boards.cv2.imwrite(str(tmp_path / f"{name}.png.png"), np.where(mask, 0, 255).astype(np.uint8))
-    recover_cameras(frames, names, tmp_path / "work", Settings(thorough=False))
+    for k, mask in enumerate(masks):
+        boards.cv2.imwrite(str(tmp_path / f"shot{k:03d}.png.png"), np.where(mask, 0, 255).astype(np.uint8))
+    recover(frames, tmp_path / "work", thorough=False)
     extracted = (tmp_path / "work/features.done").stat().st_mtime_ns
-    refined = recover_cameras(frames, names, tmp_path / "work", Settings(masks=tmp_path, refine=True))
+    refined = recover(frames, tmp_path / "work", masks=tmp_path, refine=True)
     assert (tmp_path / "work/features.done").stat().st_mtime_ns == extracted
-    assert refined.names == names
     assert refined.error < 0.4  # that of the first pass, which what moves misleads, is 0.17 to 0.5: not deterministic
     assert abs(refined.lens.focal[0] / boards.FOCAL - 1.0) < 0.03
 
@@ -243,9 +240,7 @@ def agree_on(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
         (150.0, {150.0: (90.0, 0.9), 576.0: (240.0, 0.3)}, [150.0, 576.0], 240.0),
     ],
 )
-def test_mapping_starts_from_the_focal_length_that_the_pairs_agree_on(
-    agreed, found, starts, kept, tmp_path, monkeypatch
-):
+def test_mapping_starts_from_the_focal_length_that_pairs_agree_on(agreed, found, starts, kept, tmp_path, monkeypatch):
     """``found``: by start, the focal length and the reprojection error that mapping ends with."""
     names, started = wide_database(tmp_path / "features.db"), []
 
@@ -278,10 +273,8 @@ def test_the_focal_length_that_pairs_agree_on_is_the_true_one(tmp_path):
         turn = (poses[b][0] * poses[a][0].inv()).as_matrix()
         x, y, z = poses[b][1] - turn @ poses[a][1]
         essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ turn
-        pair.F, pair.config = (
-            calibration.T @ essential @ calibration,
-            pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED,
-        )
+        pair.F = calibration.T @ essential @ calibration
+        pair.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
         opened.update_two_view_geometry(a, b, pair)
     opened.close()
     copy = calibrated(tmp_path / "features.db")
@@ -308,7 +301,4 @@ def test_a_far_focal_length_that_loses_frames_has_a_rival(placed, tried, tmp_pat
 
 def test_a_known_focal_length_is_kept(tmp_path):
     frames = boards.write_folder(tmp_path / "shots", boards.record(10, moves=False)[0])
-    names = [path.stem for path in sorted(frames.iterdir())]
-    found = recover_cameras(frames, names, tmp_path / "work", Settings(focal=boards.FOCAL))
-    assert found.lens.focal == (boards.FOCAL, boards.FOCAL)
-    assert found.names == names
+    assert recover(frames, tmp_path / "work", focal=boards.FOCAL).lens.focal == (boards.FOCAL, boards.FOCAL)
