@@ -118,10 +118,14 @@ def test_without_visible_points_the_focus_is_one_unit_away(points):
     assert paths.focus(camera(), points) == 1.0
 
 
+def pixel_of(c, point):
+    projected = c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])
+    return projected[:2] / projected[2]
+
+
 def distance_from_center(c, point):
     """Distance of a point from the image center [px]."""
-    projected = c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])
-    return float((projected[:2] / projected[2] - c.K[:2, 2]).norm())
+    return float((pixel_of(c, point) - c.K[:2, 2]).norm())
 
 
 def test_a_spiral_keeps_its_target_centered_and_its_radius():
@@ -150,14 +154,10 @@ def test_time_stops_while_the_camera_swings(stop, frames):
     assert [c.time for c in path] == sorted(c.time for c in path)
 
 
-def test_bullet_time_runs_from_the_first_time_to_the_last():
+def test_bullet_time_runs_from_the_first_time_to_the_last_swings_to_both_sides_and_keeps_its_distance():
     path = paths.bullet(camera(), 2.0, 0.5, 120)
-    assert path[0].time == 0.0
-    assert path[-1].time == 1.0
-
-
-def test_bullet_time_swings_to_both_sides_and_keeps_its_distance():
-    centers = positions(paths.bullet(camera(), 2.0, 0.5, 120))
+    assert (path[0].time, path[-1].time) == (0.0, 1.0)
+    centers = positions(path)
     assert centers[:, 0].max() == pytest.approx(2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers[:, 0].min() == pytest.approx(-2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
@@ -177,9 +177,8 @@ def test_outliers_do_not_enlarge_the_bounding_sphere():
 
 def test_training_cameras_are_always_within_the_scene():
     far = torch.tensor([[0.0, 0.0, -50.0]])
-    paths.BoundingSphere.around(torch.randn(100, 3), far).check(
-        [Camera.looking_at(far[0], torch.zeros(3), UP, 9.0, (4, 4))], "x"
-    )
+    sphere = paths.BoundingSphere.around(torch.randn(100, 3), far)
+    sphere.check([Camera.looking_at(far[0], torch.zeros(3), UP, 9.0, (4, 4))], "x")
 
 
 def test_a_path_that_leaves_the_scene_is_refused_and_its_camera_named():
@@ -208,10 +207,7 @@ def test_a_resized_camera_sees_the_same_view(factor):
     point = torch.tensor([0.3, -0.2, 0.5])
     a, b = camera(), paths.resized(camera(), factor)
     assert b.size == (round(64 * factor), round(48 * factor))
-    projected = [(c.K @ (c.viewmat[:3, :3] @ point + c.viewmat[:3, 3])) for c in (a, b)]
-    relative = [
-        p[:2] / p[2] / torch.tensor([float(c.width), float(c.height)]) for p, c in zip(projected, (a, b), strict=True)
-    ]
+    relative = [pixel_of(c, point) / torch.tensor([float(c.width), float(c.height)]) for c in (a, b)]
     assert (relative[0] - relative[1]).abs().max() < 1e-6
 
 

@@ -147,28 +147,19 @@ def test_an_invalid_path_is_refused_with_a_one_line_message(path, text, words):
     assert "\n" not in str(error.value)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path):
-    for path, message in ((tmp_path / "none.json", r"none\.json is missing"), (tmp_path, "is not a file")):
-        with pytest.raises(ValueError, match=message):
-            read_path(path, CAPTURE, 3)
+UNREADABLE = {
+    "missing": (lambda path: None, r"path\.json is missing"),
+    "folder": (lambda path: path.mkdir(), "is not a file"),
+    "binary": (lambda path: path.write_bytes(b"\xff\xfe"), "is not valid JSON"),
+    "huge": (lambda path: path.write_text(" " * ((1 << 20) + 1)), "has 1,048,577 bytes, more than"),
+    "device, whose size is 0": (lambda path: path.symlink_to("/dev/zero"), "is not a file"),
+}
 
 
-def test_a_binary_file_is_refused(path):
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match="is not valid JSON"):
-        read_path(path, CAPTURE, 3)
-
-
-def test_a_huge_file_is_not_read(path):
-    path.write_text(" " * ((1 << 20) + 1))
-    with pytest.raises(ValueError, match="has 1,048,577 bytes, more than"):
-        read_path(path, CAPTURE, 3)
-
-
-def test_a_device_is_not_read(path):
-    """It would never end, although its size is 0."""
-    path.symlink_to("/dev/zero")
-    with pytest.raises(ValueError, match="is not a file"):
+@pytest.mark.parametrize(("make", "message"), UNREADABLE.values(), ids=UNREADABLE)
+def test_what_is_not_a_file_of_a_path_is_refused(path, make, message):
+    make(path)
+    with pytest.raises(ValueError, match=message):
         read_path(path, CAPTURE, 3)
 
 

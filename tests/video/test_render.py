@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.data.captures import edit_json
 from tests.errors import error_line
 from tests.video.test_writer import frames_of
 from warpgs import rendering
 from warpgs.cli import main
+from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video import frames, render_run, writer
@@ -335,18 +337,11 @@ def test_without_an_encoder_the_error_suggests_png(run, tmp_path, monkeypatch):
     assert len(images_in(tmp_path)) == 3
 
 
-@pytest.fixture
-def damaged(run, tmp_path):
-    """A copy of the run to damage."""
-    return shutil.copytree(run, tmp_path / "damaged")
-
-
-def test_the_error_names_a_moved_capture_and_data_replaces_it(damaged, capture, tmp_path, capsys):
-    config = json.loads((damaged / "config.json").read_text())
-    data = config["data"]
-    (damaged / "config.json").write_text(json.dumps({**config, "data": str(tmp_path / "gone")}))
-    assert str(tmp_path / "gone") in error_line(capsys, "render", damaged, "--device", "cpu")
-    assert f"{len(capture.val)} images" in render(damaged, tmp_path, data=Path(data))
+def test_the_error_names_a_moved_capture_and_data_replaces_it(run, capture, tmp_path, capsys):
+    moved, data = shutil.copytree(run, tmp_path / "moved"), read_config(run).data
+    edit_json(moved / "config.json", data=str(tmp_path / "gone"))
+    assert str(tmp_path / "gone") in error_line(capsys, "render", moved, "--device", "cpu")
+    assert f"{len(capture.val)} images" in render(moved, tmp_path, data=data)
 
 
 def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypatch, capsys):
