@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import json
 import math
 import re
@@ -53,13 +54,9 @@ def capture(val=VAL, **options):
 
 
 def rendering(image, dynamic_alpha=None):
-    def layer(image, alpha):
-        return Layer(image, alpha, None)
-
-    alpha = torch.zeros(H, W) if dynamic_alpha is None else dynamic_alpha
-    nothing = torch.zeros(0, 2)
-    joint = layer(image, torch.ones(H, W))
-    return Rendering(joint, joint, layer(torch.zeros(H, W, 3), alpha), nothing.int(), None, None, None)
+    alpha = torch.zeros(image.shape[:2]) if dynamic_alpha is None else dynamic_alpha
+    joint, dynamic = Layer(image, torch.ones_like(alpha), None), Layer(torch.zeros_like(image), alpha, None)
+    return Rendering(joint, joint, dynamic, torch.zeros(0, 2).int(), None, None, None)
 
 
 class Scene:
@@ -145,16 +142,8 @@ def test_values_outside_0_and_1_count_as_0_and_1():
 
 def test_what_a_capture_does_not_have_is_not_measured():
     view = evaluated(capture(masks=False), noisy(capture())).views[0]
-    regions = (
-        "psnr_static",
-        "psnr_dynamic",
-        "ssim_static",
-        "ssim_dynamic",
-        "masked_psnr",
-        "masked_ssim",
-        "masked_lpips",
-    )
-    for name in (*regions, "masked_lpips", "lpips", "ms_ssim"):
+    regions = "psnr_static psnr_dynamic ssim_static ssim_dynamic masked_psnr masked_ssim masked_lpips"
+    for name in (*regions.split(), "lpips", "ms_ssim"):
         assert getattr(view, name) is None
 
 
@@ -225,6 +214,7 @@ def undistorted_ray(u, v):
     return found.x
 
 
+@functools.cache
 def distorted_capture():
     """One evaluation frame of the pattern through ``LENS``."""
     pixels = [[undistorted_ray(j + 0.5, i + 0.5) for j in range(LENS.width)] for i in range(LENS.height)]
@@ -240,21 +230,13 @@ def distorted_capture():
 
 
 def pattern_scene():
-    def render(camera, branches):
-        image = pattern(*rays(camera))
-        layer = Layer(image, torch.zeros(camera.height, camera.width), None)
-        nothing = torch.zeros(0, 2)
-        return Rendering(layer, layer, layer, nothing.int(), None, None, None)
-
-    return Scene(render)
+    return Scene(lambda camera, branches: rendering(pattern(*rays(camera))))
 
 
 def test_frames_are_compared_as_they_were_taken_without_resampling_them():
     """What is left is the rounding to 8 bits (58.9 dB) and the interpolation of the rendering."""
-    shown = []
-    result = evaluate.evaluate(
-        pattern_scene(), distorted_capture(), on_view=lambda *view: shown.append(view), quiet=True, as_taken=True
-    )
+    shown, options = [], {"quiet": True, "as_taken": True}
+    result = evaluate.evaluate(pattern_scene(), distorted_capture(), on_view=lambda *v: shown.append(v), **options)
     assert result.views[0].psnr > 52.0
     assert result.summary()["frames"] == "as taken"
     _, _, truth, distorted = shown[0]
@@ -367,19 +349,16 @@ def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
     evaluate.write_views(tmp_path / "views.csv", Evaluation(views, None, 1.0, None))
     with open(tmp_path / "views.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["name"], row["psnr"], row["psnr_static"]) for row in rows] == [
-        ("a,b", "20.0", "12.5"),
-        ("c", "20.0", ""),
-    ]
+    found = [(row["name"], row["psnr"], row["psnr_static"]) for row in rows]
+    assert found == [("a,b", "20.0", "12.5"), ("c", "20.0", "")]
 
 
 # A whole run --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def run(quickly, tmp_path_factory):
+def run(quickly, data, tmp_path_factory):
     """A run of train.py with its evaluation."""
-    data = tiny.write(tmp_path_factory.mktemp("cache"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
         config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path_factory.mktemp("runs") / "run")
