@@ -58,11 +58,6 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def run(finished_run, tmp_path_factory):
-    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
-
-
-@pytest.fixture(scope="module")
 def viewer(run):
     source_module.POLL_SECONDS, before = 0.2, source_module.POLL_SECONDS
     source = open_source(run, "cpu", True)

@@ -8,7 +8,6 @@ import viser
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from tests.viewer import watched
 from warpgs.viewer.origin import POLICY_VIOLATION, is_foreign
 from warpgs.viewer.server import Viewer
 from warpgs.viewer.source import open_source
@@ -35,8 +34,7 @@ def test_a_page_is_foreign_unless_it_connects_to_its_own_server(origin, host, li
 
 
 @pytest.fixture(scope="module")
-def viewer(finished_run, tmp_path_factory):
-    run = watched.copy(finished_run, tmp_path_factory.mktemp("made"))
+def viewer(run):
     with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
         yield viewer
 

@@ -15,8 +15,8 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
 
 from tests.campaign.browser import Browser
+from tests.data.captures import edit_json
 from tests.errors import error_line
-from tests.viewer import watched
 from tests.viewer.watched import until
 from warpgs.cli import main
 from warpgs.command_line.version import install_command
@@ -27,11 +27,6 @@ from warpgs.viewer.serve import training_cameras
 from warpgs.viewer.server import Viewer, check_address
 from warpgs.viewer.source import open_source
 from warpgs.viewer.training_cameras import MAX_FRUSTUMS
-
-
-@pytest.fixture(scope="module")
-def run(finished_run, tmp_path_factory):
-    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
@@ -154,25 +149,21 @@ def test_a_port_is_free_again_after_the_viewer(run):
 
 
 def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):
-    assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use" in error_line(
-        capsys, "view", run, "--port", taken
-    )
+    error = error_line(capsys, "view", run, "--port", taken)
+    assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use" in error
 
 
-@pytest.mark.parametrize("host", ["192.0.2.1", "no such host", ""])
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such host"])
 def test_a_host_of_another_machine_is_refused_in_one_line(run, capsys, host):
-    if host:
-        assert f"cannot listen on {host}, port 8080" in error_line(capsys, "view", run, "--host", host)
-    else:
-        with pytest.raises(OSError, match="port 70000"):
-            check_address(host, 70000)
+    assert f"cannot listen on {host}, port 8080" in error_line(capsys, "view", run, "--host", host)
 
 
 @pytest.mark.parametrize("port", [-1, 65536, 99999])
 def test_an_invalid_port_is_refused_in_one_line(run, capsys, port):
-    assert f"cannot listen on port {port}: choose a --port from 0 to 65535" in error_line(
-        capsys, "view", run, "--port", port
-    )
+    with pytest.raises(OSError, match=f"port {port}"):
+        check_address("", port)
+    error = error_line(capsys, "view", run, "--port", port)
+    assert f"cannot listen on port {port}: choose a --port from 0 to 65535" in error
 
 
 def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, monkeypatch):
@@ -181,11 +172,9 @@ def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, 
 
 
 def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_path):
-    copy = shutil.copytree(run, tmp_path / "run")
-    text = (copy / "config.json").read_text()
-    (copy / "config.json").write_text(text.replace("/capture", "/gone"))
+    copy, warnings = shutil.copytree(run, tmp_path / "run"), []
+    edit_json(copy / "config.json", data=str(tmp_path / "gone"))
     source = open_source(copy, "cpu", False)
-    warnings = []
     assert training_cameras(source, warnings.append) is None
     assert warnings[0].startswith("without training cameras: ")
     with Viewer(source, None, "127.0.0.1", 0) as viewer:

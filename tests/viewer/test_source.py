@@ -13,14 +13,10 @@ from warpgs.viewer import source as source_module
 from warpgs.viewer.source import open_source
 
 
-@pytest.fixture(scope="module")
-def made(finished_run, tmp_path_factory):
-    return watched.copy(finished_run, tmp_path_factory.mktemp("made"))
-
-
 @pytest.fixture
-def run(made, tmp_path):
-    return shutil.copytree(made, tmp_path / "run")
+def run(run, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(run, tmp_path / "run")
 
 
 @pytest.fixture
@@ -36,11 +32,12 @@ def test_the_newest_checkpoint_is_shown(run):
     assert watched.same(trained.scene.static.means, newest["scene.static.means"])
 
 
-def test_without_follow_newer_checkpoints_are_ignored(run, without_interval):
+def test_without_follow_newer_checkpoints_are_ignored_and_nothing_is_asked_for(run, without_interval):
     source = open_source(run, "cpu", False)
     before = source.current()
     watched.advance(run)
     assert source.current() is before
+    assert not preview.is_requested(run)
 
 
 def test_a_newer_checkpoint_is_followed(run, without_interval):
@@ -173,8 +170,3 @@ def test_a_viewer_that_ends_leaves_no_request(run, without_interval):
     source.stop()
     source.current()
     assert not (run / preview.REQUEST).exists()
-
-
-def test_a_run_that_is_not_followed_is_not_asked(run, without_interval):
-    open_source(run, "cpu", False).current()
-    assert not preview.is_requested(run)
