@@ -113,15 +113,14 @@ def test_the_report_shows_the_training_time(tmp_path, run):
 
 def test_strips_show_truth_all_layers_and_error(tmp_path, run):
     page = report(tmp_path, run, views=1)
-    truth, rendered, static, dynamic, error = page.images()[:5]
-    sizes = {decoded(uri).shape for uri in (truth, rendered, static, dynamic, error)}
-    assert sizes == {(24, 32, 3)}
-    assert len({truth, rendered, static, dynamic, error}) == 5
+    truth, *_ = images = page.images()[:5]
+    assert {decoded(uri).shape for uri in images} == {(24, 32, 3)}
+    assert len(set(images)) == 5
     evaluated = read_runs([run])[0]
     name = extremes([evaluated], 1)[0][0]
     frame = load_capture(evaluated.config.data).frame(name)
     assert np.abs(decoded(truth).astype(float) - frame.image.numpy()).mean() < 8  # JPEG
-    assert f"{name}" in page.words
+    assert name in page.words
 
 
 def decoded(uri):
@@ -255,9 +254,8 @@ def test_metrics_are_formatted_with_units(name, value, text):
 def test_the_page_loads_nothing_and_runs_nothing(tmp_path, run):
     page = report(tmp_path, run)
     assert not page.tags() & {"script", "link", "iframe", "object", "embed", "base", "form"}
-    addresses = [
-        v for _, attrs in page.elements for k, v in attrs.items() if k in ("src", "href", "data", "xlink:href")
-    ]
+    links = ("src", "href", "data", "xlink:href")
+    addresses = [attrs[name] for _, attrs in page.elements for name in links if name in attrs]
     assert all(address.startswith("data:image/jpeg;base64,") for address in addresses)
     policy = next(a["content"] for t, a in page.elements if t == "meta" and "http-equiv" in a)
     assert policy.startswith("default-src 'none'")
@@ -298,22 +296,14 @@ def test_large_images_are_scaled_down():
 
 
 def points_of(svg):
-    return [
-        [tuple(map(float, at.split(","))) for at in attrs["points"].split()]
-        for tag, attrs in Page(svg).elements
-        if tag == "polyline"
-    ]
+    curves = [attrs["points"].split() for tag, attrs in Page(svg).elements if tag == "polyline"]
+    return [[tuple(map(float, at.split(","))) for at in curve] for curve in curves]
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        [(0.0, 1.0)],
-        [(0.0, 0.0), (5.0, 0.0)],
-        [(3.0, -1e-9), (3.0, 1e9)],
-        [(float(k), float(k % 7)) for k in range(5 * MAX_POINTS + 3)],
-    ],
-)
+LONG = [(float(k), float(k % 7)) for k in range(5 * MAX_POINTS + 3)]
+
+
+@pytest.mark.parametrize("points", [[(0.0, 1.0)], [(0.0, 0.0), (5.0, 0.0)], [(3.0, -1e-9), (3.0, 1e9)], LONG])
 def test_a_curve_lies_inside_its_chart(points):
     for curve in points_of(chart("c", "x", [Series("s", "red", points)])):
         assert all(0 <= x <= WIDTH and 0 <= y <= HEIGHT for x, y in curve)
@@ -434,11 +424,6 @@ def test_a_device_is_not_read(capsys, run, name):
     assert f"{run / name} is not a file" in error_line(capsys, "report", run)
 
 
-def test_a_missing_column_of_views_is_named(capsys, run):
-    (run / "views.csv").write_text("name,time\na,0\n")
-    assert "columns of another version: it has no psnr" in error_line(capsys, "report", run)
-
-
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -446,24 +431,20 @@ def test_a_missing_column_of_views_is_named(capsys, run):
         ("name,time,psnr\na,0,high\n", "line 2: psnr cannot be 'high'"),
         ('name,time,psnr\n"a', "is damaged"),
         ("", "it has no name, time, psnr"),
+        ("name,time\na,0\n", "columns of another version: it has no psnr"),
     ],
 )
-def test_damaged_views_are_refused_with_their_line(capsys, run, text, reason):
+def test_damaged_views_are_refused_with_their_line_or_column(capsys, run, text, reason):
     (run / "views.csv").write_text(text)
     error = error_line(capsys, "report", run)
     assert "views.csv" in error
     assert reason in error
 
 
-def test_truncated_events_are_read_up_to_their_end(tmp_path, run):
+@pytest.mark.parametrize("damaged", [lambda data: data[:-20], lambda data: b"nonsense" * 100], ids=["cut", "nonsense"])
+def test_truncated_events_are_read_up_to_their_end_and_invalid_ones_ignored(tmp_path, run, damaged):
     path = next((run / "events").iterdir())
-    path.write_bytes(path.read_bytes()[:-20])
-    assert "PSNR [dB] of each view" in report(tmp_path, run, views=0).text
-
-
-def test_invalid_events_are_ignored(tmp_path, run):
-    path = next((run / "events").iterdir())
-    path.write_bytes(b"nonsense" * 100)
+    path.write_bytes(damaged(path.read_bytes()))
     assert "PSNR [dB] of each view" in report(tmp_path, run, views=0).text
 
 
