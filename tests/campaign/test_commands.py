@@ -56,15 +56,8 @@ def command(r: random.Random) -> list[str]:
         case "view":
             return ["view", "run", "--port", "0"]
         case "prepare":
-            return [
-                "prepare",
-                r.choice(["capture/rgb/1x", "video.mp4"]),
-                "prepared",
-                "--masks",
-                "none",
-                "--depth",
-                "none",
-            ]
+            options = ["--masks", "none", "--depth", "none"]
+            return ["prepare", r.choice(["capture/rgb/1x", "video.mp4"]), "prepared", *options]
         case _:
             return [name, "run"]
 

@@ -3,6 +3,7 @@
 import os
 import select
 
+import pytest
 import rich
 
 from warpgs.command_line import progress as module
@@ -17,52 +18,42 @@ def everything_on(screen) -> str:
     return sent.decode()
 
 
-def shown_on_a_terminal(monkeypatch, **options):
-    """The output on a terminal during an iteration over two items."""
+def shown_on_a_terminal(monkeypatch, run, **options) -> str:
+    """What a function shows."""
     screen, end = os.openpty()
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr(rich, "_console", None)  # the existing console has detected that there is no terminal
     with open(end, "w") as stream, monkeypatch.context() as patch:
         patch.setattr(module.sys, "stdout", stream)
-        list(progress([1, 2], "counting", **options))
+        run(**options)
         return everything_on(screen)
 
 
-def shown_in_steps(monkeypatch, **options) -> str:
-    """The output of two steps on a terminal."""
-    screen, end = os.openpty()
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setattr(rich, "_console", None)
-    with open(end, "w") as stream, monkeypatch.context() as patch:
-        patch.setattr(module.sys, "stdout", stream)
-        with progress_of_steps(**options) as show:
-            show("sawing", 1, 4)
-            show("planing", 2, 4)
-        return everything_on(screen)
+def two_items(**options):
+    return list(progress([3, 1], "counting", **options))
+
+
+def two_steps(**options):
+    with progress_of_steps(**options) as show:
+        show("sawing", 1, 4)
+        show("planing", 2, 4)
 
 
 def test_the_last_step_is_shown_with_its_fraction(monkeypatch):
-    sent = shown_in_steps(monkeypatch)
+    sent = shown_on_a_terminal(monkeypatch, two_steps)
     assert "planing" in sent
     assert "50%" in sent
 
 
-def test_quiet_steps_show_nothing(monkeypatch):
-    assert shown_in_steps(monkeypatch, quiet=True) == ""
-
-
-def test_items_keep_their_order():
-    assert list(progress([3, 1, 2], "counting")) == [3, 1, 2]
-
-
 def test_a_terminal_shows_a_bar_with_its_label(monkeypatch):
-    assert "counting" in shown_on_a_terminal(monkeypatch)
+    assert "counting" in shown_on_a_terminal(monkeypatch, two_items)
 
 
-def test_quiet_shows_nothing_on_a_terminal(monkeypatch):
-    assert shown_on_a_terminal(monkeypatch, quiet=True) == ""
+@pytest.mark.parametrize("run", [two_items, two_steps])
+def test_quiet_shows_nothing_on_a_terminal(monkeypatch, run):
+    assert shown_on_a_terminal(monkeypatch, run, quiet=True) == ""
 
 
-def test_nothing_is_written_if_stdout_is_not_a_terminal(capsys):
-    list(progress([1, 2], "counting"))
+def test_items_keep_their_order_and_nothing_is_written_if_stdout_is_not_a_terminal(capsys):
+    assert two_items() == [3, 1]
     assert capsys.readouterr().out == ""
