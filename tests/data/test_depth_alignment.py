@@ -136,13 +136,14 @@ def test_frames_are_fitted_together_as_each_alone():
 # Against points ------------------------------------------------------------------------------------------------------
 
 
-def random_inverse_depth():
+@pytest.fixture
+def inverse_depth():
     return 0.2 + torch.rand(HEIGHT, WIDTH, generator=generator())
 
 
-def align(*sources):
-    """The alignment of one frame to points; arguments as for ``sample_points``."""
-    return align_to_points([sample_points(*sources)])[0]
+@pytest.fixture
+def points(inverse_depth):
+    return points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
 
 
 def points_behind(inverse_depth, rows, columns):
@@ -151,22 +152,22 @@ def points_behind(inverse_depth, rows, columns):
     return CAMERA.unproject(row, column, 1.0 / (SCALE * inverse_depth[row, column] + OFFSET))
 
 
-def test_points_align_the_inverse_depth_of_their_pixels():
-    inverse_depth = random_inverse_depth()
-    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+def align(*sources):
+    """The alignment of one frame to points; arguments as for ``sample_points``."""
+    return align_to_points([sample_points(*sources)])[0]
+
+
+def test_points_align_the_inverse_depth_of_their_pixels(inverse_depth, points):
     assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
-def test_points_hidden_behind_other_surfaces_do_not_count():
-    inverse_depth = random_inverse_depth()
-    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+def test_points_hidden_behind_other_surfaces_do_not_count(inverse_depth, points):
     hidden = points_behind(inverse_depth / 5.0, range(3, 30, 7), range(2, 45, 5))
     found = align(inverse_depth, EVERYWHERE, CAMERA, torch.cat([points, hidden]))
     assert error(found, ALIGNMENT) < 1e-3
 
 
-def test_points_in_dynamic_regions_do_not_count():
-    inverse_depth = random_inverse_depth()
+def test_points_in_dynamic_regions_do_not_count(inverse_depth):
     static = EVERYWHERE.clone()
     static[:, :25] = False
     true = points_behind(inverse_depth, range(2, 30, 3), range(26, 45, 3))
@@ -174,31 +175,25 @@ def test_points_in_dynamic_regions_do_not_count():
     assert error(align(inverse_depth, static, CAMERA, torch.cat([true, wrong])), ALIGNMENT) < 1e-4
 
 
-def test_points_behind_the_camera_or_outside_the_image_do_not_count():
-    inverse_depth = random_inverse_depth()
-    true = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+def test_points_behind_the_camera_or_outside_the_image_do_not_count(inverse_depth, points):
     behind = points_behind(-inverse_depth, range(20), range(20))
     outside = CAMERA.unproject(torch.arange(100), torch.full((100,), WIDTH + 3), torch.ones(100))
-    points = torch.cat([behind, true, outside])
+    points = torch.cat([behind, points, outside])
     assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
-def test_pixels_without_depth_do_not_count():
-    inverse_depth = random_inverse_depth()
-    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+def test_pixels_without_depth_do_not_count(inverse_depth, points):
     inverse_depth[:15] = torch.nan
     assert error(align(inverse_depth, EVERYWHERE, CAMERA, points), ALIGNMENT) < 1e-4
 
 
 @pytest.mark.parametrize("num", [0, ENOUGH - 1])
-def test_a_frame_that_sees_too_few_points_is_not_aligned(num):
-    inverse_depth = random_inverse_depth()
+def test_a_frame_that_sees_too_few_points_is_not_aligned(num, inverse_depth):
     points = points_behind(inverse_depth, range(20), range(20))[:num]
     assert align(inverse_depth, EVERYWHERE, CAMERA, points).isnan().all()
 
 
-def test_a_frame_without_depth_is_not_aligned():
-    points = points_behind(random_inverse_depth(), range(20), range(20))
+def test_a_frame_without_depth_is_not_aligned(points):
     nothing = torch.full((HEIGHT, WIDTH), torch.nan)
     assert align(nothing, EVERYWHERE, CAMERA, points).isnan().all()
 
@@ -212,15 +207,14 @@ def rendered_depth(inverse_depth):
     return 1.0 / (SCALE * inverse_depth + OFFSET)
 
 
-def test_a_rendering_aligns_inverse_depth():
-    inverse_depth = random_inverse_depth()
+def test_a_rendering_aligns_inverse_depth(inverse_depth):
     depth = rendered_depth(inverse_depth)
     assert error(fit(*sample_rendering(inverse_depth, EVERYWHERE, depth, OPAQUE)), ALIGNMENT) < 1e-5
 
 
 @pytest.mark.parametrize("excluded", ["dynamic", "transparent", "unknown", "empty"])
-def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(excluded):
-    inverse_depth, static, alpha = random_inverse_depth(), EVERYWHERE.clone(), OPAQUE.clone()
+def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(excluded, inverse_depth):
+    static, alpha = EVERYWHERE.clone(), OPAQUE.clone()
     depth = rendered_depth(inverse_depth)
     wrong_rows = slice(0, 22)  # most of the image: more outliers than a robust fit tolerates
     depth[wrong_rows] = 1.0 / (9.0 * inverse_depth[wrong_rows] + 4.0)
@@ -235,16 +229,15 @@ def test_only_static_opaque_pixels_of_known_depth_align_to_a_rendering(excluded)
     assert error(fit(*sample_rendering(inverse_depth, static, depth, alpha)), ALIGNMENT) < 1e-5
 
 
-def test_an_empty_rendering_gives_no_alignment():
+def test_an_empty_rendering_gives_no_alignment(inverse_depth):
     nothing = torch.zeros(HEIGHT, WIDTH)
-    assert fit(*sample_rendering(random_inverse_depth(), EVERYWHERE, nothing, nothing)).isnan().all()
+    assert fit(*sample_rendering(inverse_depth, EVERYWHERE, nothing, nothing)).isnan().all()
 
 
 # Depth in scene units ------------------------------------------------------------------------------------------------
 
 
-def test_aligned_inverse_depth_becomes_depth():
-    inverse_depth = random_inverse_depth()
+def test_aligned_inverse_depth_becomes_depth(inverse_depth):
     expected = 1.0 / (SCALE * inverse_depth.double() + OFFSET)
     assert error(metric_depth(inverse_depth, ALIGNMENT), expected) < 1e-6
 
@@ -259,16 +252,14 @@ def test_unknown_inverse_depth_stays_unknown():
     assert metric_depth(inverse_depth, ALIGNMENT).isnan().tolist() == [[True, False]]
 
 
-def test_all_depth_of_a_frame_that_is_not_aligned_is_unknown():
-    assert metric_depth(random_inverse_depth(), torch.full((2,), torch.nan)).isnan().all()
+def test_all_depth_of_a_frame_that_is_not_aligned_is_unknown(inverse_depth):
+    assert metric_depth(inverse_depth, torch.full((2,), torch.nan)).isnan().all()
 
 
 # Errors at points ----------------------------------------------------------------------------------------------------
 
 
-def test_errors_are_those_of_aligned_depth_and_of_a_constant():
-    inverse_depth = random_inverse_depth()
-    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))
+def test_errors_are_those_of_aligned_depth_and_of_a_constant(inverse_depth, points):
     wrong = 1.1 * torch.tensor([SCALE, OFFSET])
     samples = sample_points(inverse_depth, EVERYWHERE, CAMERA, points)
     found = relative_errors(samples, wrong)
@@ -278,8 +269,7 @@ def test_errors_are_those_of_aligned_depth_and_of_a_constant():
     assert error(relative_errors(samples, ALIGNMENT)[0], torch.tensor(0.0)) < 1e-4
 
 
-def test_errors_of_points_in_dynamic_regions_do_not_count():
-    inverse_depth = random_inverse_depth()
+def test_errors_of_points_in_dynamic_regions_do_not_count(inverse_depth):
     static = EVERYWHERE.clone()
     static[:, :25] = False
     points = points_behind(inverse_depth, range(2, 30, 3), range(27, 45, 4))
@@ -289,10 +279,9 @@ def test_errors_of_points_in_dynamic_regions_do_not_count():
 
 
 @pytest.mark.parametrize("alignment", [ALIGNMENT, torch.full((2,), torch.nan)])
-def test_errors_are_infinite_without_points_or_alignment(alignment):
-    inverse_depth = random_inverse_depth()
-    points = points_behind(inverse_depth, range(2, 30, 3), range(1, 45, 4))[: 0 if alignment.isfinite().all() else None]
-    assert relative_errors(sample_points(inverse_depth, EVERYWHERE, CAMERA, points), alignment).isinf().all()
+def test_errors_are_infinite_without_points_or_alignment(alignment, inverse_depth, points):
+    found = points[: 0 if alignment.isfinite().all() else None]
+    assert relative_errors(sample_points(inverse_depth, EVERYWHERE, CAMERA, found), alignment).isinf().all()
 
 
 @pytest.mark.parametrize(
