@@ -136,16 +136,9 @@ def write_nerfstudio(root: Path) -> Path:
     return root
 
 
-PLY_HEADER = "\n".join(
-    [
-        "ply",
-        "format {} 1.0",
-        f"element vertex {len(POINTS)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
-        "end_header\n",
-    ]
-)
+PROPERTIES = ("double x", "double y", "double z", "uchar red", "uchar green", "uchar blue")
+PLY_HEADER = f"ply\nformat {{}} 1.0\nelement vertex {len(POINTS)}\n"
+PLY_HEADER += "".join(f"property {name}\n" for name in PROPERTIES) + "end_header\n"
 
 
 def write_ply(path: Path, encoding: str = "binary_little_endian") -> Path:

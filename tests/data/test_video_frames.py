@@ -2,10 +2,10 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
-import av
 import numpy as np
 import pytest
 
+from tests.prepare.boards import write_video
 from warpgs.data.video_frames import NUM_KEPT, VideoFrames
 
 NUM = 40
@@ -14,15 +14,8 @@ NUM = 40
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     """A video whose frames become brighter."""
-    path = tmp_path_factory.mktemp("video") / "clip.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 32, 32, "yuv420p"
-        for k in range(NUM):
-            frame = av.VideoFrame.from_ndarray(np.full((32, 32, 3), 6 * k, np.uint8), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
+    images = [np.full((32, 32, 3), 6 * k, np.uint8) for k in range(NUM)]
+    return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", images)
 
 
 @pytest.fixture(scope="module")
