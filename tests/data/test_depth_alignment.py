@@ -57,9 +57,6 @@ def total_error(alignment, values, targets):
     return (a * values.double() + b - targets.double()).abs().sum().item()
 
 
-# The fit -------------------------------------------------------------------------------------------------------------
-
-
 def test_exact_samples_give_their_scale_and_offset():
     assert error(fit(*samples()), ALIGNMENT) < 1e-6
 
@@ -133,9 +130,6 @@ def test_frames_are_fitted_together_as_each_alone():
     assert relative_error(found[found.isfinite()], alone[alone.isfinite()]) < 1e-6
 
 
-# Against points ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def inverse_depth():
     return 0.2 + torch.rand(HEIGHT, WIDTH, generator=generator())
@@ -198,8 +192,6 @@ def test_a_frame_without_depth_is_not_aligned(points):
     assert align(nothing, EVERYWHERE, CAMERA, points).isnan().all()
 
 
-# Against a rendering -------------------------------------------------------------------------------------------------
-
 OPAQUE = torch.full((HEIGHT, WIDTH), 0.99)
 
 
@@ -234,9 +226,6 @@ def test_an_empty_rendering_gives_no_alignment(inverse_depth):
     assert fit(*sample_rendering(inverse_depth, EVERYWHERE, nothing, nothing)).isnan().all()
 
 
-# Depth in scene units ------------------------------------------------------------------------------------------------
-
-
 def test_aligned_inverse_depth_becomes_depth(inverse_depth):
     expected = 1.0 / (SCALE * inverse_depth.double() + OFFSET)
     assert error(metric_depth(inverse_depth, ALIGNMENT), expected) < 1e-6
@@ -254,9 +243,6 @@ def test_unknown_inverse_depth_stays_unknown():
 
 def test_all_depth_of_a_frame_that_is_not_aligned_is_unknown(inverse_depth):
     assert metric_depth(inverse_depth, torch.full((2,), torch.nan)).isnan().all()
-
-
-# Errors at points ----------------------------------------------------------------------------------------------------
 
 
 def test_errors_are_those_of_aligned_depth_and_of_a_constant(inverse_depth, points):
@@ -297,9 +283,6 @@ def test_errors_are_infinite_without_points_or_alignment(alignment, inverse_dept
 )
 def test_depth_is_unusable_if_it_is_wrong_and_hardly_better_than_a_constant(depth_error, constant_error, unusable):
     assert bool(is_unusable(torch.tensor([depth_error, constant_error]))) == unusable
-
-
-# The smooth factor ---------------------------------------------------------------------------------------------------
 
 
 def dense_points(depth, every=2):

@@ -96,9 +96,6 @@ def decibels(capture, images, name, rows=slice(None), columns=slice(None)):
     return -10 * math.log10(((image - truth)[rows, columns] ** 2).mean())
 
 
-# PSNR and regions ---------------------------------------------------------------------------------------------------
-
-
 def test_psnr_is_the_mean_over_views_of_each_views_psnr():
     """Not the PSNR of the mean error, which one bad view would rule."""
     here = capture()
@@ -189,8 +186,6 @@ def test_lpips_is_measured_with_the_network_that_is_given():
     assert result.views[1].masked_lpips == pytest.approx((error[:, :5].mean() / 2).item())
 
 
-# As they were taken --------------------------------------------------------------------------------------------------
-
 LENS = Lens(60, 44, (62.0, 58.0), (31.3, 20.6), (-0.14, 0.05, 0.0), (0.006, -0.004))
 
 
@@ -264,9 +259,6 @@ def test_a_frame_as_it_was_taken_is_rendered_from_the_aligned_camera():
     assert aligned.views[0].psnr < evaluate.evaluate(pattern_scene(), distorted_capture(), **options).views[0].psnr - 10
 
 
-# Flicker ------------------------------------------------------------------------------------------------------------
-
-
 def gray(value):
     return torch.full((H, W, 3), value)
 
@@ -317,9 +309,6 @@ def test_flicker_is_not_measured_if_everything_is_dynamic():
     assert evaluate.evaluate(Scene(render), capture(), quiet=True).flicker is None
 
 
-# Frames per second ----------------------------------------------------------------------------------------------------
-
-
 def test_fps_counts_joint_images_after_one_warm_up_frame(monkeypatch):
     now = [0.0]
 
@@ -331,17 +320,11 @@ def test_fps_counts_joint_images_after_one_warm_up_frame(monkeypatch):
     assert evaluate.evaluate(Scene(render), capture(), quiet=True).fps == pytest.approx(50.0)
 
 
-# Without evaluation frames ------------------------------------------------------------------------------------------
-
-
 def test_without_evaluation_frames_only_flicker_and_speed_are_measured():
     summary = evaluated(capture(()), {0.0: gray(0.2), 1.0: gray(0.4)}).summary()
     assert (summary["psnr"], summary["ssim"], summary["lpips"], summary["num_views"]) == (None, None, None, 0)
     assert summary["flicker"] == pytest.approx(0.2)
     assert summary["fps"] > 0
-
-
-# Files --------------------------------------------------------------------------------------------------------------
 
 
 def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
@@ -351,9 +334,6 @@ def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
         rows = list(csv.DictReader(file))
     found = [(row["name"], row["psnr"], row["psnr_static"]) for row in rows]
     assert found == [("a,b", "20.0", "12.5"), ("c", "20.0", "")]
-
-
-# A whole run --------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

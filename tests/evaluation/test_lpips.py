@@ -57,9 +57,6 @@ def real():
     return next(lpips.find(Path(WEIGHTS), net) for net in NETS if None not in lpips._files(Path(WEIGHTS), net))
 
 
-# The networks -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("net", NETS)
 def test_only_equal_images_have_no_distance_and_it_is_the_same_both_ways(net, pair):
     distance = network(net)
@@ -131,9 +128,6 @@ def test_no_gradient_is_kept(pair):
     assert not network("squeeze")(*pair).requires_grad
 
 
-# mLPIPS -------------------------------------------------------------------------------------------------------------
-
-
 def bilinear(values, size):
     """A map enlarged to a size, pixel centres aligned, one pixel after the other."""
     result = torch.zeros(size, dtype=torch.float64)
@@ -164,9 +158,6 @@ def test_masked_lpips_does_not_see_the_rest(pair):
     other = torch.where(region[..., None], pair[0], torch.rand(40, 44, 3))
     assert distance.masked(other, pair[1], region).item() == distance.masked(*pair, region).item()
     assert distance.masked(pair[0], pair[0], region).item() == 0.0
-
-
-# Their files --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("net", NETS)
@@ -288,9 +279,6 @@ def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
-# Real weights -------------------------------------------------------------------------------------------------------
-
-
 @needs_weights
 def test_real_weights_give_equal_images_no_distance(real, pair):
     assert real(pair[0], pair[0].clone()).item() == 0.0
@@ -316,9 +304,6 @@ def test_real_weights_call_blur_farther_than_a_change_of_brightness_of_the_same_
     blurred = nn.functional.avg_pool2d(truth.permute(2, 0, 1), 7, 1, 3, count_include_pad=False).permute(1, 2, 0)
     brighter = truth + (blurred - truth).square().mean().sqrt()
     assert real(blurred, truth).item() > 2.0 * real(brighter, truth).item()
-
-
-# At the start of training -------------------------------------------------------------------------------------------
 
 
 def test_training_with_a_wrong_folder_is_refused_before_any_work(tmp_path):

@@ -54,9 +54,6 @@ def test_gaussians_with_values_that_are_not_finite_are_reported():
     assert cloud.finite.tolist() == [True, False, True, False, True]
 
 
-# The most visible Gaussians -----------------------------------------------------------------------------------------
-
-
 def test_the_least_visible_gaussians_are_omitted(clouds):
     clouds = scenes.clouds()
     hidden = torch.arange(40) % 2 == 0

@@ -65,9 +65,6 @@ def truth(run, camera):
     return Run.open(run, "cpu").trained_scene().render(camera).joint.image.clamp(0, 1)
 
 
-# Files --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("time", [0.0, 0.7])
 def test_a_ply_file_looks_like_the_run_at_its_time(run, data, tmp_path, time):
     assert f"{tmp_path / 'out' / 'scene.ply'}: " in export(run, tmp_path, time=time)
@@ -204,9 +201,6 @@ def test_a_new_file_of_no_format_is_refused_with_the_suffixes_of_all(run, tmp_pa
     assert (tmp_path / file / "scene.ply").is_file()
 
 
-# Formats ------------------------------------------------------------------------------------------------------------
-
-
 def write_count(job):
     path = job.folder / "count.txt"
     path.parent.mkdir()
@@ -232,9 +226,6 @@ def test_the_help_names_every_format(capsys):
         main(["export", "--help"])
     shown = capsys.readouterr().out
     assert all(f"{name}: " in shown for name in WRITERS)
-
-
-# A capture that is elsewhere ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -300,9 +291,6 @@ def test_max_gaussians_works_without_a_capture(stranded, tmp_path):
 
 def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
     assert "cameras of " in export(stranded, tmp_path, format="html", keys=2, data=data)
-
-
-# Refusals -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -40,9 +40,6 @@ def cloud_of(means, quats, scales, opacities, sh):
     return Cloud(*arrays, is_dynamic=np.zeros(len(means), bool))
 
 
-# OpenUSD ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def stage(clouds, finished_run, tmp_path_factory):
     pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed (extra 'export')")
@@ -122,9 +119,6 @@ def test_a_value_that_changes_late_is_constant_before(tmp_path):
     assert found == pytest.approx([0, 0, 0, 0.5, 1, 1, 2], abs=1e-5)
 
 
-# .4dgs --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def container(clouds, finished_run, tmp_path_factory):
     pytest.importorskip("fourdgs", reason="fourdgs is not installed (extra 'export')")
@@ -159,9 +153,6 @@ def test_gaussians_move_in_straight_lines_between_samples(container, clouds):
     first, second = (expected(clouds, time).means for time in (1 / KEYS, 2 / KEYS))
     tolerance = 0.03 * float(np.median(np.exp(clouds.at(0.0).log_scales)))
     assert np.abs(state["centers"] - (first + second) / 2).max() < tolerance
-
-
-# Errors -------------------------------------------------------------------------------------------------------------
 
 
 PACKAGES = [(usd.write_usd, "pxr.Usd", "usd-core"), (fourdgs.write_fourdgs, "fourdgs", "fourdgs")]

@@ -46,9 +46,6 @@ def fine(clouds):
     return bake(clouds.at, evenly_spaced(KEYS), precision=8.0)
 
 
-# Baking -------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("key", range(KEYS))
 def test_at_key_times_the_image_matches_the_scene_up_to_quantisation(clouds, baked, fine, key):
     time = key / (KEYS - 1)
@@ -175,9 +172,6 @@ def test_renamed_axes_are_the_same_ellipsoids():
     assert np.allclose(covariances(turned, np.take_along_axis(scales, axes, 1)), covariances(quats, scales), atol=1e-12)
     assert turned[:, 0].min() > 0.85
     assert np.allclose(np.linalg.norm(turned, axis=1), 1.0)
-
-
-# The file -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_page_holds_the_baked_scene_exactly(path, baked):

@@ -90,9 +90,6 @@ def edit_views(run, change):
         writer.writerows(rows)
 
 
-# Content --------------------------------------------------------------------------------------------------------------
-
-
 def test_the_report_lists_the_metrics_of_every_view(tmp_path, run):
     page = report(tmp_path, run)
     for view in read_runs([run])[0].views:
@@ -248,9 +245,6 @@ def test_metrics_are_formatted_with_units(name, value, text):
     assert formatted(name, value) == text
 
 
-# Safety --------------------------------------------------------------------------------------------------------------
-
-
 def test_the_page_loads_nothing_and_runs_nothing(tmp_path, run):
     page = report(tmp_path, run)
     assert not page.tags() & {"script", "link", "iframe", "object", "embed", "base", "form"}
@@ -290,9 +284,6 @@ def test_images_outside_of_the_run_folder_are_not_shown(run):
 
 def test_large_images_are_scaled_down():
     assert decoded(data_uri(np.zeros((100, 2 * MAX_WIDTH, 3), np.uint8))).shape == (50, MAX_WIDTH, 3)
-
-
-# Curves --------------------------------------------------------------------------------------------------------------
 
 
 def points_of(svg):
@@ -342,9 +333,6 @@ def test_curves_share_their_axes():
 
 def test_without_points_there_is_no_chart():
     assert chart("c", "x", [Series("s", "red", [])]) == ""
-
-
-# Refusals ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_report_without_runs_is_refused(capsys):

@@ -63,9 +63,6 @@ def metadata(**changes):
     return {"__metadata__": {key: value for key, value in header.items() if value is not None}}
 
 
-# Written and read ---------------------------------------------------------------------------------------------------
-
-
 def test_a_checkpoint_round_trips_bit_for_bit(path):
     loaded = checkpoint.load(path)
     assert tiny.differences(loaded.tensors, TENSORS) == []
@@ -117,9 +114,6 @@ def test_half_written_files_are_not_listed_and_are_removed(path):
     assert list(path.parent.iterdir()) == [path]
 
 
-# A write that fails -------------------------------------------------------------------------------------------------
-
-
 WITH_SMALL_FILES = """
 import pathlib, resource, sys, torch
 from warpgs.runs import checkpoint
@@ -164,9 +158,6 @@ def test_a_checkpoint_is_synced_before_it_is_renamed(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "replace", lambda *paths: (done.append("named"), replace(*paths)))
     checkpoint.save(tmp_path / "a.safetensors", TENSORS, METADATA)
     assert done == ["written", "named"]
-
-
-# Damaged files -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kept", [0, 1, 7, 8, 9, 100, -1])
@@ -382,9 +373,6 @@ def test_a_config_that_claims_a_huge_network_takes_no_memory(path):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert "does not hold a scene" in refused(tensors_of(scene()), dataclasses.replace(tiny.MODEL, width=4096, depth=8))
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KiB
-
-
-# Scenes that do not fit ----------------------------------------------------------------------------------------------
 
 
 def refused(tensors, model=tiny.MODEL):

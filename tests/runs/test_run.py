@@ -49,9 +49,6 @@ def edit(run, change):
     (run / "config.json").write_text(json.dumps(values))
 
 
-# config.json --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["best"]), UNUSUAL, tiny.CONFIG])
 def test_a_config_round_trips(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
@@ -197,9 +194,6 @@ def test_a_damaged_config_is_named(run, content, message):
         read_config(run)
 
 
-# Folders ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "problem"), [("", "is not a run folder"), ("file", "is not a run folder"), ("missing", "does not exist$")]
 )
@@ -253,9 +247,6 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
     assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
 
 
-# The newest checkpoint ----------------------------------------------------------------------------------------------
-
-
 def test_a_run_without_a_checkpoint_has_no_scene(run):
     assert Run.open(run).newest_checkpoint() is None
     with pytest.raises(ValueError, match=f"{run} has no checkpoint yet"):
@@ -278,9 +269,6 @@ def test_a_scene_is_not_read_with_the_config_of_another_run(run, data):
     other = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, width=16))
     with pytest.raises(ValueError, match="does not hold a scene of this run's config"):
         Run(run, other).trained_scene()
-
-
-# Corrected cameras --------------------------------------------------------------------------------------------------
 
 
 def run_with_poses(data, folder):

@@ -263,8 +263,6 @@ def test_a_cluster_whose_head_is_silent_is_gone(pool, monkeypatch):
         results(pool, 1)
 
 
-# Real trainings on a real cluster -------------------------------------------------------------------------------------
-
 TOML = """
 preset = "quick"
 seeds = 4

@@ -30,9 +30,6 @@ def is_rigid(path):
     return bool((R @ R.transpose(1, 2) - torch.eye(3)).abs().max() < 1e-5) and bool((torch.linalg.det(R) > 0).all())
 
 
-# Interpolation ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("target", "up"), [((1.0, 2.0, 3.0), (0.0, 0.0, 1.0)), ((1.0, 2.0, 5.0), (0.0, 0.0, -2.0))])
 def test_a_camera_without_a_direction_or_parallel_to_up_is_refused(target, up):
     with pytest.raises(ValueError, match="position and target coincide, or the view direction is parallel to up"):
@@ -71,9 +68,6 @@ def test_a_path_of_one_camera_is_constant():
     assert paths.interpolated([camera(0.3)], [0.0], [0.0, 0.0])[1].position[0] == pytest.approx(0.3)
 
 
-# The training camera's path -----------------------------------------------------------------------------------------
-
-
 def test_the_training_path_is_sorted_by_time_and_covers_all_times():
     unsorted = capture([0.4, 0.0, 0.2], [1.0, 0.0, 0.5])
     path = paths.training_path(unsorted, 5, smoothing=0.0)
@@ -102,9 +96,6 @@ def test_smoothing_removes_shaking():
 @pytest.mark.parametrize("frames", [1, 2])
 def test_paths_of_one_and_two_frames_have_that_length(frames):
     assert len(paths.training_path(capture([0.0, 1.0], [0.0, 1.0]), frames)) == frames
-
-
-# Spiral and bullet time ---------------------------------------------------------------------------------------------
 
 
 def test_the_focus_is_the_median_depth_of_the_visible_points():
@@ -163,9 +154,6 @@ def test_bullet_time_runs_from_the_first_time_to_the_last_swings_to_both_sides_a
     assert centers.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
 
 
-# Bounding sphere ----------------------------------------------------------------------------------------------------
-
-
 def test_outliers_do_not_enlarge_the_bounding_sphere():
     points = torch.randn(5000, 3)
     points[:20] *= 1e4
@@ -197,9 +185,6 @@ def test_a_camera_at_nan_is_refused():
 def test_a_scene_without_gaussians_has_no_bounding_sphere():
     with pytest.raises(ValueError, match="the scene has no Gaussians"):
         paths.BoundingSphere.around(torch.zeros(0, 3))
-
-
-# Image sizes --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 3.0, 0.37])

@@ -55,9 +55,6 @@ def expected(scene, camera):
     return to_bytes(scene.render(camera).joint.image)
 
 
-# Images -------------------------------------------------------------------------------------------------------------
-
-
 def test_every_evaluation_view_is_written_under_its_name(run, capture, scene, tmp_path):
     summary = render(run, tmp_path)
     images = images_in(tmp_path)
@@ -148,9 +145,6 @@ def test_a_shorter_path_removes_the_images_of_a_longer_one(run, tmp_path):
 def test_images_are_written_to_the_run_folder_by_default(run):
     render_run.render_run(Render(run, path="fixed", frames=1, quiet=True, device="cpu"))
     assert (run / "render" / "fixed" / "00000.png").is_file()
-
-
-# Sizes, layers, files -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("scale", "size"), [(2.0, (48, 64)), (0.5, (12, 16))])
@@ -262,9 +256,6 @@ def test_progress_is_hidden_only_if_quiet(run, tmp_path, monkeypatch, quiet):
     monkeypatch.setattr(frames, "progress", lambda steps, name, quiet: calls.append(quiet) or steps)
     render(run, tmp_path, path="fixed", quiet=quiet)
     assert calls == [quiet]
-
-
-# Errors -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
