@@ -50,7 +50,7 @@ def shift_far(matrix: np.ndarray) -> None:
     matrix[0, 3] = np.nan
 
 
-CAMERAS = "sparse/0/cameras.bin"
+CAMERAS, SPARSE = "sparse/0/cameras.bin", "sparse/0/points3D.bin"
 SMALL = np.zeros((9, 9, 3), np.uint8)
 FIELD_OF_VIEW = cameras_bin(7, [*layouts.PARAMS[:4], 0.9])
 BENT = [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0]
@@ -66,11 +66,7 @@ DAMAGES = [
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [5.0, 1, 1], (10**9, 5))), "out of range"),
-    (
-        "colmap",
-        lambda r: (r / "sparse/0/points3D.bin").write_bytes(struct.pack("<Q", 2**60)),
-        r"points3D\.bin is damaged",
-    ),
+    ("colmap", lambda r: (r / SPARSE).write_bytes(struct.pack("<Q", 2**60)), r"points3D\.bin is damaged"),
     ("colmap", lambda r: write_png(r / "images/frame_00002.png", SMALL), "has not the shape of"),
     ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", SMALL[..., 0]), "the mask is 9×9"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),

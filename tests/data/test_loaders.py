@@ -284,11 +284,6 @@ def test_without_a_time_id_time_is_the_warp_id(iphone):
     assert load_capture(iphone).cameras["1_00002"].time == pytest.approx(2 / 3)
 
 
-def test_points_are_in_scene_units(root):
-    expected = (np.arange(30).reshape(10, 3) - CENTER) * SCALE
-    assert np.allclose(load_capture(root).points.numpy(), expected, atol=1e-6)
-
-
 def test_the_covisible_mask_is_true_where_bright(iphone):
     frame = load_capture(iphone).frame("1_00000")
     assert np.array_equal(frame.covisible.numpy(), captures.dynamic_block((SIZE[0] // 2, SIZE[1] // 2)) == 255)

@@ -47,10 +47,3 @@ def test_only_existing_contact_sheets_are_mentioned(tmp_path, capsys, monkeypatc
     assert "look at masks.png in it" in capsys.readouterr().out
     assert main(arguments) == 0
     assert "was finished before; --force makes it again" in capsys.readouterr().out
-
-
-def test_the_command_line_imports_no_heavy_packages():
-    heavy = "{'torch', 'cv2', 'pycolmap', 'scipy', 'transformers'}"
-    code = f"import sys, warpgs.prepare.command; print(*sorted({heavy} & set(sys.modules)))"
-    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert printed.strip() == ""

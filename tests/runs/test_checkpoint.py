@@ -202,22 +202,11 @@ def test_missing_metadata_is_named_with_the_file(path, missing):
         checkpoint.load(path)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("moving", "yes"),
-        ("relit", 1),
-        ("sh_degree", 0.5),
-        ("sh_degree", []),
-        ("iteration", -1),
-        ("iteration", True),
-        ("iteration", 10**400),
-        ("train_seconds", "1"),
-        ("train_seconds", None),
-        ("rollbacks", -1),
-        ("views", [1]),
-    ],
-)
+WRONG = {"moving": ["yes"], "relit": [1], "sh_degree": [0.5, []], "iteration": [-1, True, 10**400]}
+WRONG |= {"train_seconds": ["1", None], "rollbacks": [-1], "views": [[1]]}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
 def test_metadata_of_another_type_or_range_is_damage(path, name, value):
     tiny.edit_metadata(path, lambda values: values.update({name: value}))
     with pytest.raises(ValueError, match=f"{path} is damaged: {name} cannot be"):

@@ -151,12 +151,11 @@ def test_an_unknown_field_is_refused_by_its_name(run, part):
         read_config(run)
 
 
-WRONG = {"dap": 1, "assume": "nothing", "device": "tpu", "factor": "2", "data": 5, "lpips": {}}
+WRONG = {"seed": ["0", 1.5, True, None], "dap": [1], "assume": ["nothing"], "device": ["tpu"]}
+WRONG |= {"factor": ["2"], "data": [5, ["a"]], "lpips": [{}]}
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [*(("seed", value) for value in ("0", 1.5, True, None)), *WRONG.items(), ("data", ["a"])]
-)
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
 def test_a_field_of_another_type_is_refused_by_its_name(run, name, value):
     edit(run, lambda values: values.update({name: value}))
     with pytest.raises(ValueError, match=rf"config\.json: {name} cannot be "):

@@ -159,9 +159,7 @@ def test_sigterm_stops_a_sweep_as_ctrl_c_does(sweep, tmp_path, capsys):
     assert "| full | 20.00 | 1.0 | 1 of 2 |" in (tmp_path / "out/table.md").read_text()
 
 
-needs_dev_full = pytest.mark.skipif(
-    not Path("/dev/full").exists(), reason="needs /dev/full, to which every write fails"
-)
+needs_dev_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full: every write to it fails")
 
 
 @needs_dev_full

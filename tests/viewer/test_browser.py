@@ -30,16 +30,8 @@ from warpgs.viewer.source import open_source  # noqa: E402
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-ARGUMENTS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-quic",
-    "--no-first-run",
-]
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"]
+ARGUMENTS += [f"--disable-{part}" for part in ("background-networking", "component-update", "sync", "quic")]
 SIZE = {"width": 900, "height": 700}
 LEFT = 480
 """Columns of the image that are compared; the panel lies beside the image [px]."""

@@ -36,17 +36,13 @@ def taken():
         yield listening.getsockname()[1]
 
 
-def test_only_this_machine_can_connect_by_default(run):
+def test_only_this_machine_can_connect_by_default_and_no_browser_can_request_a_public_address(run):
     with Viewer(open_source(run, "cpu", False), None, View(run).host, 0) as viewer:
-        listening = viewer._server._websock_server
-        assert listening._host == "127.0.0.1"
+        assert viewer._server._websock_server._host == "127.0.0.1"
+        assert viewer._server.request_share_url() is None
         with urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}", timeout=30) as page:
             assert page.status == 200
-
-
-def test_a_browser_cannot_request_a_public_address(run):
-    with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
-        assert viewer._server.request_share_url() is None
+    check_address("127.0.0.1", viewer.port)  # it is free again
 
 
 class FakeSession:
@@ -140,12 +136,6 @@ def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
             until(lambda: [ref() for ref in left[0]] == [None, None])
     finally:
         gc.enable()
-
-
-def test_a_port_is_free_again_after_the_viewer(run):
-    with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
-        port = viewer.port
-    check_address("127.0.0.1", port)
 
 
 def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):

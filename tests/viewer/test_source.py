@@ -138,14 +138,6 @@ def test_a_damaged_run_is_refused(run):
         open_source(run, "cpu", True)
 
 
-def test_without_residual_static_gaussians_keep_their_colours(run):
-    trained = open_source(run, "cpu", False).current()
-    plain, changed = (trained.splats(0.5, residual) for residual in (False, True))
-    num = len(trained.scene.static)
-    assert watched.same(plain.sh[:num], trained.scene.static.sh)
-    assert not watched.same(changed.sh[:num], trained.scene.static.sh)
-
-
 def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, without_interval):
     source = open_source(run, "cpu", True)
     source.current()
