@@ -64,17 +64,14 @@ def test_a_wrong_number_of_entries_is_refused_before_colmap_reads_it(model, name
         read_model(model)
 
 
-@pytest.mark.parametrize(("name", "offset"), [("points3D", 8 + 43), ("rigs", 8 + 4), ("frames", 8 + 64)])
-def test_an_entry_that_claims_a_huge_size_is_refused(model, name, offset):
-    overwrite(model / f"{name}.bin", offset, b"\xff\xff\xff\xff")
+SIZES = [("points3D", 8 + 43, -1), ("rigs", 8 + 4, -1), ("frames", 8 + 64, -1)]
+MODELS = [("cameras", 8 + 4, model_id) for model_id in (-1, 18, 2**31 - 1)]
+
+
+@pytest.mark.parametrize(("name", "offset", "value"), SIZES + MODELS)
+def test_an_entry_that_claims_a_huge_size_or_an_unknown_camera_model_is_refused(model, name, offset, value):
+    overwrite(model / f"{name}.bin", offset, struct.pack("<i", value))
     with pytest.raises(ValueError, match=rf"{name}\.bin is damaged"):
-        read_model(model)
-
-
-@pytest.mark.parametrize("model_id", [-1, 18, 2**31 - 1])
-def test_an_unknown_camera_model_is_refused(model, model_id):
-    overwrite(model / "cameras.bin", 8 + 4, struct.pack("<i", model_id))
-    with pytest.raises(ValueError, match=r"cameras\.bin is damaged"):
         read_model(model)
 
 

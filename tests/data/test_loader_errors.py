@@ -107,22 +107,20 @@ def test_the_error_for_a_part_of_a_capture_lists_its_files(root):
     refused(root, "dataset.json is missing: a capture has .*camera")
 
 
-def test_the_error_for_a_missing_size_lists_the_existing_sizes(root):
-    refused(root, r"rgb.4x is missing: .* has 1x", factor=4)
-
-
 @pytest.mark.usefixtures("contracts_off")
-def test_an_unknown_dataset_is_refused_with_the_known_ones(root):
-    refused(root, "unknown dataset 'blend', expected one of iphone, nerfds, hypernerf, nerfstudio", dataset="blend")
-
-
-def test_a_factor_below_one_is_refused(root):
-    refused(root, "factor must be at least 1, got 0", factor=0)
-
-
-def test_a_bad_perturbation_is_refused_on_opening(root):
-    with pytest.raises(ValueError, match="erode"):
-        load_capture(root, perturbation=MaskPerturbation(erode=-1))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"factor": 4}, r"rgb.4x is missing: .* has 1x"),
+        ({"factor": 0}, "factor must be at least 1, got 0"),
+        ({"dataset": "blend"}, "unknown dataset 'blend', expected one of iphone, nerfds, hypernerf, nerfstudio"),
+        ({"perturbation": MaskPerturbation(erode=-1)}, "erode"),
+    ],
+)
+def test_a_bad_option_is_refused_on_opening(root, options, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        load_capture(root, **options)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("ids", [[], "left", [1, 2], ["../up"], ["left_000000"] * 2, ["right_000000"], [""]])

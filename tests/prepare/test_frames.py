@@ -91,30 +91,21 @@ def test_invalid_selections_are_refused(selection, word):
         check_selection(selection)
 
 
-def test_files_that_are_not_videos_are_refused(tmp_path):
-    (tmp_path / "notes.mp4").write_text("hello" * 100)
-    with pytest.raises(ValueError, match=r"notes\.mp4 is not a video"):
-        take_frames(tmp_path / "notes.mp4", tmp_path / "frames", Selection())
-    with pytest.raises(ValueError, match="is missing"):
-        take_frames(tmp_path / "nothing.mp4", tmp_path / "frames", Selection())
+UNSUITABLE = {
+    "text": (lambda path, images: path.write_text("hello" * 100), r"source\.mp4 is not a video"),
+    "missing": (lambda path, images: None, r"source\.mp4 is missing"),
+    "fifo": (lambda path, images: os.mkfifo(path), r"source\.mp4 is not a file"),
+    "device": (lambda path, images: path.symlink_to("/dev/zero"), r"source\.mp4 is not a file"),
+    "one frame": (lambda path, images: write_video(path, images[:1]), "gives 1 frame, at least"),
+    "empty folder": (lambda path, images: path.mkdir(), "holds no"),
+}
 
 
-def test_a_video_that_is_a_fifo_or_a_device_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "fifo.mp4")
-    (tmp_path / "zero.mp4").symlink_to("/dev/zero")
-    for name in ("fifo.mp4", "zero.mp4"):
-        with pytest.raises(ValueError, match=f"{name} is not a file"):
-            take_frames(tmp_path / name, tmp_path / "frames", Selection())
-
-
-def test_one_frame_is_too_few(tmp_path, images):
-    with pytest.raises(ValueError, match="gives 1 frame, at least"):
-        take_frames(write_video(tmp_path / "one.mp4", images[:1]), tmp_path / "frames", Selection())
-
-
-def test_a_folder_without_images_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="holds no"):
-        take_frames(tmp_path, tmp_path / "frames", Selection())
+@pytest.mark.parametrize(("write", "message"), UNSUITABLE.values(), ids=UNSUITABLE)
+def test_unsuitable_sources_are_refused(tmp_path, images, write, message):
+    write(tmp_path / "source.mp4", images)
+    with pytest.raises(ValueError, match=message):
+        take_frames(tmp_path / "source.mp4", tmp_path / "frames", Selection())
 
 
 def test_images_of_different_sizes_are_refused_by_name(tmp_path, images):

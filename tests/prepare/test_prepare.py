@@ -411,16 +411,20 @@ def test_too_few_frames_for_the_options_are_refused(options, word, tmp_path):
         prepare(shots, tmp_path / "made", **options)
 
 
-def test_a_camera_at_rest_is_refused_with_advice(tmp_path):
-    still = boards.write_folder(tmp_path / "still", boards.record(10, travel=0.0, moves=False)[0])
-    with pytest.raises(ValueError, match=r"move the camera sideways|walk around"):
-        prepare(still, tmp_path / "made")
+UNUSABLE = {
+    "at rest": (lambda: boards.record(10, travel=0.0, moves=False)[0], "move the camera sideways|walk around"),
+    "no texture": (lambda: [np.full((96, 128, 3), 128, np.uint8)] * 10, "hardly any texture"),
+    "unrelated": (
+        lambda: [boards.texture(k, boards.COLORS[0], 256, (20, 60)) for k in range(10)],
+        "no two frames show enough of the same static surfaces",
+    ),
+}
 
 
-def test_frames_without_texture_are_refused_with_advice(tmp_path):
-    grey = boards.write_folder(tmp_path / "grey", [np.full((96, 128, 3), 128, np.uint8)] * 10)
-    with pytest.raises(ValueError, match="hardly any texture"):
-        prepare(grey, tmp_path / "made")
+@pytest.mark.parametrize(("images", "message"), UNUSABLE.values(), ids=UNUSABLE)
+def test_images_without_parallax_or_texture_or_that_are_unrelated_are_refused_with_advice(images, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        prepare(boards.write_folder(tmp_path / "shots", images()), tmp_path / "made")
 
 
 def test_a_full_disk_is_reported_before_work_starts(shots, tmp_path, monkeypatch):
@@ -477,12 +481,6 @@ def test_the_error_of_a_disk_that_fills_up_says_how_to_continue(shots, tmp_path,
     monkeypatch.setattr("warpgs.prepare.steps.take_frames", fill_up)
     with pytest.raises(OSError, match=r"the disk is full; free some disk space and run the same command again$"):
         prepare(shots, tmp_path / "made")
-
-
-def test_unrelated_images_are_refused_with_advice(tmp_path):
-    unrelated = [boards.texture(k, boards.COLORS[0], 256, (20, 60)) for k in range(10)]
-    with pytest.raises(ValueError, match="no two frames show enough of the same static surfaces"):
-        prepare(boards.write_folder(tmp_path / "unrelated", unrelated), tmp_path / "made")
 
 
 def test_if_nearly_everything_seems_to_move_the_error_suggests_masks(tmp_path, monkeypatch):
