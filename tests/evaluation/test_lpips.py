@@ -175,14 +175,10 @@ def test_the_linear_layers_may_be_named_as_their_authors_do(tmp_path, pair):
     assert lpips.find(tmp_path, "squeeze")(*pair).item() == distance(*pair).item()
 
 
-def test_the_folder_may_be_named_in_the_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv("WARPGS_LPIPS", str(write(tmp_path, network("squeeze"))))
+def test_a_folder_that_is_given_goes_before_one_in_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARPGS_LPIPS", str(write(tmp_path / "squeeze", network("squeeze"))))
     assert lpips.find(None, "squeeze").net == "squeeze"
-
-
-def test_a_folder_that_is_given_goes_before_the_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv("WARPGS_LPIPS", str(tmp_path / "nothing"))
-    assert lpips.find(write(tmp_path, network("alex")), "alex").net == "alex"
+    assert lpips.find(write(tmp_path / "alex", network("alex")), "alex").net == "alex"
 
 
 def test_without_a_folder_there_is_no_lpips():

@@ -68,22 +68,18 @@ def test_a_path_of_one_camera_is_constant():
     assert paths.interpolated([camera(0.3)], [0.0], [0.0, 0.0])[1].position[0] == pytest.approx(0.3)
 
 
-def test_the_training_path_is_sorted_by_time_and_covers_all_times():
-    unsorted = capture([0.4, 0.0, 0.2], [1.0, 0.0, 0.5])
-    path = paths.training_path(unsorted, 5, smoothing=0.0)
-    assert positions(path)[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-5)
-    assert [c.time for c in path] == pytest.approx([0.0, 0.25, 0.5, 0.75, 1.0])
+TRAINING = {  # positions and times of the cameras, positions of the path
+    "it is sorted by time": ([0.4, 0.0, 0.2], [1.0, 0.0, 0.5], [0.0, 0.1, 0.2, 0.3, 0.4]),
+    "before the first time it stays at the first camera": ([0.1, 0.5], [0.5, 1.0], [0.1, 0.1, 0.5]),
+    "of cameras at the same time the first is used": ([0.1, 0.9, 0.5], [0.0, 0.0, 1.0], [0.1, 0.5]),
+}
 
 
-def test_before_the_first_time_the_training_path_stays_at_the_first_camera():
-    path = paths.training_path(capture([0.1, 0.5], [0.5, 1.0]), 3, smoothing=0.0)
-    assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.1, 0.5], abs=1e-5)
-    assert path[0].time == 0.0
-
-
-def test_of_cameras_at_the_same_time_the_first_is_used():
-    path = paths.training_path(capture([0.1, 0.9, 0.5], [0.0, 0.0, 1.0]), 2, smoothing=0.0)
-    assert positions(path)[:, 0].tolist() == pytest.approx([0.1, 0.5], abs=1e-5)
+@pytest.mark.parametrize(("xs", "times", "expected"), TRAINING.values(), ids=TRAINING)
+def test_the_training_path_covers_all_times(xs, times, expected):
+    path = paths.training_path(capture(xs, times), len(expected), smoothing=0.0)
+    assert positions(path)[:, 0].tolist() == pytest.approx(expected, abs=1e-5)
+    assert [c.time for c in path] == pytest.approx(paths.evenly_spaced(len(expected)))
 
 
 def test_smoothing_removes_shaking():

@@ -109,22 +109,19 @@ def cameras_of(run, monkeypatch, tmp_path, **options):
     return cameras
 
 
-def test_a_frozen_path_moves_only_the_camera(run, monkeypatch, tmp_path):
-    cameras = cameras_of(run, monkeypatch, tmp_path, path="frozen", time=0.3, frames=5)
-    assert {c.time for c in cameras} == {0.3}
-    assert (cameras[0].position - cameras[1].position).norm() > 0.01
-
-
-def test_a_moving_path_moves_camera_and_time(run, monkeypatch, tmp_path):
-    cameras = cameras_of(run, monkeypatch, tmp_path, path="moving", frames=5)
-    assert [c.time for c in cameras] == [0.0, 0.25, 0.5, 0.75, 1.0]
-    assert (cameras[0].position - cameras[1].position).norm() > 0.01
-
-
-@pytest.mark.parametrize(("time", "times"), [(None, [0.0, 0.5, 1.0]), (0.2, [0.2, 0.2, 0.2])])
-def test_a_spiral_runs_through_time_unless_a_time_is_given(run, monkeypatch, tmp_path, time, times):
-    cameras = cameras_of(run, monkeypatch, tmp_path, path="spiral", time=time)
+@pytest.mark.parametrize(
+    ("path", "time", "times"),
+    [
+        ("frozen", 0.3, [0.3, 0.3, 0.3]),
+        ("moving", None, [0.0, 0.5, 1.0]),
+        ("spiral", None, [0.0, 0.5, 1.0]),
+        ("spiral", 0.2, [0.2, 0.2, 0.2]),
+    ],
+)
+def test_cameras_move_and_time_passes_unless_one_is_given(run, monkeypatch, tmp_path, path, time, times):
+    cameras = cameras_of(run, monkeypatch, tmp_path, path=path, time=time)
     assert [c.time for c in cameras] == times
+    assert (cameras[0].position - cameras[1].position).norm() > 0.01
 
 
 def test_keyframes_are_followed(run, capture, scene, tmp_path):

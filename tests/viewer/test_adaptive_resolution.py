@@ -23,22 +23,17 @@ def test_the_resolution_is_full_before_the_first_measurement():
     assert AdaptiveResolution().interactive_scale(PIXELS) == 1.0
 
 
-def test_a_fast_machine_renders_at_full_resolution():
-    assert measured(0.001, 0.01).interactive_scale(PIXELS) == 1.0
+@pytest.mark.parametrize(
+    ("fixed", "per_million", "scale"), [(0.001, 0.01, 1.0), (0.5, 0.1, 1.0), (0.0, 1e3, SCALES[-1])]
+)
+def test_fast_machines_and_cheap_pixels_are_at_full_resolution_and_it_has_a_minimum(fixed, per_million, scale):
+    assert measured(fixed, per_million).interactive_scale(PIXELS) == scale
 
 
 def test_a_slow_machine_renders_the_highest_resolution_within_the_target_time():
     scale = measured(0.0, 0.8).interactive_scale(PIXELS)
     assert scale in SCALES
     assert 0.8 * scale**2 <= 0.1 < 0.8 * (scale * 2**0.5) ** 2
-
-
-def test_the_resolution_stays_full_where_pixels_cost_little():
-    assert measured(0.5, 0.1).interactive_scale(PIXELS) == 1.0
-
-
-def test_the_scale_has_a_minimum():
-    assert measured(0.0, 1e3).interactive_scale(PIXELS) == SCALES[-1]
 
 
 def test_with_images_of_one_size_the_cost_is_all_per_pixel():
