@@ -351,24 +351,28 @@ def test_a_run_that_was_not_evaluated_is_refused_with_the_remedy(capsys, run, na
     assert "warpgs eval" in error
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "config.json"])
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00"])
-def test_a_file_that_is_not_json_is_named(capsys, run, name, content):
-    (run / name).write_bytes(content)
-    assert f"{name} is not valid JSON" in error_line(capsys, "report", run)
+NOT_JSON = [(name, data) for name in ("metrics.json", "config.json") for data in (b"", b"{", b"\xff\xfe\x00")]
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("name", "data", "message"),
     [
-        ("[]", "metrics.json must hold a JSON object, got list"),
-        ("3", "metrics.json must hold a JSON object, got int"),
-        ('{"psnr": [1]}', "metrics.json is damaged: expected an object with numbers and strings"),
+        *((name, data, f"{name} is not valid JSON") for name, data in NOT_JSON),
+        ("metrics.json", b"[]", "metrics.json must hold a JSON object, got list"),
+        ("metrics.json", b"3", "metrics.json must hold a JSON object, got int"),
+        ("metrics.json", b'{"psnr": [1]}', "metrics.json is damaged: expected an object with numbers and strings"),
+        ("views.csv", b"name,time,psnr\na,0\n", "line 2 has 2 columns, not 3"),
+        ("views.csv", b"name,time,psnr\na,0,high\n", "line 2: psnr cannot be 'high'"),
+        ("views.csv", b'name,time,psnr\n"a', "is damaged"),
+        ("views.csv", b"", "it has no name, time, psnr"),
+        ("views.csv", b"name,time\na,0\n", "columns of another version: it has no psnr"),
     ],
 )
-def test_metrics_that_are_not_an_object_of_values_are_refused(capsys, run, text, message):
-    (run / "metrics.json").write_text(text)
-    assert message in error_line(capsys, "report", run)
+def test_a_damaged_file_is_refused_with_its_name_and_what_is_wrong(capsys, run, name, data, message):
+    (run / name).write_bytes(data)
+    error = error_line(capsys, "report", run)
+    assert name in error
+    assert message in error
 
 
 @pytest.mark.parametrize("number", ["Infinity", "-Infinity", "NaN", "1" + 400 * "0", "1" + 5000 * "0"])
@@ -410,23 +414,6 @@ def test_a_device_is_not_read(capsys, run, name):
     (run / name).unlink()
     (run / name).symlink_to("/dev/zero")
     assert f"{run / name} is not a file" in error_line(capsys, "report", run)
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("name,time,psnr\na,0\n", "line 2 has 2 columns, not 3"),
-        ("name,time,psnr\na,0,high\n", "line 2: psnr cannot be 'high'"),
-        ('name,time,psnr\n"a', "is damaged"),
-        ("", "it has no name, time, psnr"),
-        ("name,time\na,0\n", "columns of another version: it has no psnr"),
-    ],
-)
-def test_damaged_views_are_refused_with_their_line_or_column(capsys, run, text, reason):
-    (run / "views.csv").write_text(text)
-    error = error_line(capsys, "report", run)
-    assert "views.csv" in error
-    assert reason in error
 
 
 @pytest.mark.parametrize("damaged", [lambda data: data[:-20], lambda data: b"nonsense" * 100], ids=["cut", "nonsense"])
