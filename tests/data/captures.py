@@ -112,11 +112,12 @@ def write_capture(root: Path, dataset: str = "nerfds") -> Path:
 def refused(root: Path, match: str, dataset: str | None = None, **options: Any) -> None:
     """The capture is refused in one line, on opening or when its frames are read."""
     with pytest.raises(ValueError, match=match) as caught:
-        _read_all(root, dataset, **options)
+        read_all(root, dataset, **options)
     assert "\n" not in str(caught.value)
 
 
-def _read_all(root: Path, dataset: str | None, **options: Any) -> None:
+def read_all(root: Path, dataset: str | None = None, **options: Any) -> None:
+    """Opens a capture and reads its frames."""
     capture = load_capture(root, dataset, **options)
     for name in (*capture.train, *capture.val):
         capture.frame(name)

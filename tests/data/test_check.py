@@ -114,11 +114,10 @@ def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):
 
 
 def test_cameras_that_do_not_match_the_images_are_a_warning(root):
-    names = sorted(p.name for p in (root / "camera").iterdir())
-    shuffled = np.random.default_rng(0).permutation(len(names))
-    cameras = [(root / "camera" / name).read_text() for name in names]
-    for name, k in zip(names, shuffled, strict=True):
-        (root / "camera" / name).write_text(cameras[k])
+    paths = sorted((root / "camera").iterdir())
+    cameras = np.random.default_rng(0).permutation([path.read_text() for path in paths])
+    for path, text in zip(paths, cameras, strict=True):
+        path.write_text(text)
     assert "cameras may not match" in texts(check_capture(root), "warning")
 
 

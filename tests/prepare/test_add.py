@@ -48,8 +48,8 @@ def root(original, tmp_path):
     return shutil.copytree(original, tmp_path / "capture")
 
 
-@pytest.fixture
-def red(monkeypatch):
+@pytest.fixture(autouse=True)
+def _red(monkeypatch):
     """A masker that finds what is red."""
     monkeypatch.setitem(masks.MASKERS, "red", Masker(lambda frames, weights, quiet: [is_red(i) for i in frames.images]))
 
@@ -65,7 +65,6 @@ def written_mask(root, name, size="1x"):
     return decode(root / f"resized_mask/{size}/{name}.png.png") == 0
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
     for k, name in enumerate(NAMES):
         lens = {"focal_length": boards.FOCAL + 3.0 * k, "radial_distortion": [0.02 * k, 0.0, 0.0]}
@@ -81,7 +80,6 @@ def test_masks_fit_the_files_of_frames_with_lenses_of_their_own(root, capsys):
     assert (root / "masks.png").is_file()
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_that_are_there_stay(root):
     for name in NAMES:
         write_mask(root, name)
@@ -92,7 +90,6 @@ def test_masks_that_are_there_stay(root):
     assert not written_mask(root, "shot003").any()
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_that_only_some_training_frames_lack_are_made(root):
     """Three of twelve frames have masks, in one of two sizes."""
     drawn = STATIC.copy()
@@ -114,7 +111,6 @@ def test_masks_that_only_some_training_frames_lack_are_made(root):
     assert load_capture(root, factor=2).frame(NAMES[3]).static_mask is not None
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_are_known_as_estimates_if_the_next_part_fails(root, monkeypatch):
     def fail(*arguments):
         raise ValueError("no depth here")
@@ -125,7 +121,6 @@ def test_masks_are_known_as_estimates_if_the_next_part_fails(root, monkeypatch):
     assert load_capture(root).estimated_masks
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_of_one_size_in_a_folder_that_gets_no_new_ones_are_refused(root):
     for name in NAMES:
         captures.write_png(root / f"mask/2x/{name}.png.png", STATIC[::2, ::2])
@@ -140,7 +135,6 @@ def test_depth_is_not_added_beside_incomplete_masks(root):
         add_parts(root, AddOptions(["depth"]))
 
 
-@pytest.mark.usefixtures("red")
 def test_masks_are_not_split_over_two_folders(root):
     """Masks of the training frames in mask/, none of the evaluation frames."""
     train = load_capture(root).train
@@ -219,7 +213,6 @@ def test_a_camera_that_stays_at_one_place_gives_no_depth_by_optical_flow(root, p
         add_parts(root, AddOptions([part]))
 
 
-@pytest.mark.usefixtures("red")
 def test_a_hypernerf_capture_stays_one(tmp_path):
     root = captures.write_capture(tmp_path / "toy", "hypernerf")
     for path in (root / "rgb/2x").iterdir():

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.data.captures import edit_json
 from warpgs.cli import main
-from warpgs.runs.config_file import read_config
+from warpgs.runs.config_file import read_config, write_config
 from warpgs.sweep import run_sweep as module
 from warpgs.sweep.scheduler import ClusterGoneError, Result
 
@@ -227,8 +228,7 @@ def test_finished_cells_that_lack_what_is_asked_for_are_evaluated_again(sweep, t
 def test_networks_of_lpips_are_not_mixed_without_a_note(sweep, tmp_path, capsys):
     sweep()
     for name, net in (("as-full-seed0", "alex"), ("as-plain-seed0", "vgg")):
-        path = tmp_path / "out" / name / "metrics.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "lpips": 0.5, "lpips_net": net}))
+        edit_json(tmp_path / "out" / name / "metrics.json", lpips=0.5, lpips_net=net)
     capsys.readouterr()
     sweep("--tables-only")
     assert "LPIPS is of different networks (alex in 1, vgg in 1 trainings)" in capsys.readouterr().out
@@ -310,10 +310,9 @@ def test_tables_alone_of_a_folder_without_the_sweep_are_refused(sweep, tmp_path,
 def test_a_note_says_which_frames_were_resampled(sweep, tmp_path, capsys, undistorted, note):
     def finish(job):
         sweep.finish(job)
-        path = tmp_path / "out" / job.name / "metrics.json"
         index = ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"].index(job.name)
         frames = "undistorted" if str(index) in undistorted else "as taken"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "frames": frames}))
+        edit_json(tmp_path / "out" / job.name / "metrics.json", frames=frames)
 
     assert sweep(by=finish)[0] == 0
     printed = capsys.readouterr().out
@@ -367,8 +366,6 @@ def test_a_wrong_type_names_the_file_and_the_whole_option(sweep, tmp_path, capsy
 
 
 def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, tmp_path):
-    from warpgs.runs.config_file import write_config
-
     config = dataclasses.replace(read_config(finished_run), data=Path("builtin:room"))
     write_config(tmp_path, config)
     assert read_config(tmp_path).data == Path("builtin:room")
