@@ -51,6 +51,12 @@ def images_in(tmp_path):
     return {path.stem: cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in files}
 
 
+def first_image(run, tmp_path, **options):
+    """The only image of a fixed camera."""
+    render(run, tmp_path, path="fixed", frames=1, **options)
+    return images_in(tmp_path)["00000"]
+
+
 def expected(scene, camera):
     return to_bytes(scene.render(camera).joint.image)
 
@@ -146,34 +152,26 @@ def test_images_are_written_to_the_run_folder_by_default(run):
 
 @pytest.mark.parametrize(("scale", "size"), [(2.0, (48, 64)), (0.5, (12, 16))])
 def test_images_have_the_requested_size(run, tmp_path, scale, size):
-    render(run, tmp_path, scale=scale, path="fixed", frames=1)
-    assert images_in(tmp_path)["00000"].shape == (*size, 3)
+    assert first_image(run, tmp_path, scale=scale).shape == (*size, 3)
 
 
 def test_supersampling_averages_a_larger_image(run, tmp_path):
-    render(run, tmp_path, path="fixed", frames=1, scale=3.0)
-    large = images_in(tmp_path)["00000"].astype(float)
-    render(run, tmp_path, path="fixed", frames=1, supersample=3)
-    small = images_in(tmp_path)["00000"]
+    large = first_image(run, tmp_path, scale=3.0).astype(float)
+    small = first_image(run, tmp_path, supersample=3)
     assert small.shape == (24, 32, 3)
     assert np.abs(large.reshape(24, 3, 32, 3, 3).mean((1, 3)) - small).max() <= 1.0
 
 
 def test_layers_are_side_by_side(run, tmp_path):
-    images = []
-    for layers in ("joint", "static", "dynamic", "all"):
-        render(run, tmp_path, path="fixed", frames=1, layers=layers)
-        images.append(images_in(tmp_path)["00000"])
-    assert (np.concatenate(images[:3], 1) == images[3]).all()
+    *images, together = (first_image(run, tmp_path, layers=name) for name in ("joint", "static", "dynamic", "all"))
+    assert (np.concatenate(images, 1) == together).all()
     assert (images[1] != images[2]).any()
 
 
 def test_a_size_of_another_shape_crops_the_view(run, tmp_path):
     """32 × 24 at 20 × 48: twice as large, then 20 of 64 columns."""
-    render(run, tmp_path, path="fixed", frames=1, scale=2.0)
-    whole = images_in(tmp_path)["00000"]
-    render(run, tmp_path, path="fixed", frames=1, size="20x48")
-    difference = np.abs(images_in(tmp_path)["00000"].astype(int) - whole[:, 22:42])
+    whole = first_image(run, tmp_path, scale=2.0)
+    difference = np.abs(first_image(run, tmp_path, size="20x48").astype(int) - whole[:, 22:42])
     assert difference.mean() < 0.2  # the covariance of Gaussians at the border depends on the field of view
     assert difference.max() <= 4
 
@@ -205,8 +203,7 @@ def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("layers", ["joint", "dynamic"])
 def test_a_transparent_image_over_black_is_the_opaque_one(run, tmp_path, layers):
-    render(run, tmp_path, path="fixed", frames=1, write="png", layers=layers)
-    opaque = images_in(tmp_path)["00000"]
+    opaque = first_image(run, tmp_path, write="png", layers=layers)
     render(run, tmp_path, path="fixed", frames=1, write="png", layers=layers, transparent=True)
     b, g, r, alpha = np.moveaxis(cv2.imread(str(tmp_path / "out" / "00000.png"), cv2.IMREAD_UNCHANGED), 2, 0)
     assert alpha.min() < 128

@@ -25,6 +25,12 @@ def without_interval(monkeypatch):
     monkeypatch.setattr(source_module, "POLL_SECONDS", 0.0)
 
 
+@pytest.fixture
+def source(run, without_interval):
+    """The source of a run that is followed."""
+    return open_source(run, "cpu", True)
+
+
 def test_the_newest_checkpoint_is_shown(run):
     trained = open_source(run, "cpu", False).current()
     assert trained.metadata.iteration == 32
@@ -40,20 +46,17 @@ def test_without_follow_newer_checkpoints_are_ignored_and_nothing_is_asked_for(r
     assert not preview.is_requested(run)
 
 
-def test_a_newer_checkpoint_is_followed(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_a_newer_checkpoint_is_followed(run, source):
     assert source.current().metadata.iteration == 32
     watched.advance(run)
     assert source.current().metadata.iteration == 33
 
 
-def test_an_unchanged_checkpoint_is_not_read_again(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_an_unchanged_checkpoint_is_not_read_again(source):
     assert source.current() is source.current()
 
 
-def test_a_rewritten_checkpoint_is_read_again(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_a_rewritten_checkpoint_is_read_again(run, source):
     before = source.current()
     path = checkpoint.list_checkpoints(run)[-1]
     loaded = checkpoint.load(path)
@@ -84,16 +87,14 @@ def test_a_followed_run_may_have_no_checkpoint_yet(run, without_interval):
     assert source.note == ""
 
 
-def test_a_damaged_checkpoint_keeps_the_scene_before_it(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_a_damaged_checkpoint_keeps_the_scene_before_it(run, source):
     before = source.current()
     watched.advance(run).write_bytes(b"nonsense")
     assert source.current() is before
     assert "0000033.safetensors is damaged" in source.note
 
 
-def test_a_checkpoint_deleted_while_it_is_read_is_ignored(run, without_interval, monkeypatch):
-    source = open_source(run, "cpu", True)
+def test_a_checkpoint_deleted_while_it_is_read_is_ignored(run, source, monkeypatch):
     before = source.current()
     deleted = run / "checkpoints" / "0000099.safetensors"
     monkeypatch.setattr(Run, "newest_checkpoint", lambda _: deleted)
@@ -101,8 +102,7 @@ def test_a_checkpoint_deleted_while_it_is_read_is_ignored(run, without_interval,
     assert source.note == ""
 
 
-def test_nobody_waits_for_a_scene_that_another_thread_reads(run, without_interval, monkeypatch):
-    source = open_source(run, "cpu", True)
+def test_nobody_waits_for_a_scene_that_another_thread_reads(run, source, monkeypatch):
     before = source.current()
     watched.advance(run)
     begun, read = threading.Event(), threading.Event()
@@ -138,8 +138,7 @@ def test_a_damaged_run_is_refused(run):
         open_source(run, "cpu", True)
 
 
-def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, source):
     source.current()
     assert preview.is_requested(run)
     scene = Run.open(run, "cpu").trained_scene()
@@ -155,8 +154,7 @@ def test_a_followed_training_is_asked_for_its_scene_and_shows_it(run, without_in
     assert source.progress == ""
 
 
-def test_a_viewer_that_ends_leaves_no_request(run, without_interval):
-    source = open_source(run, "cpu", True)
+def test_a_viewer_that_ends_leaves_no_request(run, source):
     source.current()
     assert preview.is_requested(run)
     source.stop()
