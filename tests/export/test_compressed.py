@@ -71,6 +71,10 @@ def test_the_bits_are_in_the_layout_of_playcanvas(path):
     assert [rest["f_rest_0"], rest["f_rest_1"], rest["f_rest_3"]] == [255, 0, 159]  # red, red, green
 
 
+def as_floats(table):
+    return table.astype([(name, "<f4") for name in table.dtype.names])
+
+
 def test_a_file_without_colour_ranges_is_read(path):
     cloud = dataclasses.replace(scenes.cloud(10, degree=0), sh=np.zeros((10, 1, 3), np.float32))
     write_compressed(path, cloud)
@@ -78,7 +82,7 @@ def test_a_file_without_colour_ranges_is_read(path):
     old = tables["chunk"][list(tables["chunk"].dtype.names[:12])]
     vertex = tables["vertex"].copy()
     vertex["packed_color"] = 0x336699FF
-    write_ply(path, {"chunk": old.astype([(name, "<f4") for name in old.dtype.names]), "vertex": vertex})
+    write_ply(path, {"chunk": as_floats(old), "vertex": vertex})
     colors = 0.5 + SH_C0 * read_compressed(path).sh[:, 0]
     assert colors * 255 == pytest.approx(np.tile([0x33, 0x66, 0x99], (10, 1)), abs=1e-3)
 
@@ -90,10 +94,7 @@ def test_a_file_without_colour_ranges_is_read(path):
         (lambda t: t.update(chunk=t["chunk"][:1]), "has 1 chunks, expected 2 for 300 Gaussians"),
         (lambda t: t.update(sh=t["sh"][:7]), "has 7 rows of sh for 300 Gaussians"),
         (lambda t: t["chunk"].__setitem__("max_y", np.nan), "ranges that are not finite"),
-        (
-            lambda t: t.update(vertex=t["vertex"].astype([(n, "<f4") for n in t["vertex"].dtype.names])),
-            "the wrong type",
-        ),
+        (lambda t: t.update(vertex=as_floats(t["vertex"])), "has the wrong type"),
     ],
 )
 def test_an_inconsistent_file_is_refused(path, change, message):
