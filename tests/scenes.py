@@ -93,3 +93,18 @@ def relative_error(actual: Tensor, expected: Tensor) -> float:
     assert actual.shape == expected.shape
     assert expected.norm() > 0
     return ((actual - expected).norm() / expected.norm()).item()
+
+
+def assert_same_gradients(
+    outputs: Iterable[Tensor],
+    expected: Iterable[Tensor],
+    inputs: Iterable[Tensor],
+    doubles: Iterable[Tensor],
+    tolerance: float = 1e-5,
+) -> None:
+    """Backpropagates random gradients from outputs and from those of the reference; compares the inputs' gradients."""
+    v_outputs = random_like(expected)
+    weighted_sum(outputs, v_outputs).backward()
+    weighted_sum(expected, v_outputs).backward()
+    for k, (actual, wanted) in enumerate(zip(inputs, doubles, strict=True)):
+        assert relative_error(actual.grad, wanted.grad) < tolerance, f"input {k}"

@@ -13,6 +13,7 @@ from tests.scenes import (
     WIDTH,
     as_doubles,
     as_leaves,
+    assert_same_gradients,
     error,
     float_tensors,
     generator,
@@ -42,8 +43,9 @@ def outputs(rendering):
 
 def reference_outputs(splats, behind, branches=True, **options):
     masks = (None, ~splats.is_dynamic, splats.is_dynamic) if branches else (None,)
-    doubles = as_doubles(splats)
-    results = [reference(doubles, CAMERA, behind, selected=mask, **options) for mask in masks]
+    doubles, behinds = as_doubles(splats), behind if behind.ndim == 2 else behind.expand(len(masks), -1)
+    pairs = zip(behinds, masks, strict=True)
+    results = [reference(doubles, CAMERA, b, selected=mask, **options) for b, mask in pairs]
     return doubles, [r[0] for r in results] + [r[1] for r in results], results[0][2]
 
 
@@ -58,12 +60,8 @@ def test_images_statistics_and_gradients_equal_the_reference(channels, options):
         assert error(actual, wanted) < 2e-6
     assert relative_error(result.weights, weights.sum((1, 2))) < 2e-6
     assert torch.equal(result.contributed, weights.sum((1, 2)) > 0)
-    v_outputs = random_like(expected)
-    weighted_sum(outputs(result), v_outputs).backward()
-    weighted_sum(expected, v_outputs).backward()
-    for name, gradient in gradients(splats).items():
-        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
-    assert relative_error(behind.grad, behind64.grad) < 1e-5
+    inputs, doubles = [*float_tensors(splats).values(), behind], [*doubles.values(), behind64]
+    assert_same_gradients(outputs(result), expected, inputs, doubles)
 
 
 @pytest.mark.parametrize("depth", [False, True])
@@ -71,18 +69,11 @@ def test_each_image_may_have_its_own_background(depth):
     splats, behind = as_leaves(make_splats()), torch.rand(3, 3, generator=generator()).requires_grad_()
     behind64 = behind.detach().double().requires_grad_()
     result = render(splats, CAMERA, behind, dataclasses.replace(EVERYTHING, depth=depth))
-    doubles = as_doubles(splats)
-    masks = (None, ~splats.is_dynamic, splats.is_dynamic)
-    results = [reference(doubles, CAMERA, b, selected=m) for b, m in zip(behind64, masks, strict=True)]
-    expected = [r[0] for r in results] + [r[1] for r in results]
+    doubles, expected, _ = reference_outputs(splats, behind64)
     for actual, wanted in zip(outputs(result), expected, strict=True):
         assert error(actual, wanted) < 2e-6
-    v_outputs = random_like(expected)
-    weighted_sum(outputs(result), v_outputs).backward()
-    weighted_sum(expected, v_outputs).backward()
-    for name, gradient in gradients(splats).items():
-        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
-    assert relative_error(behind.grad, behind64.grad) < 1e-5
+    inputs, doubles = [*float_tensors(splats).values(), behind], [*doubles.values(), behind64]
+    assert_same_gradients(outputs(result), expected, inputs, doubles)
 
 
 def test_the_joint_image_is_the_same_with_and_without_branches():
@@ -150,11 +141,7 @@ def test_any_number_of_channels_can_be_rendered(channels):
     result = render(splats, CAMERA, background(channels))
     doubles, expected, _ = reference_outputs(splats, background(channels).double(), branches=False)
     assert error(result.joint.image, expected[0]) < 2e-6
-    v_outputs = random_like(expected[:1])
-    weighted_sum([result.joint.image], v_outputs).backward()
-    weighted_sum(expected[:1], v_outputs).backward()
-    for name, gradient in gradients(splats).items():
-        assert relative_error(gradient, doubles[name].grad) < 1e-5, name
+    assert_same_gradients([result.joint.image], expected[:1], float_tensors(splats).values(), doubles.values())
 
 
 @pytest.mark.parametrize("branches", [False, True])

@@ -77,22 +77,17 @@ def double_parameters(trunk):
 @pytest.mark.parametrize(("depth", "skip"), SHAPES)
 @pytest.mark.parametrize("raw", [True, False])
 def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip, raw):
+    """Its values and gradients."""
     trunk = make_trunk(depth=depth, skip=skip, raw_input=raw)
-    expected = plain_trunk(double_parameters(trunk), random_means(), skip, raw)
-    assert relative_error(trunk(random_means(), TIME), expected) < 2e-6
-
-
-@pytest.mark.parametrize(("depth", "skip"), SHAPES)
-def test_gradients_of_the_trunk_are_those_of_the_reference(depth, skip):
-    trunk = make_trunk(depth=depth, skip=skip)
-    outputs = trunk(random_means(), TIME)
+    parameters, outputs = double_parameters(trunk), trunk(random_means(), TIME)
+    expected = plain_trunk(parameters, random_means(), skip, raw)
+    assert relative_error(outputs, expected) < 2e-6
     (v_outputs,) = random_like([outputs])
     outputs.backward(v_outputs)
-    parameters = double_parameters(trunk)
-    plain_trunk(parameters, random_means(), skip).backward(v_outputs.double())
+    expected.backward(v_outputs.double())
     ours = [part for layer in trunk.layers(trunk.values.grad) for part in layer]
-    for gradient, expected in zip(ours, parameters, strict=True):
-        assert relative_error(gradient, expected.grad) < 1e-5
+    for gradient, parameter in zip(ours, parameters, strict=True):
+        assert relative_error(gradient, parameter.grad) < 1e-5
 
 
 def test_padding_gets_no_gradient():

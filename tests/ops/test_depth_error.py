@@ -5,37 +5,23 @@ import torch
 
 from tests.reference.depth_error import depth_error as reference
 from tests.reference.depth_error import random_inputs
-from tests.scenes import error, generator, relative_error
+from tests.scenes import assert_same_gradients, error, generator
 from warpgs.ops.depth_error import depth_error
 
-SIZES = [(1, 1), (37, 50)]
-MARGINS = [0.0, 0.3]
 NONE = torch.tensor(0.0)
+NAMES = ["depth", "alpha", "inverse_depth", "alignment", "region", "margin"]
 
 
-def doubles(inputs):
-    return [t.double() if t.is_floating_point() else t for t in inputs]
-
-
-@pytest.mark.parametrize("margin", MARGINS)
-@pytest.mark.parametrize("size", SIZES)
-def test_error_equals_the_reference(size, margin):
+@pytest.mark.parametrize("margin", [0.0, 0.3])
+@pytest.mark.parametrize("size", [(1, 1), (37, 50)])
+def test_error_and_gradient_equal_the_reference(size, margin):
     inputs = random_inputs(*size, generator(), margin)
-    expected = reference(*doubles(inputs))
+    double = [t.double() if t.is_floating_point() else t for t in inputs]
+    ours = depth_error(inputs[0].requires_grad_(), *inputs[1:])
+    expected = reference(double[0].requires_grad_(), *double[1:])
     assert expected > 0
-    assert error(depth_error(*inputs), expected) < 1e-6 * expected
-
-
-@pytest.mark.parametrize("margin", MARGINS)
-@pytest.mark.parametrize("size", SIZES)
-def test_gradient_equals_the_reference(size, margin):
-    inputs = random_inputs(*size, generator(), margin)
-    double = doubles(inputs)
-    inputs[0].requires_grad_()
-    double[0].requires_grad_()
-    (3.7 * depth_error(*inputs)).backward()
-    (3.7 * reference(*double)).backward()
-    assert relative_error(inputs[0].grad, double[0].grad) < 1e-6
+    assert error(ours, expected) < 1e-6 * expected
+    assert_same_gradients([ours], [expected], inputs[:1], double[:1], tolerance=1e-6)
 
 
 def test_exact_depth_has_no_error_and_no_gradient():
@@ -72,14 +58,13 @@ def test_only_depth_gets_a_gradient():
     assert [t.grad is None for t in inputs] == [False, True, True, True, True, True]
 
 
-@pytest.mark.parametrize("name", ["depth", "alpha", "inverse_depth", "alignment", "region", "margin"])
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "spoil", [lambda t: t[:1] if t.ndim else t[None], lambda t: t.double(), lambda t: t[..., None]]
 )
 @pytest.mark.usefixtures("contracts_off")
 def test_inputs_that_do_not_fit_are_refused(name, spoil):
-    names = ["depth", "alpha", "inverse_depth", "alignment", "region", "margin"]
-    inputs = dict(zip(names, random_inputs(5, 6, generator()), strict=True))
+    inputs = dict(zip(NAMES, random_inputs(5, 6, generator()), strict=True))
     with pytest.raises(ValueError, match=" must "):
         depth_error(**{**inputs, name: spoil(inputs[name])})
 

@@ -109,17 +109,10 @@ def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05, antialias=False):
 @pytest.mark.parametrize(
     "culled",
     [
-        {"depth": -2.0},
-        {"depth": 0.0},
-        {"depth": 0.01},
-        {"x": 5.0},
-        {"x": -5.0},
-        {"opacity": 0.9999 / 255},
-        {"opacity": 1.0001},
-        {"opacity": -0.5},
-        {"opacity": float("nan")},
-        {"scale": float("inf")},
-        {"scale": float("nan")},
+        *({"depth": value} for value in (-2.0, 0.0, 0.01)),
+        *({"x": value} for value in (5.0, -5.0)),
+        *({"opacity": value} for value in (0.9999 / 255, 1.0001, -0.5, float("nan"))),
+        *({"scale": value} for value in (float("inf"), float("nan"))),
     ],
 )
 def test_culled_gaussians_have_radius_zero_and_zero_values(culled, antialias):
