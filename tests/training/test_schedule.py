@@ -45,9 +45,9 @@ def plans(*arguments, **changes):
     return [made.at(iteration) for iteration in range(made.num_iterations)]
 
 
-def iterations_where(name, *arguments, **changes):
+def iterations_where(name, **changes):
     """The iterations whose plan, or its phase, has a true attribute of this name."""
-    made = plans(*arguments, **changes)
+    made = plans(**changes)
     return [i for i, plan in enumerate(made) if getattr(plan if hasattr(plan, name) else plan.phase, name)]
 
 
@@ -72,27 +72,27 @@ def test_every_iteration_belongs_to_the_stage_it_lies_in():
     assert names == ["pretrain"] * 20 + ["stage1"] * 100 + ["stage2"] * 80
 
 
-@pytest.mark.parametrize(("has_depth", "dap"), [(False, True), (True, False), (False, False)])
-def test_without_pretraining_stage_1_takes_its_iterations(has_depth, dap):
-    assert boundaries(protocol(has_depth, dap=dap)) == [("stage1", 0, 119), ("stage2", 120, 199)]
+WHOLE = [("pretrain", 0, 19), ("stage1", 20, 119), ("stage2", 120, 199)]
+WITHOUT_PRETRAINING = [("stage1", 0, 119), ("stage2", 120, 199)]
 
 
-def test_without_stage_2_stage_1_takes_its_iterations():
-    assert boundaries(protocol(stage2=False)) == [("pretrain", 0, 19), ("stage1", 20, 199)]
-
-
-def test_without_pretraining_and_stage_2_every_iteration_is_stage_1():
-    assert boundaries(protocol(dap=False, stage2=False)) == [("stage1", 0, 199)]
-
-
-@pytest.mark.parametrize("off", ["dap", "vdp", "app", "stage2"])
-def test_runs_with_a_component_disabled_have_the_full_length(off):
-    assert protocol(**{off: False}).num_iterations == protocol().num_iterations == END
-
-
-@pytest.mark.parametrize("off", ["vdp", "app"])
-def test_stages_do_not_depend_on_pruning_or_the_appearance_network(off):
-    assert boundaries(protocol(**{off: False})) == boundaries(protocol())
+@pytest.mark.parametrize(
+    ("off", "stages"),
+    [
+        (["vdp"], WHOLE),
+        (["app"], WHOLE),
+        (["has_depth"], WITHOUT_PRETRAINING),
+        (["dap"], WITHOUT_PRETRAINING),
+        (["has_depth", "dap"], WITHOUT_PRETRAINING),
+        (["stage2"], [("pretrain", 0, 19), ("stage1", 20, 199)]),
+        (["dap", "stage2"], [("stage1", 0, 199)]),
+    ],
+    ids=str,
+)
+def test_stage_1_takes_the_iterations_of_stages_that_are_switched_off(off, stages):
+    made = protocol(**dict.fromkeys(off, False))
+    assert boundaries(made) == stages
+    assert made.num_iterations == END
 
 
 def test_equal_phases_are_equal_keys():
@@ -104,17 +104,7 @@ def test_equal_phases_are_equal_keys():
     assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
 
 
-# Dropout and settling -----------------------------------------------------------------------------------------------
-
-DROPPING = dataclasses.replace(CONFIG.model, dropout=0.1)
-
-
-def test_gaussians_are_omitted_from_stage_1_on_until_they_settle():
-    assert iterations_where("use_dropout", model=DROPPING) == list(range(STAGE1, END))
-    settling = {"settle": 30}
-    expected = list(range(STAGE1, END - 30))
-    assert iterations_where("use_dropout", schedule=settling, model=DROPPING) == expected
-    assert iterations_where("use_dropout", schedule=settling) == []
+# Settling -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("has_depth", [True, False])  # without depth there is no pretraining
@@ -145,23 +135,9 @@ def iterations_with_joint_term(**changes):
     return [i for i, plan in enumerate(plans(**changes)) if is_active(plan.phase, CONFIG.loss)]
 
 
-def test_the_joint_term_is_active_in_stage_2_only():
-    assert iterations_with_joint_term() == list(range(STAGE2, END))
-
-
-def test_the_appearance_network_is_used_from_its_iteration_of_stage_1_on():
-    assert iterations_where("use_appearance") == list(range(STAGE1 + 35, END))
-
-
-def test_the_appearance_network_is_always_used_in_stage_2():
-    assert iterations_where("use_appearance", schedule={"appearance_from": 1000}) == list(range(STAGE2, END))
-
-
-@pytest.mark.parametrize("has_depth", [True, False])
-def test_the_appearance_network_can_wait_for_stage_2(has_depth):
-    plan = plans(has_depth, schedule={"appearance_from": None})
-    assert [k for k, p in enumerate(plan) if p.phase.use_appearance] == list(range(STAGE2, END))
-    assert not iterations_where("use_appearance", stage2=False, schedule={"appearance_from": None})
+@pytest.mark.parametrize("app", [True, False])
+def test_the_joint_term_is_active_in_stage_2_only(app):
+    assert iterations_with_joint_term(app=app) == list(range(STAGE2, END))
 
 
 BRANCH_TERMS = {"static", "dynamic", "depth", "depth_dynamic"}
@@ -177,26 +153,8 @@ def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
     assert active == ({*BRANCH_TERMS, "joint"} if keeps == "yes" else {"joint"})
 
 
-def test_without_the_appearance_network_stage_2_has_its_joint_term():
-    assert iterations_where("use_appearance", app=False) == []
-    assert iterations_with_joint_term(app=False) == list(range(STAGE2, END))
-
-
 def test_without_stage_2_there_is_no_joint_term():
     assert iterations_with_joint_term(stage2=False) == []
-
-
-def test_without_stage_2_networks_start_at_the_same_iterations():
-    assert iterations_where("use_appearance", stage2=False) == iterations_where("use_appearance")
-    assert iterations_where("use_deformation", stage2=False) == iterations_where("use_deformation")
-
-
-def test_the_deformation_network_is_used_from_its_iteration_of_stage_1_on():
-    assert iterations_where("use_deformation") == list(range(STAGE1 + 25, END))
-
-
-def test_the_deformation_network_is_always_used_in_stage_2():
-    assert iterations_where("use_deformation", schedule={"deform_from": 1000}) == list(range(STAGE2, END))
 
 
 def test_the_sh_degree_rises_in_steps_from_stage_1_on():
@@ -224,18 +182,6 @@ def test_noise_until_iteration_0_ends_after_one_iteration():
 def test_the_depth_weight_decays_exponentially_over_the_run():
     weights = [plan.depth_weight for plan in plans()]
     assert weights == pytest.approx([2.0 * 0.01 ** (k / END) for k in range(END)], rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("has_depth", "changes"), [(False, {}), (False, {"dap": False}), (True, {"loss": LossConfig(depth=0.0)})]
-)
-def test_without_depth_its_weight_is_zero(has_depth, changes):
-    assert iterations_where("depth_weight", has_depth, **changes) == []
-    assert iterations_where("with_depth", has_depth, **changes) == []
-
-
-def test_without_pretraining_depth_is_compared_all_the_same():
-    assert iterations_where("depth_weight", dap=False) == list(range(END))
 
 
 @pytest.mark.parametrize("end", [0.0, 2.0])
@@ -274,14 +220,18 @@ def test_the_rate_of_dynamic_positions_can_decay_from_stage_1_on_in_which_they_b
     assert means_progress("dynamic", optim=TRAINED) == pytest.approx(expected)
 
 
-def network_progress(name, **schedule):
-    return [plan.network_progress[name] for plan in plans(schedule=schedule)]
-
-
-@pytest.mark.parametrize(("name", "first"), [("deformation", STAGE1 + 25), ("appearance", STAGE1 + 35)])
-def test_the_progress_of_a_network_covers_its_iterations(name, first):
+@pytest.mark.parametrize(
+    ("name", "schedule", "first"),
+    [
+        ("deformation", {}, STAGE1 + 25),
+        ("appearance", {}, STAGE1 + 35),
+        ("deformation", {"deform_from": 1000}, STAGE2),
+        ("appearance", {"appearance_from": 1000}, STAGE2),
+    ],
+)
+def test_the_progress_of_a_network_covers_its_iterations(name, schedule, first):
     expected = [0.0] * first + [k / (END - first) for k in range(END - first)]
-    assert network_progress(name) == pytest.approx(expected)
+    assert [plan.network_progress[name] for plan in plans(schedule=schedule)] == pytest.approx(expected)
 
 
 def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_stage_1():
@@ -290,13 +240,7 @@ def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_sta
     assert not Protocol(CONFIG, has_depth=True).phase_at(STAGE1).use_deformation
 
 
-@pytest.mark.parametrize(("name", "start"), [("deformation", "deform_from"), ("appearance", "appearance_from")])
-def test_the_progress_of_a_network_that_starts_in_stage_2_covers_stage_2(name, start):
-    expected = [0.0] * STAGE2 + [k / (END - STAGE2) for k in range(END - STAGE2)]
-    assert network_progress(name, **{start: 1000}) == pytest.approx(expected)
-
-
-# What changes the Gaussians ------------------------------------------------------------------------------------------
+# What is done in which iterations ------------------------------------------------------------------------------------
 # After iteration i of a run, i + 1 − STAGE1 iterations of stage I are done.
 
 
@@ -304,71 +248,72 @@ def after(*done):
     return [STAGE1 + number - 1 for number in done]
 
 
-def test_gaussians_are_densified_at_intervals_in_a_range_of_stage_1():
-    assert iterations_where("densify") == after(20, 30, 40, 50, 60)
+DROPPING = {"model": dataclasses.replace(CONFIG.model, dropout=0.1)}
+NEEDLES = {"densify": DensifyConfig(every=50, max_elongation=10.0)}
+WEAKEST = {"densify": DensifyConfig(every=10, weakest=0.02)}
+WAITING = {"schedule": {"appearance_from": None}}
+LATE = {"schedule": {"appearance_from": 1000, "deform_from": 1000}}
+SETTLING = {"schedule": {"settle": 30}}
+OFTEN = {"schedule": {"prune_every": 10, "warmup": 20}}
+RESEED = {"densify": DensifyConfig(every=10, reseed=0.05), **OFTEN}
+NO_DEPTH = {"loss": LossConfig(depth=0.0)}
 
 
-def test_gaussians_are_not_densified_in_stage_2():
-    assert max(iterations_where("densify", schedule={"densify_until": 1000})) == STAGE2 - 1
+def last(first):
+    return list(range(first, END))
 
 
-def test_opacities_are_reset_at_intervals_before_the_last_densification():
-    assert iterations_where("reset") == after(20, 40)
+ACTIONS = {
+    "appearance: from its iteration of stage 1 on": ("use_appearance", {}, last(STAGE1 + 35)),
+    "appearance: likewise without stage 2": ("use_appearance", {"stage2": False}, last(STAGE1 + 35)),
+    "appearance: at the latest from stage 2 on": ("use_appearance", LATE, last(STAGE2)),
+    "appearance: can wait for stage 2": ("use_appearance", WAITING, last(STAGE2)),
+    "appearance: can wait for stage 2 without depth": ("use_appearance", {"has_depth": False, **WAITING}, last(STAGE2)),
+    "appearance: never without the stage 2 it waits for": ("use_appearance", {"stage2": False, **WAITING}, []),
+    "appearance: never if it is switched off": ("use_appearance", {"app": False}, []),
+    "deformation: from its iteration of stage 1 on": ("use_deformation", {}, last(STAGE1 + 25)),
+    "deformation: likewise without stage 2": ("use_deformation", {"stage2": False}, last(STAGE1 + 25)),
+    "deformation: at the latest from stage 2 on": ("use_deformation", LATE, last(STAGE2)),
+    "dropout: from stage 1 on": ("use_dropout", DROPPING, last(STAGE1)),
+    "dropout: until Gaussians settle": ("use_dropout", {**DROPPING, **SETTLING}, list(range(STAGE1, END - 30))),
+    "dropout: not unless asked to": ("use_dropout", SETTLING, []),
+    "depth weight: without pretraining, too": ("depth_weight", {"dap": False}, last(0)),
+    "depth weight: none without depth": ("depth_weight", {"has_depth": False}, []),
+    "depth weight: none without depth and pretraining": ("depth_weight", {"has_depth": False, "dap": False}, []),
+    "depth weight: none if it is zero": ("depth_weight", NO_DEPTH, []),
+    "depth: not rendered if there is none": ("with_depth", {"has_depth": False}, []),
+    "depth: not rendered without depth and pretraining": ("with_depth", {"has_depth": False, "dap": False}, []),
+    "depth: not rendered if its weight is zero": ("with_depth", NO_DEPTH, []),
+    "densify: at intervals in a range of stage 1": ("densify", {}, after(20, 30, 40, 50, 60)),
+    "densify: never in stage 2": ("densify", {"schedule": {"densify_until": 1000}}, after(*range(20, 101, 10))),
+    "reset: at intervals before the last densification": ("reset", {}, after(20, 40)),
+    "prune: at intervals and at the end of stage 1": ("prune", {}, after(30, 60, 90, 100)),
+    "prune: never if it is switched off": ("prune", {"vdp": False}, []),
+    "prune: without stage 2 not after the last iteration": ("prune", {"stage2": False}, after(30, 60, 90, 120, 150)),
+    "weakest: once densification has ended": ("prune_weakest", WEAKEST, after(60, 90, 100)),
+    "weakest: also without pruning by visibility": ("prune_weakest", {**WEAKEST, "vdp": False}, after(60, 90, 100)),
+    "weakest: without stage 2, too": ("prune_weakest", {**WEAKEST, "stage2": False}, after(60, 90, 120)),
+    "weakest: not unless asked to": ("prune_weakest", {}, []),
+    "shorten: at intervals and at the end": ("shorten", NEEDLES, [STAGE1 - 1, *after(50, 100, 150), END - 1]),
+    "shorten: not unless asked to": ("shorten", {}, []),
+    "reseed: while densifying, once the deformation has warmed up": ("reseed", RESEED, after(50)),
+    "reseed: not unless asked to": ("reseed", OFTEN, []),
+    "remove_large: only after the first reset": ("remove_large", {}, last(STAGE1 + 20)),
+    "realign: once in the pretraining": ("realign", {}, [9]),
+    "realign: at the end of a shorter pretraining": ("realign", {"schedule": {"realign_at": 500}}, [19]),
+    "realign: never without pretraining": ("realign", {"dap": False}, []),
+}
+
+
+@pytest.mark.parametrize(("name", "changes", "expected"), ACTIONS.values(), ids=ACTIONS)
+def test_iterations_do_what_the_schedule_says(name, changes, expected):
+    assert iterations_where(name, **changes) == expected
 
 
 def test_the_paper_preset_resets_opacities_every_3000_iterations_before_15000():
     made = Protocol(PRESETS["paper"], has_depth=True)
     resets = [k for k in range(1, 30_001, 100) if made.at(2_000 + k + 98).reset]
     assert [k + 99 for k in resets] == [3_000, 6_000, 9_000, 12_000]
-
-
-def test_static_gaussians_are_pruned_at_intervals_and_at_the_end_of_stage_1():
-    assert iterations_where("prune") == after(30, 60, 90, 100)
-
-
-def test_the_weakest_are_pruned_once_densification_has_ended():
-    weakest = DensifyConfig(every=10, weakest=0.02)
-    assert iterations_where("prune_weakest", densify=weakest) == after(60, 90, 100)
-    assert iterations_where("prune_weakest", densify=weakest, vdp=False) == after(60, 90, 100)
-    assert iterations_where("prune_weakest", densify=weakest, stage2=False) == after(60, 90, 120)
-    assert iterations_where("prune_weakest") == []
-
-
-def test_needles_are_shortened_at_intervals_and_at_the_end():
-    limit = DensifyConfig(every=50, max_elongation=10.0)
-    assert iterations_where("shorten", densify=limit) == [STAGE1 - 1, *after(50, 100, 150), END - 1]
-    assert iterations_where("shorten") == []
-
-
-def test_lost_objects_are_looked_for_while_densifying_once_the_deformation_network_has_warmed_up():
-    reseed, often = DensifyConfig(every=10, reseed=0.05), {"prune_every": 10, "warmup": 20}
-    assert iterations_where("reseed", densify=reseed, schedule=often) == after(50)
-    assert iterations_where("reseed", schedule=often) == []
-
-
-def test_without_visibility_driven_pruning_nothing_is_pruned():
-    assert iterations_where("prune", vdp=False) == []
-
-
-def test_without_stage_2_pruning_continues_except_after_the_last_iteration():
-    assert protocol(stage2=False).num_iterations == STAGE1 + 6 * SHORT.prune_every
-    assert iterations_where("prune", stage2=False) == after(30, 60, 90, 120, 150)
-
-
-def test_oversized_gaussians_are_removed_only_after_the_first_reset():
-    assert iterations_where("remove_large") == list(range(STAGE1 + 20, END))
-
-
-def test_depth_is_aligned_again_once_in_the_pretraining():
-    assert iterations_where("realign") == [9]
-
-
-def test_a_pretraining_shorter_than_that_aligns_depth_at_its_end():
-    assert iterations_where("realign", schedule={"realign_at": 500}) == [19]
-
-
-def test_without_pretraining_depth_is_not_aligned_again():
-    assert iterations_where("realign", dap=False) == []
 
 
 # Scaling -------------------------------------------------------------------------------------------------------------
