@@ -147,9 +147,7 @@ def test_the_size_threshold_is_relative_to_the_extent(extent, cloned):
 
 
 def test_transparent_gaussians_are_removed():
-    before, after = densified(
-        [SMALL, LARGE, SMALL], [SMALL_GRADIENT, SMALL_GRADIENT, SMALL_GRADIENT], opacities=[0.09, 0.11, 0.01]
-    )
+    before, after = densified([SMALL, LARGE, SMALL], [SMALL_GRADIENT] * 3, opacities=[0.09, 0.11, 0.01])
     assert equal(chosen(before, [1]), after)
 
 
@@ -158,16 +156,10 @@ def test_transparent_gaussians_with_large_gradients_are_removed():
     rows_in(after, 0)
 
 
-def test_oversized_gaussians_are_removed_if_requested():
-    before, after = densified(
-        [OVERSIZED, SMALL, HUGE], [SMALL_GRADIENT, SMALL_GRADIENT, SMALL_GRADIENT], remove_large=True
-    )
-    assert equal(chosen(before, [1, 2]), after)
-
-
-def test_oversized_gaussians_stay_unless_requested():
-    before, after = densified([OVERSIZED, SMALL], [SMALL_GRADIENT, SMALL_GRADIENT], remove_large=False)
-    assert equal(before, after)
+@pytest.mark.parametrize(("remove_large", "kept"), [(True, [1, 2]), (False, [0, 1, 2])])
+def test_oversized_gaussians_are_removed_if_requested(remove_large, kept):
+    before, after = densified([OVERSIZED, SMALL, HUGE], [SMALL_GRADIENT] * 3, remove_large=remove_large)
+    assert equal(chosen(before, kept), after)
 
 
 @pytest.mark.parametrize("size", [math.inf, math.nan])
@@ -252,20 +244,13 @@ def test_a_reset_clamps_opacities_to_a_hundredth():
     assert error(gaussians.opacities.detach(), given.clamp(max=0.01)) < 1e-7
 
 
-def test_a_reset_changes_opacities_only():
+def test_a_reset_changes_opacities_and_clears_their_moments_only():
     gaussians = make_gaussians([SMALL, LARGE])
     before = copies(gaussians)
     _, optimizer = make_scene(gaussians, Gaussians.empty(0))
     reset_opacities(gaussians, optimizer)
-    changed = [name for name, value in copies(gaussians).items() if not torch.equal(value, before[name])]
-    assert changed == ["logit_opacities"]
-
-
-def test_a_reset_clears_the_moments_of_opacities_only():
-    gaussians = make_gaussians([SMALL, LARGE])
-    _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    reset_opacities(gaussians, optimizer)
-    for name in PARAMETERS:
+    for name, value in copies(gaussians).items():
+        assert torch.equal(value, before[name]) == (name != "logit_opacities")
         state = optimizer.state[getattr(gaussians, name)]
         for part in ("exp_avg", "exp_avg_sq"):
             assert state[part].any() == (name != "logit_opacities")

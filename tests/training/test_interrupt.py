@@ -27,30 +27,16 @@ def press():
     signal.raise_signal(signal.SIGINT)
 
 
-def test_no_stop_is_requested_before_ctrl_c():
+def test_the_first_ctrl_c_is_only_recorded_and_all_later_ones_interrupt():
     with Interrupt() as interrupt:
         assert not interrupt.requested
-
-
-def test_the_first_ctrl_c_is_only_recorded():
-    with Interrupt() as interrupt:
         press()
         assert interrupt.requested
-
-
-def test_the_second_ctrl_c_interrupts():
-    with Interrupt():
-        press()
-        with pytest.raises(KeyboardInterrupt):
-            press()
-
-
-def test_a_third_ctrl_c_interrupts_too():
-    with Interrupt():
-        press()
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 press()
+    with Interrupt() as another:
+        assert not another.requested
 
 
 def test_sigterm_is_only_recorded_as_often_as_it_comes():
@@ -79,14 +65,6 @@ def test_the_previous_handler_is_restored_after_an_error():
         raise ValueError("wrong")
     with pytest.raises(KeyboardInterrupt):
         press()
-
-
-def test_each_context_starts_without_a_request():
-    interrupt = Interrupt()
-    with interrupt:
-        press()
-    with Interrupt() as another:
-        assert not another.requested
 
 
 # In training --------------------------------------------------------------------------------------------------------

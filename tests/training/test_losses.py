@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.reference.ssim import ssim_map
-from tests.scenes import error, generator, make_camera, make_splats, relative_error
+from tests.scenes import assert_same_gradients, error, generator, make_camera, make_splats
 from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.gaussians import Gaussians
@@ -60,6 +60,14 @@ def changed_at(image, mask):
     return torch.where(mask[..., None], 1.0 - image, image)
 
 
+def assert_same_loss(loss, expected, *arguments):
+    """Compares a loss of the image, and its gradient, with those of a function of the image in double precision."""
+    image, double = IMAGE.clone().requires_grad_(), IMAGE.double().requires_grad_()
+    ours, theirs = loss(image, *arguments), expected(double)
+    assert error(ours, theirs) < 1e-6
+    assert_same_gradients([ours], [theirs], [image], [double])
+
+
 def gradient(loss, image, *arguments):
     leaf = image.clone().requires_grad_()
     loss(leaf, *arguments).backward()
@@ -71,14 +79,7 @@ def gradient(loss, image, *arguments):
 
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_images_are_compared_by_l1_and_similarity(weight):
-    assert error(image_loss(IMAGE, TRUTH, weight), compared(IMAGE, TRUTH, weight)) < 1e-6
-
-
-@pytest.mark.parametrize("weight", WEIGHTS)
-def test_gradients_of_compared_images_are_those_of_the_reference(weight):
-    image = IMAGE.double().requires_grad_()
-    compared(image, TRUTH, weight).backward()
-    assert relative_error(gradient(image_loss, IMAGE, TRUTH, weight), image.grad) < 1e-5
+    assert_same_loss(image_loss, lambda image: compared(image, TRUTH, weight), TRUTH, weight)
 
 
 # Eq. 9 ---------------------------------------------------------------------------------------------------------------
@@ -86,15 +87,8 @@ def test_gradients_of_compared_images_are_those_of_the_reference(weight):
 
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_the_static_loss_masks_both_images(weight):
-    expected = compared(IMAGE * where(MASK), TRUTH * where(MASK), weight)
-    assert error(static_loss(IMAGE, TRUTH, MASK, weight), expected) < 1e-6
-
-
-@pytest.mark.parametrize("weight", WEIGHTS)
-def test_gradients_of_the_static_loss_are_those_of_equation_9(weight):
-    image = IMAGE.double().requires_grad_()
-    compared(image * where(MASK), TRUTH * where(MASK), weight).backward()
-    assert relative_error(gradient(static_loss, IMAGE, TRUTH, MASK, weight), image.grad) < 1e-5
+    truth = TRUTH * where(MASK)
+    assert_same_loss(static_loss, lambda image: compared(image * where(MASK), truth, weight), TRUTH, MASK, weight)
 
 
 # Eq. 12 --------------------------------------------------------------------------------------------------------------
@@ -102,15 +96,8 @@ def test_gradients_of_the_static_loss_are_those_of_equation_9(weight):
 
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_the_dynamic_loss_masks_the_ground_truth_only(weight):
-    expected = compared(IMAGE, TRUTH * where(~MASK), weight)
-    assert error(dynamic_loss(IMAGE, TRUTH, MASK, weight, BLACK), expected) < 1e-6
-
-
-@pytest.mark.parametrize("weight", WEIGHTS)
-def test_gradients_of_the_dynamic_loss_are_those_of_equation_12(weight):
-    image = IMAGE.double().requires_grad_()
-    compared(image, TRUTH * where(~MASK), weight).backward()
-    assert relative_error(gradient(dynamic_loss, IMAGE, TRUTH, MASK, weight, BLACK), image.grad) < 1e-5
+    truth = TRUTH * where(~MASK)
+    assert_same_loss(dynamic_loss, lambda image: compared(image, truth, weight), TRUTH, MASK, weight, BLACK)
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
@@ -272,39 +259,32 @@ def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_to
     assert all(parameter.isfinite().all() for parameter in scene.parameters())
 
 
+def terms_with_trust(weight, margin):
+    _, plan, step = prepared("stage1", trust=(weight, margin))
+    step(plan, Sample(0, 0.0, PURPLE, 0))
+    return step.take_means().terms
+
+
 def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
-    _, plan, step = prepared("stage1")
-    step(plan, Sample(0, 0.0, PURPLE, 0))
-    whole = step.take_means().terms
-    _, plan, step = prepared("stage1", trust=(0.25, 0.0))
-    step(plan, Sample(0, 0.0, PURPLE, 0))
-    part = step.take_means().terms
+    whole, part = terms_with_trust(1.0, 0.0), terms_with_trust(0.25, 0.0)
     for name in ("depth", "depth_dynamic"):
         assert part[name] == pytest.approx(0.25 * whole[name], rel=1e-6)
     assert part["static"] == whole["static"]
 
 
 def test_a_margin_frees_small_errors_of_the_static_depth_alone():
-    found = {}
-    for margin in (0.0, 0.2, 1e3):
-        _, plan, step = prepared("stage1", trust=(1.0, margin))
-        step(plan, Sample(0, 0.0, PURPLE, 0))
-        found[margin] = step.take_means().terms
-    assert 0.0 < found[0.2]["depth"] < found[0.0]["depth"]
-    assert found[1e3]["depth"] == 0.0
-    assert found[1e3]["depth_dynamic"] == found[0.0]["depth_dynamic"] > 0.0
+    none, small, large = (terms_with_trust(1.0, margin) for margin in (0.0, 0.2, 1e3))
+    assert 0.0 < small["depth"] < none["depth"]
+    assert large["depth"] == 0.0
+    assert large["depth_dynamic"] == none["depth_dynamic"] > 0.0
 
 
-def test_the_joint_term_compares_the_joint_image_with_the_whole_ground_truth():
-    terms, rendering = terms_of("stage2")
+@pytest.mark.parametrize("weight", [0.0, 7.0])
+def test_the_joint_and_the_squared_term_compare_the_joint_image_with_the_whole_ground_truth(weight):
+    terms, rendering = terms_of("stage2", dataclasses.replace(LOSS, squared=weight))
     assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
-
-
-def test_the_squared_term_is_the_weighted_squared_error_of_the_joint_image():
-    terms, rendering = terms_of("stage2", dataclasses.replace(LOSS, squared=7.0))
-    expected = 7.0 * (rendering.joint.image.double() - view_truth()).square().mean()
+    expected = weight * (rendering.joint.image.double() - view_truth()).square().mean()
     assert error(terms["squared"], expected) < 1e-6
-    assert error(terms["joint"], 1.1 * compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
 
 
 @pytest.mark.parametrize(("stage", "counts"), [("pretrain", False), ("stage1", True), ("stage2", True)])
