@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.model.gaussians import Gaussians
 from warpgs.model.splats import Splats
 
 WIDTH, HEIGHT = 50, 37
@@ -42,6 +43,19 @@ def make_splats(num: int = 60, seed: int = 3, channels: int | None = None, degre
         return Splats(means, quats, scales, opacities, colors=colors, is_dynamic=is_dynamic)
     sh = torch.randn(num, (degree + 1) ** 2, 3, generator=g) * 0.3
     return Splats(means, quats, scales, opacities, sh=sh, is_dynamic=is_dynamic)
+
+
+def as_gaussians(splats: Splats) -> Gaussians:
+    """The parameters of splats with spherical harmonics."""
+    values = (splats.means, splats.quats, splats.scales.log(), splats.opacities.logit())
+    return Gaussians(*values, splats.sh[:, :1].contiguous(), splats.sh[:, 1:].contiguous())
+
+
+def random_gaussians(num: int, seed: int = 3) -> Gaussians:
+    """Parameters that are normally distributed."""
+    g = generator(seed)
+    shapes = [(num, 3), (num, 4), (num, 3), (num,), (num, 1, 3), (num, 15, 3)]
+    return Gaussians(*(torch.randn(shape, generator=g) for shape in shapes))
 
 
 def float_tensors(splats: Splats) -> dict[str, Tensor]:

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from tests.reference.covariance import covariance, rotation
-from tests.scenes import error, generator, make_camera, make_splats, relative_error
+from tests.scenes import as_gaussians, error, generator, make_camera, make_splats, relative_error
 from warpgs.config import ModelConfig, RenderSettings
-from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
@@ -24,21 +23,9 @@ def model(**changes):
     return ModelConfig(position_bands=2, time_bands=2, depth=3, width=8, skip=1, sh_degree=3, **changes)
 
 
-def make_gaussians(num, seed):
-    splats = make_splats(num, seed)
-    return Gaussians(
-        splats.means,
-        splats.quats,
-        splats.scales.log(),
-        splats.opacities.logit(),
-        splats.sh[:, :1].contiguous(),
-        splats.sh[:, 1:].contiguous(),
-    )
-
-
 def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, trained=True, **changes):
     """A scene; if ``trained``, with networks whose outputs are not 0."""
-    static, dynamic = make_gaussians(num_static, 1), make_gaussians(num_dynamic, 2)
+    static, dynamic = as_gaussians(make_splats(num_static, 1)), as_gaussians(make_splats(num_dynamic, 2))
     scene = SplitScene(static, dynamic, model(**changes), torch.zeros(3), torch.full((3,), 3.0))
     if trained:
         for network in (scene.deformation, scene.appearance):

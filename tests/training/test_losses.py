@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from tests.reference.ssim import ssim_map
-from tests.scenes import assert_same_gradients, error, generator, make_camera, make_splats
+from tests.scenes import as_gaussians, assert_same_gradients, error, generator, make_camera, make_splats, select
 from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 from warpgs.training.loss_terms import TERMS
@@ -151,18 +150,12 @@ STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
 """First iteration of each stage."""
 
 
-def make_gaussians(chosen):
-    s = SPLATS
-    values = (s.means, s.quats, s.scales.log(), s.opacities.logit(), s.sh[:, :1], s.sh[:, 1:])
-    return Gaussians(*(value[chosen].contiguous() for value in values))
-
-
 def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **options):
     """A scene, the plan of an iteration of a stage, by default of the first, and a step that trains the scene."""
     frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
     capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
     config = TrainConfig(model=NETWORK, loss=loss, schedule=schedule, **options)
-    static, dynamic = make_gaussians(~SPLATS.is_dynamic), make_gaussians(SPLATS.is_dynamic)
+    static, dynamic = (as_gaussians(select(SPLATS, chosen)) for chosen in (~SPLATS.is_dynamic, SPLATS.is_dynamic))
     scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
     plan = Protocol(config, has_depth=True).at(STAGES[stage] + at)
     assert plan.phase.stage == stage

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.scenes import error, generator
+from tests.scenes import error, generator, random_gaussians
 from warpgs.config import ModelConfig, OptimConfig
-from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.model.gaussians import PARAMETERS
 from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import (
     BRANCHES,
@@ -37,15 +37,9 @@ RATES = OptimConfig(
 )
 
 
-def make_gaussians(num, seed):
-    g = generator(seed)
-    shapes = [(num, 3), (num, 4), (num, 3), (num,), (num, 1, 3), (num, 15, 3)]
-    return Gaussians(*(torch.randn(shape, generator=g) for shape in shapes))
-
-
 def make_scene(num_static=5, num_dynamic=4):
     torch.manual_seed(0)
-    static, dynamic = make_gaussians(num_static, 1), make_gaussians(num_dynamic, 2)
+    static, dynamic = random_gaussians(num_static, 1), random_gaussians(num_dynamic, 2)
     return SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
 
 
@@ -204,13 +198,6 @@ def test_training_continues_after_all_gaussians_were_removed():
     step(scene, optimizer, random_gradients(scene, 9))
     assert len(scene.dynamic) == 0
     assert optimizer.state[scene.dynamic.sh_rest]["exp_avg"].shape == (0, 15, 3)
-
-
-def test_resizing_drops_gradients():
-    scene, optimizer = trained()
-    scene.static.means.grad = torch.ones(5, 3)
-    gather(optimizer, scene.static, torch.arange(5), num_kept=5)
-    assert scene.static.means.grad is None
 
 
 def test_a_reset_sets_the_moments_of_one_parameter_to_zero():

@@ -9,7 +9,7 @@ import torch
 from tests import tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
-from tests.scenes import error, make_camera, make_splats
+from tests.scenes import as_gaussians, error, make_camera, make_splats
 from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
@@ -50,10 +50,9 @@ def in_front(depths, sizes, opacities):
 
 def random_gaussians():
     """Random positions; some Gaussians are outside all images, some are opaque."""
-    splats = make_splats()
-    logits = splats.opacities.logit()
-    logits[::7] = OPAQUE_LOGIT
-    return Gaussians(splats.means, splats.quats, splats.scales.log(), logits, splats.sh[:, :1], splats.sh[:, 1:])
+    gaussians = as_gaussians(make_splats())
+    gaussians.logit_opacities.data[::7] = OPAQUE_LOGIT
+    return gaussians
 
 
 def make_scene(static, dynamic=None):
