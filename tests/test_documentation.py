@@ -111,9 +111,14 @@ def test_there_are_commands_and_snippets():
     assert len(snippets()) >= 6
 
 
-def test_every_option_is_on_the_page_of_options(monkeypatch):
+@pytest.fixture
+def pages(monkeypatch):
+    """The module that makes the pages of the site."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+    return importlib.import_module("site_pages")
+
+
+def test_every_option_is_on_the_page_of_options(pages):
     text = pages.on_page_markdown((ROOT / "docs" / "options.md").read_text())
     assert pages.MARKER not in text
     for command in COMMANDS:
@@ -129,9 +134,7 @@ def test_every_option_is_on_the_page_of_options(monkeypatch):
     assert "| `--schedule.joint-from` | none | `0` | `0` | `0` |" in text
 
 
-def test_the_page_of_options_has_the_defaults_of_the_command_line(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_the_page_of_options_has_the_defaults_of_the_command_line(pages):
     config = training.parse(["--data", "capture"])
     options = [option for option in pages.options_of("train") if option.name != "--data"]
     assert len(options) > 90
@@ -141,16 +144,12 @@ def test_the_page_of_options_has_the_defaults_of_the_command_line(monkeypatch):
     assert (defaults["RUN"], defaults["--supersample"]) == (dataclasses.MISSING, 1)
 
 
-def test_pipes_in_the_code_of_tables_are_shown_without_the_backslash_that_github_needs(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_pipes_in_the_code_of_tables_are_shown_without_the_backslash_that_github_needs(pages):
     text = "| `--a b\\|c` | either \\| or |\n\nnot `d\\|e`"
     assert pages.on_page_markdown(text) == "| `--a b|c` | either \\| or |\n\nnot `d\\|e`"
 
 
-def test_choices_of_an_option_and_long_cells_of_a_table_have_space(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_choices_of_an_option_and_long_cells_of_a_table_have_space(pages):
     (layers,) = (option for option in pages.options_of("export") if option.name == "--layers")
     assert pages.row(layers)[0] == "`--layers {all`, `static`, `dynamic`, `apart}`"
     long = "a <b>word</b> " * 9
@@ -160,9 +159,7 @@ def test_choices_of_an_option_and_long_cells_of_a_table_have_space(monkeypatch):
     assert pages.on_page_content(number) == number
 
 
-def test_code_breaks_between_words_and_folders_and_not_inside_of_options(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_code_breaks_between_words_and_folders_and_not_inside_of_options(pages):
     text = pages.on_page_content("<p><code>train --model.sh-degree 0</code> of the-rest</p>")
     assert text == '<p><code>train <span class="option">--model.sh-degree</span> 0</code> of the-rest</p>'
     path = "warpgs/data/loaders/posed.py"
@@ -172,17 +169,13 @@ def test_code_breaks_between_words_and_folders_and_not_inside_of_options(monkeyp
     assert pages.on_page_content(f"<code>{'word ' * 9}</code>") == f'<code class="long">{"word " * 9}</code>'
 
 
-def test_placeholders_in_the_help_of_options_are_shown(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_placeholders_in_the_help_of_options_are_shown(pages):
     (out,) = (option for option in pages.options_of("train") if option.name == "--out")
     assert "runs/<capture>-<preset>" in out.text
     assert "runs/&lt;capture&gt;-&lt;preset&gt;" in pages.row(out)[2]
 
 
-def test_images_link_to_their_files(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    pages = importlib.import_module("site_pages")
+def test_images_link_to_their_files(pages):
     image = '<img alt="A scene" src="../images/a.jpg" />'
     assert pages.on_page_content(f"<p>{image}</p>") == f'<p><a href="../images/a.jpg">{image}</a></p>'
 

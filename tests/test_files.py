@@ -57,10 +57,14 @@ def test_parent_folders_are_created(tmp_path):
     assert (tmp_path / "x" / "y" / "a.txt").read_bytes() == "Tür".encode()
 
 
-def test_a_failed_write_leaves_the_old_file_and_names_it(path, monkeypatch):
+WRITERS = [(write_png, np.zeros((4, 5, 3), np.uint8)), (write_json, {"a": 1}), (write_array, np.zeros(3))]
+
+
+@pytest.mark.parametrize(("write", "values"), [(write_text, "new"), *WRITERS])
+def test_a_failed_write_leaves_the_old_file_and_names_it(path, monkeypatch, write, values):
     monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match=rf"^{path} could not be written: No space left on device$"):
-        write_text(path, "new")
+        write(path, values)
     assert path.read_bytes() == b"old"
     assert list(path.parent.iterdir()) == [path]
 
@@ -214,9 +218,6 @@ def test_numbered_files_are_removed_up_to_the_first_gap(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.b", "3.a"]
 
 
-WRITERS = [(write_png, np.zeros((4, 5, 3), np.uint8)), (write_json, {"a": 1}), (write_array, np.zeros(3))]
-
-
 def test_images_keep_their_channels_and_bit_depth(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
     grey = np.random.default_rng(0).integers(0, 65536, (4, 5), dtype=np.uint16)
@@ -243,14 +244,6 @@ def test_a_full_disk_is_reported_with_the_name_of_the_file(write, values, tmp_pa
 def test_numbers_that_are_not_finite_are_null_in_json(tmp_path):
     write_json(tmp_path / "a.json", {"a": [math.nan, 1.0], "b": math.inf, "c": -math.inf})
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": None, "c": None}
-
-
-def test_a_png_that_cannot_be_written_leaves_the_old_one(path, monkeypatch):
-    monkeypatch.setattr(os, "replace", full_disk)
-    with pytest.raises(OSError, match=rf"{path} could not be written: No space left on device$"):
-        write_png(path, np.zeros((4, 5, 3), np.uint8))
-    assert path.read_bytes() == b"old"
-    assert list(path.parent.iterdir()) == [path]
 
 
 def test_an_array_is_read_with_its_type(tmp_path):

@@ -102,17 +102,10 @@ def test_a_gaussian_in_a_corner_leaves_the_other_tiles_empty():
     assert [len(listed) for listed in lists] == [NUM] + [0] * 11
 
 
-def test_no_gaussians_make_empty_lists():
-    lists, number = binned(Projection(*(t[:0] for t in projected())))
-    assert lists == [[]] * 12
-    assert number == 0
-
-
-def test_all_gaussians_culled_make_empty_lists():
+def test_without_gaussians_or_if_all_are_culled_lists_are_empty():
     splats = projected()
-    lists, number = binned(splats._replace(radii=torch.zeros_like(splats.radii)))
-    assert lists == [[]] * 12
-    assert number == 0
+    for none in (Projection(*(t[:0] for t in splats)), splats._replace(radii=torch.zeros_like(splats.radii))):
+        assert binned(none) == ([[]] * 12, 0)
 
 
 def images_and_gradients(is_dynamic):

@@ -50,6 +50,12 @@ def run(tmp_path_factory, quickly):
 
 
 @pytest.fixture
+def capture(run):
+    """The capture of the run over white."""
+    return load_capture(Run.open(run, "cpu").config.data)
+
+
+@pytest.fixture
 def opaque(run, tmp_path):
     """A copy of the run whose capture has lost its alpha."""
     data = shutil.copytree(Run.open(run, "cpu").config.data, tmp_path / "balls")
@@ -131,16 +137,14 @@ def test_a_resumed_run_goes_on_as_it_would_have(run, tmp_path):
 
 
 @pytest.mark.parametrize("asked", ["black", "white"])
-def test_an_option_overrides_the_background_of_the_capture(run, asked):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+def test_an_option_overrides_the_background_of_the_capture(capture, asked):
     config = fitted(TrainConfig(background=asked), capture, print)
     assert config.background == asked
     assert fitted(TrainConfig(), capture, print).background == "white"
     assert (capture.over(asked).frame("train_r_000").empty is None) == (asked == "black")
 
 
-def test_exact_masks_have_no_margin(run):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+def test_exact_masks_have_no_margin(capture):
     frame = capture.frame("train_r_000")
     given = dataclasses.replace(capture, read=lambda name: frame, unmasked="masks")  # the same masks, from files
     for source, has_border in ((capture, False), (given, True)):
@@ -180,13 +184,11 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
     assert trainer.step.take_means().psnr == pytest.approx(58.9, abs=0.05)
 
 
-def test_a_trainer_refuses_a_background_that_was_not_looked_up(run, tmp_path):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+@pytest.mark.parametrize("background", ["capture", "mean"])
+def test_a_trainer_refuses_a_background_that_was_not_looked_up(capture, tmp_path, background):
     assert capture.background == "white"
-    with pytest.raises(ValueError, match='background is "capture": call fitted'):
-        Trainer(TrainConfig(device="cpu"), capture, tmp_path)
-    with pytest.raises(ValueError, match='background is "mean": call fitted'):
-        Trainer(TrainConfig(device="cpu", background="mean"), capture, tmp_path)
+    with pytest.raises(ValueError, match=f'background is "{background}": call fitted'):
+        Trainer(TrainConfig(device="cpu", background=background), capture, tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -230,14 +232,12 @@ def test_a_run_over_the_mean_resumes_as_it_would_have_gone_on(mean_run, tmp_path
     assert tiny.differences(tiny.state(copy), tiny.state(mean_run)) == []
 
 
-def test_a_capture_over_white_stays_so_where_others_get_the_mean(run):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+def test_a_capture_over_white_stays_so_where_others_get_the_mean(capture):
     assert fitted(TrainConfig(background="mean"), capture, print).background == "white"
     assert fitted(TrainConfig(background="mean"), capture.over("black"), print).background == mean_color(capture)
 
 
-def test_the_mean_of_many_frames_is_that_of_some_of_them(run, monkeypatch):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+def test_the_mean_of_many_frames_is_that_of_some_of_them(capture, monkeypatch):
     everything = mean_color(capture)
     monkeypatch.setattr(fitting, "MAX_AVERAGED", 2)
     assert mean_color(capture) != everything
@@ -254,8 +254,7 @@ def test_a_background_that_is_no_colour_is_refused(mean_run, tmp_path, color):
 @pytest.mark.parametrize(
     ("words", "expected"), [("0.1 0.2 0.3", (0.1, 0.2, 0.3)), ("1 1 1", "white"), ("0 0 0", "black")]
 )
-def test_a_background_may_be_given_in_rgb(run, words, expected):
-    capture = load_capture(Run.open(run, "cpu").config.data)
+def test_a_background_may_be_given_in_rgb(capture, words, expected):
     config = parse(["--data", "x", "--background", *words.split()])
     assert fitted(config, capture, print).background == expected
 

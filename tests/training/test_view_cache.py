@@ -52,32 +52,32 @@ def test_views_come_back_bit_for_bit(tmp_path, border, depth):
     assert size == cache.nbytes if border and depth else size < cache.nbytes
 
 
+@pytest.fixture
+def cache(tmp_path):
+    """A cache that has the first view."""
+    made = ViewCache(tmp_path, SIZES)
+    assert made.store(0, pixels(0))
+    return made
+
+
+@pytest.mark.usefixtures("cache")
 def test_the_file_has_no_name(tmp_path):
-    cache = ViewCache(tmp_path, SIZES)
-    cache.store(0, pixels(0))
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_view_that_was_never_stored_is_missing(tmp_path):
-    cache = ViewCache(tmp_path, SIZES)
-    assert cache.store(0, pixels(0))
+def test_a_view_that_was_never_stored_is_missing(cache):
     assert cache.load(1, pinned=False) is None
 
 
-def test_a_stored_view_is_only_overwritten_on_request(tmp_path):
-    cache = ViewCache(tmp_path, SIZES)
-    first, second = pixels(0), pixels(2)._replace(inverse_depth=pixels(0).inverse_depth * 2)
-    cache.store(0, first)
+def test_a_stored_view_is_only_overwritten_on_request(cache):
+    second = pixels(2)._replace(inverse_depth=pixels(0).inverse_depth * 2)
     assert cache.store(0, second)
-    assert_equal(cache.load(0, pinned=False), first)
+    assert_equal(cache.load(0, pinned=False), pixels(0))
     assert cache.store(0, second, replace=True)
     assert_equal(cache.load(0, pinned=False), second)
 
 
-def test_a_disk_that_becomes_full_keeps_what_was_stored_before(tmp_path, monkeypatch):
-    cache = ViewCache(tmp_path, SIZES)
-    cache.store(0, pixels(0))
-
+def test_a_disk_that_becomes_full_keeps_what_was_stored_before(cache, monkeypatch):
     def write(data):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -97,18 +97,14 @@ def test_a_disk_without_room_stores_nothing(tmp_path, monkeypatch):
     assert cache.load(0, pinned=False) is None
 
 
-def test_what_must_stay_free_is_kept_while_the_disk_fills(tmp_path, monkeypatch):
-    cache = ViewCache(tmp_path, SIZES)
-    cache.store(0, pixels(0))
+def test_what_must_stay_free_is_kept_while_the_disk_fills(cache, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=SPARE_BYTES))
     cache.store(1, pixels(1))
     assert cache.load(1, pinned=False) is None
     assert_equal(cache.load(0, pinned=False), pixels(0))
 
 
-def test_a_cut_file_is_an_error(tmp_path):
-    cache = ViewCache(tmp_path, SIZES)
-    cache.store(0, pixels(0))
+def test_a_cut_file_is_an_error(cache):
     cache._file.truncate(3)
     with pytest.raises(OSError, match="cannot be read"):
         cache.load(0, pinned=False)
@@ -204,10 +200,9 @@ def test_depth_that_changes_while_a_thread_reads_the_view_is_not_lost(decoder, m
     assert_equal([views._read_ahead.take(1).inverse_depth], [(2.0 * before).half()])
 
 
-def test_a_view_that_is_being_replaced_is_read_before_or_after(tmp_path):
+def test_a_view_that_is_being_replaced_is_read_before_or_after(cache):
     """Never in part, whatever the depth: one of the two has none."""
-    cache, views = ViewCache(tmp_path, SIZES), [pixels(0), pixels(0, depth=False)]
-    cache.store(0, views[0])
+    views = [pixels(0), pixels(0, depth=False)]
     with ThreadPoolExecutor(2) as pool:
         writes = [pool.submit(cache.store, 0, views[k % 2], replace=True) for k in range(200)]
         for _ in range(200):
