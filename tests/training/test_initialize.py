@@ -263,20 +263,15 @@ def test_points_outside_all_views_are_grey():
 # From masked depth ---------------------------------------------------------------------------------------------------
 
 
-def test_unprojected_pixels_project_to_their_positions_and_depths():
-    depth = 1.0 + torch.rand(HEIGHT, WIDTH, generator=generator())
-    points, _ = unproject(depth, ~static_mask(), torch.rand(HEIGHT, WIDTH, 3), CAMERA)
+def test_unprojected_pixels_project_to_their_positions_and_depths_and_keep_their_colours():
+    depth, image = 1.0 + torch.rand(HEIGHT, WIDTH, generator=generator()), torch.rand(HEIGHT, WIDTH, 3)
+    points, colors = unproject(depth, ~static_mask(), image, CAMERA)
     viewed = points.double() @ CAMERA.viewmat[:3, :3].T.double() + CAMERA.viewmat[:3, 3].double()
     pixels = viewed @ CAMERA.K.T.double()
     row, column = (~static_mask()).nonzero(as_tuple=True)
     assert error(viewed[:, 2], depth[BLOCK].flatten()) < 1e-5
     assert error(pixels[:, 0] / pixels[:, 2], column + 0.5) < 1e-4
     assert error(pixels[:, 1] / pixels[:, 2], row + 0.5) < 1e-4
-
-
-def test_unprojected_pixels_keep_their_colours():
-    image = torch.rand(HEIGHT, WIDTH, 3, generator=generator())
-    _, colors = unproject(torch.ones(HEIGHT, WIDTH), ~static_mask(), image, CAMERA)
     assert torch.equal(colors, image[BLOCK].reshape(-1, 3))
 
 
@@ -288,13 +283,15 @@ def test_pixels_without_depth_are_not_unprojected():
     assert len(points) == len(colors) == 200 - 40
 
 
-def test_dynamic_gaussians_start_in_the_dynamic_region_at_the_aligned_depth():
+def test_dynamic_gaussians_start_in_the_dynamic_region_at_the_aligned_depth_and_in_its_colour():
     gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT)
     row, column, depth, inside = CAMERA.project(gaussians.means.detach())
     assert len(gaussians) == NETWORK.dynamic_points
     assert inside.all()
     assert not static_mask()[row, column].any()
     assert error(depth, torch.full_like(depth, DEPTH)) < 5e-3  # depth is stored in half precision
+    colors = 0.5 + 0.28209479 * gaussians.sh_dc[:, 0]
+    assert error(colors, torch.tensor([1.0, 0.0, 0.0]).expand_as(colors)) < 1e-6
 
 
 def test_metric_depth_is_not_aligned():
@@ -313,12 +310,6 @@ def test_metric_depth_that_is_unknown_is_not_used():
     capture.metric_depth = True
     found = initialize.align_to_points(capture, views_of(capture))
     assert found.alignments.isnan().all()
-
-
-def test_dynamic_gaussians_have_the_colour_of_the_dynamic_region():
-    gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT)
-    colors = 0.5 + 0.28209479 * gaussians.sh_dc[:, 0]
-    assert error(colors, torch.tensor([1.0, 0.0, 0.0]).expand_as(colors)) < 1e-6
 
 
 def test_frames_without_alignment_give_no_dynamic_gaussians():
@@ -408,17 +399,21 @@ def test_the_deformation_is_fitted_to_dynamic_pixels_of_known_depth():
     means = dynamic_gaussians(capture, RECEDING, FITTED, deformation).means.detach()
     assert len(means) == NETWORK.dynamic_points
     with torch.no_grad():
-        first, last = (
-            CAMERA.project(means + deformation(means, torch.tensor([t]))[:, :3])[2].mean() for t in (0.0, 2 / 3)
-        )
-    assert error(torch.stack([first, last]), torch.tensor([2.5, 2.7])) < 0.05
+        moved = [means + deformation(means, torch.tensor([time]))[:, :3] for time in (0.0, 2 / 3)]
+    depths = torch.stack([CAMERA.project(positions)[2].mean() for positions in moved])
+    assert error(depths, torch.tensor([2.5, 2.7])) < 0.05
+
+
+def is_new(deformation):
+    """Whether it has the parameters of a new one."""
+    pairs = zip(deformation.parameters(), new_deformation().parameters(), strict=True)
+    return all(torch.equal(ours, new) for ours, new in pairs)
 
 
 def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
     deformation = new_deformation()
     dynamic_gaussians(make_capture(random_points(50)), ALIGNMENT, FITTED, deformation)
-    for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
-        assert torch.equal(ours, new)
+    assert is_new(deformation)
 
 
 def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
@@ -427,8 +422,7 @@ def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
     for fits in (False, True):
         deformation = new_deformation()
         dynamic_gaussians(capture, RECEDING, FITTED, deformation, fits)
-        pairs = zip(deformation.parameters(), new_deformation().parameters(), strict=True)
-        assert all(torch.equal(ours, new) for ours, new in pairs) != fits
+        assert is_new(deformation) != fits
 
 
 @pytest.mark.parametrize(
@@ -457,14 +451,11 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
     assert len(dynamic_gaussians(with_frames(capture, read), ALIGNMENT)) == 0
 
 
-def test_gaussians_of_unknown_depth_are_small_enough_to_be_kept():
-    gaussians = dynamic_gaussians(capture := make_capture(100.0 * random_points(50)), ALIGNMENT)
-    assert gaussians.scales.max() < CONFIG.densify.max_size * capture.extent
-
-
-def test_gaussians_of_unknown_depth_have_any_size_without_bounds():
-    gaussians = dynamic_gaussians(capture := make_capture(100.0 * random_points(50)), ALIGNMENT, UNBOUNDED)
-    assert gaussians.scales.max() > CONFIG.densify.max_size * capture.extent
+@pytest.mark.parametrize(("config", "is_bounded"), [(CONFIG, True), (UNBOUNDED, False)])
+def test_gaussians_of_unknown_depth_are_small_enough_to_be_kept_unless_sizes_are_unbounded(config, is_bounded):
+    capture = make_capture(100.0 * random_points(50))
+    max_scale = dynamic_gaussians(capture, ALIGNMENT, config).scales.max()
+    assert (max_scale < CONFIG.densify.max_size * capture.extent) == is_bounded
 
 
 def test_if_everything_is_assumed_dynamic_the_points_become_dynamic_gaussians():
@@ -544,10 +535,8 @@ def test_without_a_tolerance_every_view_is_trusted():
 
 def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
-    trust = (
-        initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03)).weight
-    )
-    assert error(trust, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
+    trust = initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03))
+    assert error(trust.weight, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
 def test_the_margin_is_a_multiple_of_the_error_of_each_view():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -67,6 +68,13 @@ def capture_of(masks, points=None, images=None, **frames) -> Capture:
 
     points = wall() if points is None else points
     return Capture("objects", cameras, list(cameras), [], points, None, read)
+
+
+def changed(capture: Capture, change: Callable[[Frame], Frame]) -> Capture:
+    """The capture with changed frames."""
+    read = capture._cached
+    capture._cached = lambda name: change(read(name))
+    return capture
 
 
 def depths_at(capture: Capture, masks) -> np.ndarray:
@@ -196,9 +204,7 @@ def test_depth_by_size_is_used_where_an_object_is_known_both_whole_and_cut_off(m
 
 
 def test_frames_without_masks_show_no_objects():
-    capture = capture_of([ball(1.0)] * NUM)
-    read = capture.read
-    capture._cached = lambda name: dataclasses.replace(read(name), static_mask=None)
+    capture = changed(capture_of([ball(1.0)] * NUM), lambda frame: dataclasses.replace(frame, static_mask=None))
     assert find_objects(capture, range(NUM)) == []
 
 
@@ -335,15 +341,13 @@ SHIFTS = 1.0 + 0.1 * np.sin(np.linspace(0.0, 2.0 * math.pi, NUM))
 
 def misplaced(masks, shifts=SHIFTS) -> Capture:
     """A ball before a wall whose depth is known and off by these factors."""
-    capture = capture_of(masks)
-    read = capture.read
 
-    def with_depth(name: str) -> Frame:
-        depth = torch.where(torch.from_numpy(masks[int(name)]), DEPTHS[int(name)] * shifts[int(name)], WALL)
-        return dataclasses.replace(read(name), inverse_depth=1.0 / depth.float())
+    def with_depth(frame: Frame) -> Frame:
+        k = int(frame.name)
+        depth = torch.where(torch.from_numpy(masks[k]), DEPTHS[k] * shifts[k], WALL)
+        return dataclasses.replace(frame, inverse_depth=1.0 / depth.float())
 
-    capture._cached = with_depth
-    return capture
+    return changed(capture_of(masks), with_depth)
 
 
 def filled(capture: Capture, error: float) -> tuple[int, np.ndarray, Views]:
@@ -376,18 +380,13 @@ def rim_of(static_mask: torch.Tensor, width: int) -> torch.Tensor:
 def blurred(monkeypatch) -> Capture:
     """A capture whose depth is half way to the wall in a rim of one pixel, as depth networks blur edges."""
     monkeypatch.setattr("warpgs.training.object_depth.RIM", 2.5 / WIDTH)
-    capture = misplaced(MASKS)
-    read = capture._cached
 
-    def with_rims(name: str) -> Frame:
-        frame = read(name)
+    def with_rims(frame: Frame) -> Frame:
         half_way = 0.5 * (frame.inverse_depth + 1.0 / WALL)
-        return dataclasses.replace(
-            frame, inverse_depth=torch.where(rim_of(frame.static_mask, 1), half_way, frame.inverse_depth)
-        )
+        depth = torch.where(rim_of(frame.static_mask, 1), half_way, frame.inverse_depth)
+        return dataclasses.replace(frame, inverse_depth=depth)
 
-    capture._cached = with_rims
-    return capture
+    return changed(misplaced(MASKS), with_rims)
 
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])

@@ -15,6 +15,7 @@ from warpgs.training import train as script
 from warpgs.training.step import Sample
 
 pytestmark = pytest.mark.usefixtures("quickly")
+ON_TWO_GPUS = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA devices")
 
 
 def config_of(data, folder, **changes):
@@ -153,8 +154,11 @@ def test_a_run_of_one_process_continues_with_two_ranks(data, tmp_path):
 # Errors --------------------------------------------------------------------------------------------------------------
 
 
-def test_a_rank_that_is_killed_ends_the_others_with_one_line(data, tmp_path):
-    assert two_ranks.start(tmp_path, two_ranks.fail_in_step, config_of(data, tmp_path), "killed") == [2, -9]
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_TWO_GPUS)])
+def test_a_rank_that_is_killed_ends_the_others_with_one_line(data, tmp_path, device):
+    """Also where its GPU waits."""
+    config = dataclasses.replace(config_of(data, tmp_path), device=device)
+    assert two_ranks.start(tmp_path, two_ranks.fail_in_step, config, "killed") == [2, -9]
     (line,) = two_ranks.errors(tmp_path, 0)
     assert line.startswith("warpgs train: another of the 2 processes ended, ")
 
@@ -197,7 +201,7 @@ def test_without_torchrun_nothing_is_shared():
 # On GPUs -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA devices")
+@ON_TWO_GPUS
 @pytest.mark.parametrize("graph", [False, True])
 def test_two_gpus_end_with_the_same_bits_and_a_run_that_opens(data, tmp_path, graph):
     config = dataclasses.replace(config_of(data, tmp_path, graph=graph), device="cuda")
@@ -206,11 +210,3 @@ def test_two_gpus_end_with_the_same_bits_and_a_run_that_opens(data, tmp_path, gr
     assert first["digest"] == second["digest"]
     assert first["iteration"] == tiny.LENGTH
     assert checkpoint.load(checkpoint.path_of(tmp_path / "run", tiny.LENGTH)).metadata.iteration == tiny.LENGTH
-
-
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="fewer than two CUDA devices")
-def test_a_rank_that_is_killed_ends_the_other_although_its_gpu_waits(data, tmp_path):
-    config = dataclasses.replace(config_of(data, tmp_path), device="cuda")
-    assert two_ranks.start(tmp_path, two_ranks.fail_in_step, config, "killed") == [2, -9]
-    (line,) = two_ranks.errors(tmp_path, 0)
-    assert line.startswith("warpgs train: another of the 2 processes ended, ")

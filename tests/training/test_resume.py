@@ -1,6 +1,7 @@
 """A resumed run continues bit for bit as if it had never stopped."""
 
 import dataclasses
+import shutil
 import signal
 import subprocess
 import sys
@@ -239,12 +240,8 @@ def test_without_an_undamaged_checkpoint_the_newest_is_refused_and_all_are_kept(
 
 def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
     killed, whole = tmp_path / "killed", tmp_path / "whole"
-    options = [
-        "--data",
-        str(data),
-        *(word for key, value in LONG.items() for word in (f"--{key}", str(value))),
-        "--out",
-    ]
+    words = [word for key, value in {"data": data, **LONG}.items() for word in (f"--{key}", str(value))]
+    options = [*words, "--out"]
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     with subprocess.Popen([sys.executable, SCRIPT, *options, str(killed)], stdout=subprocess.DEVNULL) as run:
         try:
@@ -268,25 +265,27 @@ def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
 # Checkpoints that do not fit -----------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def finished(whole, tmp_path):
+    """A copy of the run without interruption."""
+    return shutil.copytree(whole, tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     "name", ["adam.exp_avg.static.means", "adam.exp_avg_sq.dynamic.sh_dc", "gradients.total", "alignments"]
 )
-def test_state_of_another_size_is_refused_by_name(data, tmp_path, name):
-    run = tmp_path / "run"
-    tiny.train(tiny.trainer(data, run))
-    path = checkpoint.list_checkpoints(run)[-1]
+def test_state_of_another_size_is_refused_by_name(data, finished, name):
+    path = checkpoint.list_checkpoints(finished)[-1]
     loaded = checkpoint.load(path)
     checkpoint.save(path, {**loaded.tensors, name: loaded.tensors[name][:2].clone()}, loaded.metadata)
     with pytest.raises(ValueError, match=rf"{path.name} is damaged: expected {name} as "):
-        tiny.trainer(data, run).restore(checkpoint.list_checkpoints(run)[-1])
+        tiny.trainer(data, finished).restore(path)
 
 
-def test_a_capture_whose_frames_have_changed_is_refused(data, tmp_path):
-    run = tmp_path / "run"
-    tiny.train(tiny.trainer(data, run))
-    tiny.edit_metadata(checkpoint.list_checkpoints(run)[-1], lambda values: values["views"].reverse())
+def test_a_capture_whose_frames_have_changed_is_refused(data, finished):
+    tiny.edit_metadata(checkpoint.list_checkpoints(finished)[-1], lambda values: values["views"].reverse())
     with pytest.raises(ValueError, match="was trained on other frames than builtin has now"):
-        tiny.trainer(data, run).restore_newest(print)
+        tiny.trainer(data, finished).restore_newest(print)
 
 
 def test_a_run_without_a_checkpoint_starts_from_the_beginning(data, tmp_path):

@@ -205,8 +205,16 @@ def test_an_existing_run_is_not_overwritten(data, finished, refused):
     assert "is not empty" in refused("--data", data, *QUICK, "--out", finished[1])
 
 
-def test_an_unknown_option_is_an_error(refused):
-    assert "bogus" in refused("--bogus", 1)
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--bogus", 1), "bogus"),
+        (("--iterations", 1), "iterations must be a number of at least 3"),
+        (("--model.width", 0), "model.width must be a number of at least 1, got 0"),
+    ],
+)
+def test_a_wrong_option_is_refused(data, refused, option, words):
+    assert words in refused("--data", data, *QUICK, *option)
 
 
 def test_resuming_with_other_options_is_refused(finished, refused):
@@ -215,10 +223,6 @@ def test_resuming_with_other_options_is_refused(finished, refused):
 
 def test_resuming_a_folder_without_a_run_is_refused(tmp_path, refused):
     assert "is not a run folder" in refused("--resume", tmp_path)
-
-
-def test_too_few_iterations_are_refused(data, refused):
-    assert "iterations must be a number of at least 3" in refused("--data", data, *QUICK, "--iterations", 1)
 
 
 def test_ctrl_c_saves_a_checkpoint_and_tells_how_to_continue(data, tmp_path):
@@ -279,26 +283,24 @@ def test_train_returns_the_finished_run_and_prints_nothing_unless_it_is_given_a_
     assert capsys.readouterr() == ("", "")
 
 
-def test_train_logs_its_folder_and_the_metrics(config):
-    lines = []
-    warpgs.train(config, log=lines.append)
-    assert any(line.startswith("builtin (read as nerfds): 6 views, on cpu, into ") for line in lines)
-    assert any("PSNR" in line for line in lines)
+@pytest.fixture
+def only_described(monkeypatch):
+    """Runs are neither trained nor evaluated."""
+    for step in ("_train", "_evaluate"):
+        monkeypatch.setattr(script, step, Mock())
 
 
 @pytest.mark.parametrize(("preset", "is_slow"), [("best", True), ("paper", True), ("patient", False), (None, False)])
-def test_a_preset_for_a_gpu_says_so_on_the_cpu(config, preset, is_slow, monkeypatch):
-    monkeypatch.setattr(script, "_train", lambda *arguments, **options: None)
-    monkeypatch.setattr(script, "_evaluate", lambda *arguments: None)
+@pytest.mark.usefixtures("only_described")
+def test_a_preset_for_a_gpu_says_so_on_the_cpu(config, preset, is_slow):
     lines = []
     warpgs.train(dataclasses.replace(config, preset=preset), log=lines.append)
     assert any(f"the preset {preset} is for a GPU" in line for line in lines) == is_slow
 
 
 @pytest.mark.parametrize("has_half_size", [True, False])
-def test_on_the_cpu_half_the_size_is_suggested_only_if_the_capture_has_it(config, has_half_size, monkeypatch):
-    monkeypatch.setattr(script, "_train", lambda *arguments, **options: None)
-    monkeypatch.setattr(script, "_evaluate", lambda *arguments: None)
+@pytest.mark.usefixtures("only_described")
+def test_on_the_cpu_half_the_size_is_suggested_only_if_the_capture_has_it(config, has_half_size):
     for folder in ("rgb", "resized_mask") if has_half_size else ():
         shutil.copytree(config.data / folder / "1x", config.data / folder / "2x")
     lines = []
@@ -322,17 +324,14 @@ def test_without_depth_training_says_so_and_needs_no_pretraining(config, tmp_pat
     assert any("in 0 of 6 views: training without depth" in line for line in lines)
 
 
-def test_train_resumes_with_the_config_of_the_run(config):
-    warpgs.train(config)
-    assert warpgs.train(TrainConfig(resume=config.out)).config.schedule == config.schedule
-
-
-def test_a_finished_run_that_is_resumed_says_so(config):
+def test_a_training_says_what_it_does_and_that_a_run_which_is_resumed_is_finished(config):
     lines = []
     warpgs.train(config, log=lines.append)
+    assert any(line.startswith("builtin (read as nerfds): 6 views, on cpu, into ") for line in lines)
+    assert any("PSNR" in line for line in lines)
     assert not any("is finished" in line for line in lines)
     assert any(re.fullmatch(r"evaluating \d+ views", line) for line in lines)
-    warpgs.train(TrainConfig(resume=config.out), log=lines.append)
+    assert warpgs.train(TrainConfig(resume=config.out), log=lines.append).config.schedule == config.schedule
     assert f"training is finished ({tiny.LENGTH} iterations), and the run is evaluated again" in "\n".join(lines)
 
 
@@ -423,8 +422,12 @@ def test_train_raises_on_an_unfit_capture(config):
         warpgs.train(config)
 
 
-def test_a_number_on_the_command_line_is_checked_by_its_bounds(data, refused):
-    assert "model.width must be a number of at least 1, got 0" in refused("--data", data, *QUICK, "--model.width", 0)
+def described(data, folder, **changes):
+    """What a training says before its first iteration."""
+    lines = []
+    config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=folder / "run", **changes)
+    script._describe(script.make_trainer(config, lines.append), lines.append)
+    return lines
 
 
 def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp_path, monkeypatch):
@@ -436,9 +439,7 @@ def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp
         return found
 
     monkeypatch.setattr(initialize, "align_to_points", mostly_unknown)
-    lines = []
-    config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=tmp_path / "run")
-    script._describe(script.make_trainer(config, lines.append), lines.append)
+    lines = described(data, tmp_path)
     assert any(re.match(r"depth is off by \d\.\d% ", line) for line in lines)
     assert any("depth can be aligned with the sparse points in 1 of" in line for line in lines)
 
@@ -446,8 +447,6 @@ def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp
 @pytest.mark.parametrize("free", [1e15, 0])
 def test_views_that_do_not_fit_on_the_device_are_announced(data, tmp_path, monkeypatch, free):
     monkeypatch.setattr(view_cache.shutil, "disk_usage", lambda folder: types.SimpleNamespace(free=free))
-    lines = []
-    config = dataclasses.replace(PRESETS["quick"], data=data, device="cpu", out=tmp_path / "run", resident_bytes=1000)
-    script._describe(script.make_trainer(config, lines.append), lines.append)
     expected = "read from a file in" if free else "decoded in every iteration: there is no space for a file in"
+    lines = described(data, tmp_path, resident_bytes=1000)
     assert any("--resident-bytes" in line and expected in line for line in lines)

@@ -65,9 +65,10 @@ def test_views_are_resident_if_their_pixels_fit(capture):
     assert not views_of(capture, nbytes - 1).resident
 
 
-def test_resident_views_equal_those_that_are_read_on_demand(capture):
+def test_resident_views_are_those_of_training_and_equal_those_that_are_read_on_demand(capture):
     kept, read = views_of(capture), views_of(capture, resident_bytes=0)
     assert len(kept) == len(read) == len(capture.train)
+    assert capture.val
     for index in range(len(kept)):
         assert_same(kept[index], read[index])
 
@@ -106,10 +107,6 @@ def test_inverse_depth_is_stored_in_half_precision_and_stays_unknown(capture):
     else:
         assert torch.equal(view.inverse_depth.isnan(), frame.inverse_depth.isnan())
         assert torch.allclose(view.inverse_depth, frame.inverse_depth, rtol=2**-11, atol=1e-7, equal_nan=True)
-
-
-def test_evaluation_frames_are_not_training_views(capture):
-    assert len(views_of(capture)) == len(capture.train) < len(capture.train) + len(capture.val)
 
 
 @pytest.mark.parametrize(("assume", "is_static"), [("static", True), ("dynamic", False)])
