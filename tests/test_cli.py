@@ -108,10 +108,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
-        (
-            ["train", "--preset", "x"],
-            "warpgs train: --preset must be one of best, paper, patient, quick, got 'x'\n",
-        ),
+        (["train", "--preset", "x"], "warpgs train: --preset must be one of best, paper, patient, quick, got 'x'\n"),
         (["train", "--device", "x"], "warpgs train: --device must be one of cpu, cuda, got 'x'\n"),
         (
             ["render", "r", "--layers", "it's"],

@@ -86,10 +86,7 @@ def test_losses_and_their_gradients_equal_those_on_cpu():
         image, target = torch.rand(2, 70, 50, 3, generator=generator()).to(device)
         image.requires_grad_()
         depth.requires_grad_()
-        values = [
-            l1_and_ssim(image, target, 0.2, constants[3]),
-            depth_error(depth, *constants),
-        ]
+        values = [l1_and_ssim(image, target, 0.2, constants[3]), depth_error(depth, *constants)]
         sum(values).backward()
         return [t.detach().cpu() for t in (*values, image.grad, depth.grad)]
 

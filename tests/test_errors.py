@@ -111,32 +111,25 @@ def test_real_allocation_failures_are_recognized():
         assert is_out_of_memory(caught.value)
 
 
-@pytest.mark.parametrize(
-    "message",
-    [
-        "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported at some other API call",
-        "DefaultCPUAllocator: not enough memory: you tried to allocate 4096 bytes.",
-        "Failed to allocate 4096 bytes on device 'cuda:0'",
-        "OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 4096 bytes in function 'f'",
-    ],
-)
+OUT_OF_MEMORY = [
+    "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported at some other API call",
+    "DefaultCPUAllocator: not enough memory: you tried to allocate 4096 bytes.",
+    "Failed to allocate 4096 bytes on device 'cuda:0'",
+    "OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 4096 bytes in function 'f'",
+]
+OTHERS = [
+    "shapes differ",
+    "Negative strides are not supported for newly allocated arrays.",
+    "Failed to allocate 4096 bytes on device 'cuda:0':  Failed to allocate memory during graph capture because "
+    "memory pools are not enabled on device 'cuda:0'.",
+    "CUDA error: operation not permitted when stream is capturing",
+    "cannot allocate gradients of an integer tensor",
+]
+
+
+@pytest.mark.parametrize("message", OUT_OF_MEMORY + OTHERS)
 def test_messages_of_lack_of_memory_are_recognized(message):
-    assert is_out_of_memory(RuntimeError(message))
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        "shapes differ",
-        "Negative strides are not supported for newly allocated arrays.",
-        "Failed to allocate 4096 bytes on device 'cuda:0':  Failed to allocate memory during graph capture because "
-        "memory pools are not enabled on device 'cuda:0'.",
-        "CUDA error: operation not permitted when stream is capturing",
-        "cannot allocate gradients of an integer tensor",
-    ],
-)
-def test_other_errors_are_not_lack_of_memory(message):
-    assert not is_out_of_memory(RuntimeError(message))
+    assert is_out_of_memory(RuntimeError(message)) == (message in OUT_OF_MEMORY)
 
 
 def test_one_line_has_no_line_breaks():

@@ -27,14 +27,7 @@ from warpgs.training.trainer import Trainer
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
 
 MODEL = ModelConfig(
-    position_bands=2,
-    time_bands=2,
-    depth=2,
-    width=8,
-    skip=1,
-    max_static_points=50,
-    dynamic_points=20,
-    dropout=0.1,
+    position_bands=2, time_bands=2, depth=2, width=8, skip=1, max_static_points=50, dynamic_points=20, dropout=0.1
 )
 
 # Pretraining takes iterations 0 to 5, stage I 6 to 21 (densified after 9, 13 and 17, opacities reset after 14, pruned

@@ -68,16 +68,10 @@ def test_is_dynamic_marks_the_branch_of_each_gaussian():
     assert make_scene().splats(TIME).is_dynamic.tolist() == [False] * NUM_STATIC + [True] * NUM_DYNAMIC
 
 
-def test_the_geometry_of_static_gaussians_does_not_depend_on_time():
+@pytest.mark.parametrize(("part", "changing"), [(static_part, {"sh", "opacities"}), (dynamic_part, set(GEOMETRY))])
+def test_time_changes_the_appearance_of_static_gaussians_and_the_geometry_of_dynamic_ones(part, changing):
     scene = make_scene(appearance_opacity=True)
-    now, later = static_part(scene.splats(TIME)), static_part(scene.splats(LATER))
-    assert differing(now, later) == {"sh", "opacities"}
-
-
-def test_the_appearance_of_dynamic_gaussians_does_not_depend_on_time():
-    scene = make_scene(appearance_opacity=True)
-    now, later = dynamic_part(scene.splats(TIME)), dynamic_part(scene.splats(LATER))
-    assert differing(now, later) == set(GEOMETRY)
+    assert differing(part(scene.splats(TIME)), part(scene.splats(LATER))) == changing
 
 
 @pytest.mark.parametrize("sizes", [(0, 4), (4, 0), (0, 0), (1, 1)])

@@ -86,19 +86,8 @@ def test_a_profile_lists_the_kernels_of_forward_and_backward():
     with profile() as taken:
         image_and_gradients(0)
     times = taken.times()
-    names = [t.name for t in times]
-    binning = ["sort_pairs", "count_tiles", "emit_isects", "sort_pairs", "tile_ranges"]
-    assert names == [
-        "project_fwd",
-        "sh_fwd",
-        "pack",
-        *binning,
-        "composite_fwd",
-        "composite_bwd",
-        "unpack",
-        "sh_bwd",
-        "project_bwd",
-    ]
+    forward = "project_fwd sh_fwd pack sort_pairs count_tiles emit_isects sort_pairs tile_ranges composite_fwd"
+    assert [t.name for t in times] == f"{forward} composite_bwd unpack sh_bwd project_bwd".split()
     assert all(t.duration_ms > 0 for t in times)
     assert [t.start_ms for t in times] == sorted(t.start_ms for t in times)
 

@@ -350,9 +350,9 @@ def misplaced(masks, shifts=SHIFTS) -> Capture:
     return changed(capture_of(masks), with_depth)
 
 
-def filled(capture: Capture, error: float) -> tuple[int, np.ndarray, Views]:
+def filled(capture: Capture, error: float, resident_bytes: int = 1 << 30) -> tuple[int, np.ndarray, Views]:
     """The number of views changed, the depth of what moves in each view, and the views."""
-    views, alignments = views_of(capture), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
     errors = torch.full((NUM,), error)
     errors[3] = torch.inf  # a view with too few points
     count = fill_object_depth(CONFIG, capture, views, alignments, errors)
@@ -391,8 +391,8 @@ def blurred(monkeypatch) -> Capture:
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 def test_rims_of_objects_have_the_depth_further_inside(blurred, resident_bytes):
-    views, alignments = views_of(blurred, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, blurred, views, alignments, torch.full((NUM,), 0.05)) == NUM
+    count, _, views = filled(blurred, 0.05, resident_bytes)
+    assert count == NUM
     for view in views:
         depths = 1.0 / view.inverse_depth[~view.static_mask]
         assert depths.max() < 1.01 * depths.min()
@@ -465,9 +465,8 @@ def test_metric_depth_of_objects_is_kept():
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 def test_static_pixels_keep_their_depth_where_objects_are_found_in_smaller_masks(monkeypatch, resident_bytes):
     monkeypatch.setattr(objects, "MAX_SIDE", 40)
-    capture = misplaced(MASKS)
-    views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views, alignments, torch.full((NUM,), 0.15)) == NUM
+    count, _, views = filled(misplaced(MASKS), 0.15, resident_bytes)
+    assert count == NUM
     for view in views:
         assert torch.allclose(view.inverse_depth[view.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3)
 

@@ -26,14 +26,7 @@ NETWORKS = ("deformation", "appearance")
 START = dict.fromkeys(NETWORKS, 0.0)
 END = dict.fromkeys(NETWORKS, 1.0)
 RATES = OptimConfig(
-    means=0.1,
-    quats=0.2,
-    scales=0.3,
-    opacities=0.4,
-    sh_dc=0.5,
-    sh_rest=0.6,
-    networks=0.7,
-    networks_end=0.07,
+    means=0.1, quats=0.2, scales=0.3, opacities=0.4, sh_dc=0.5, sh_rest=0.6, networks=0.7, networks_end=0.07
 )
 
 
