@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.reference.encoding import encode
+from tests.reference.mlp import perceptron
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.config import ModelConfig
 from warpgs.config.presets import PRESETS
@@ -57,17 +58,11 @@ def random_means(num=9):
 
 
 def plain_trunk(parameters, means, skip, raw=True):
-    """The layers one by one in double precision; parameters are [weight, bias, weight, bias …]."""
+    """The same in double precision; parameters are [weight, bias, weight, bias …]."""
     position = encode((means.double() - CENTER.double()) / HALF_SIZE.double(), 3, raw)
     encoding = torch.cat([position, encode(TIME.double()[:, None], 2, raw).repeat(len(means), 1)], 1)
-    pairs = list(zip(parameters[::2], parameters[1::2], strict=True))
-    values = encoding
-    for number, (weight, bias) in enumerate(pairs[:-1]):
-        if number > 0 and number == skip:
-            values = torch.cat([values, encoding], 1)
-        values = (values @ weight.T + bias).clamp_min(0.0)
-    weight, bias = pairs[-1]
-    return values @ weight.T + bias
+    layers = list(zip(parameters[::2], parameters[1::2], strict=True))
+    return perceptron(encoding, layers, skip if skip < len(layers) - 1 else 0)
 
 
 def double_parameters(trunk):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.reference.adam import adam
 from tests.scenes import error, generator, random_gaussians
 from warpgs.config import ModelConfig, OptimConfig
 from warpgs.model.gaussians import PARAMETERS
@@ -84,18 +85,12 @@ def test_steps_are_those_of_adam():
     scene = make_scene()
     start = {name: p.detach().double() for name, p in scene.named_parameters()}
     optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.01))
-    first = {name: torch.zeros_like(value) for name, value in start.items()}
-    second = {name: torch.zeros_like(value) for name, value in start.items()}
-    for iteration in range(1, 5):
-        gradients = random_gradients(scene, iteration)
-        step(scene, optimizer, gradients)
-        for name, gradient in gradients.items():
-            first[name] = 0.9 * first[name] + 0.1 * gradient.double()
-            second[name] = 0.999 * second[name] + 0.001 * gradient.double() ** 2
-            unbiased = first[name] / (1 - 0.9**iteration), second[name] / (1 - 0.999**iteration)
-            start[name] -= 0.01 * unbiased[0] / (unbiased[1].sqrt() + 1e-15)
+    gradients = [random_gradients(scene, seed) for seed in range(1, 5)]
+    for named in gradients:
+        step(scene, optimizer, named)
     for name, parameter in scene.named_parameters():
-        assert error(parameter.detach(), start[name]) < 1e-6
+        expected, _, _ = adam(start[name], [named[name].double() for named in gradients], 0.01, (0.9, 0.999), 1e-15)
+        assert error(parameter.detach(), expected) < 1e-6
 
 
 def test_the_step_does_not_depend_on_the_size_of_the_gradient():
