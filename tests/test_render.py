@@ -95,44 +95,37 @@ def test_in_the_smooth_scene_every_gaussian_contributes_to_every_pixel():
     assert weights.min() > 1e-4
 
 
+def assert_gradient_predicts(value, step, settings, inputs_with):
+    """Central differences along the gradient; the step is small against the scene, large against float32.
+
+    ``inputs_with`` gives splats and camera with another value.
+    """
+
+    def loss(value):
+        rendering = render(*inputs_with(value), background(), settings)
+        return sum(output.double().square().sum() for output in outputs(rendering))
+
+    value = value.detach().clone().requires_grad_()
+    loss(value).backward()
+    direction = value.grad / value.grad.norm()
+    with torch.no_grad():
+        slope = (loss(value + step * direction) - loss(value - step * direction)) / (2 * step)
+    assert slope.item() == pytest.approx(value.grad.norm().item(), rel=1e-3)
+
+
 @pytest.mark.parametrize("branches", [False, True])
 @pytest.mark.parametrize("name", [*GEOMETRY, "sh"])
 def test_gradients_predict_the_effect_of_a_small_step(name, branches):
-    """Central differences along the gradient; the step is small against the scene, large against float32."""
     splats = as_leaves(smooth_splats())
-    settings = EVERYTHING if branches else None
-
-    def loss(scene):
-        rendering = render(scene, CAMERA, background(), settings)
-        return sum(value.double().square().sum() for value in outputs(rendering))
-
-    loss(splats).backward()
-    gradient = gradients(splats)[name]
-    value = getattr(splats, name).detach()
-    direction = gradient / gradient.norm()
+    value, settings = getattr(splats, name).detach(), EVERYTHING if branches else None
     step = 1e-2 * value.norm() / value.numel() ** 0.5
-    sides = [loss(dataclasses.replace(splats, **{name: value + sign * step * direction})) for sign in (1, -1)]
-    slope = ((sides[0] - sides[1]) / (2 * step)).item()
-    assert slope == pytest.approx(gradient.norm().item(), rel=1e-3)
+    assert_gradient_predicts(value, step, settings, lambda v: (dataclasses.replace(splats, **{name: v}), CAMERA))
 
 
-@pytest.mark.parametrize("name", ["viewmat", "K"])
-def test_the_gradient_of_the_camera_predicts_the_effect_of_a_small_step(name):
-    """Central differences along the gradient, like those above."""
-    splats = smooth_splats()
-
-    def loss(camera):
-        rendering = render(splats, camera, background(), EVERYTHING)
-        return sum(value.double().square().sum() for value in outputs(rendering))
-
-    value = getattr(CAMERA, name).clone().requires_grad_()
-    loss(dataclasses.replace(CAMERA, **{name: value})).backward()
-    direction = value.grad / value.grad.norm()
-    step = 1e-3 if name == "viewmat" else 0.05
-    with torch.no_grad():
-        cameras = [dataclasses.replace(CAMERA, **{name: value + sign * step * direction}) for sign in (1, -1)]
-        slope = (loss(cameras[0]) - loss(cameras[1])) / (2 * step)
-    assert slope.item() == pytest.approx(value.grad.norm().item(), rel=1e-3)
+@pytest.mark.parametrize(("name", "step"), [("viewmat", 1e-3), ("K", 0.05)])
+def test_the_gradient_of_the_camera_predicts_the_effect_of_a_small_step(name, step):
+    value, splats = getattr(CAMERA, name), smooth_splats()
+    assert_gradient_predicts(value, step, EVERYTHING, lambda v: (splats, dataclasses.replace(CAMERA, **{name: v})))
 
 
 @pytest.mark.parametrize("channels", [1, 5])

@@ -15,10 +15,13 @@ NUM = 150
 SIZE = (WIDTH, HEIGHT)
 
 
-def projected(num=NUM) -> Projection:
+def geometry_and_view(num=NUM) -> tuple[Geometry, View]:
     splats, camera = make_splats(num), make_camera()
-    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
-    return project(geometry, View(camera.viewmat, camera.K, *SIZE))
+    return Geometry(*(getattr(splats, name) for name in GEOMETRY)), View(camera.viewmat, camera.K, *SIZE)
+
+
+def projected(num=NUM) -> Projection:
+    return project(*geometry_and_view(num))
 
 
 def random_features(num=NUM, channels=5) -> torch.Tensor:
@@ -72,13 +75,8 @@ def test_radii_of_splats_with_a_singular_conic_become_zero():
 
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
-    splats, camera = make_splats(NUM), make_camera()
-    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
-    view, features, offsets = (
-        View(camera.viewmat, camera.K, *SIZE),
-        random_features(),
-        0.1 * random_features(channels=2),
-    )
+    geometry, view = geometry_and_view()
+    features, offsets = random_features(), 0.1 * random_features(channels=2)
     features[::7, 1] = torch.nan
     projection = project_fwd(geometry, view, 0.01, True, offsets)
     rows, order = pack(projection, features, with_depth)
@@ -91,9 +89,8 @@ def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
 @pytest.mark.parametrize("imagegrad", [False, True])
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_unpacking_and_unprojecting_at_once_gives_the_same_bits(with_depth, imagegrad):
-    splats, camera = make_splats(NUM), make_camera()
-    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
-    view = View(camera.viewmat.requires_grad_(), camera.K, *SIZE)
+    geometry, view = geometry_and_view()
+    view.viewmat.requires_grad_()
     packed, _ = project_and_pack(geometry, random_features(), view, 0.01, True, with_depth)
     v_rows = torch.randn(2, NUM, gradient_stride(packed.rows.num_channels), generator=generator())
     v_splats = unpack(packed[:2], packed.rows, v_rows, SIZE, True, imagegrad)

@@ -128,14 +128,6 @@ def test_a_run_without_a_background_stays_over_black_with_empty_pixels_to_paint(
     assert not trainer.views[0].static_mask.any()
 
 
-def test_a_resumed_run_goes_on_as_it_would_have(run, tmp_path):
-    copy = shutil.copytree(run, tmp_path / "run")
-    trainer = resumed(copy)
-    assert trainer.iteration < tiny.LENGTH
-    assert tiny.train(trainer)
-    assert tiny.differences(tiny.state(copy), tiny.state(run)) == []
-
-
 @pytest.mark.parametrize("asked", ["black", "white"])
 def test_an_option_overrides_the_background_of_the_capture(capture, asked):
     config = fitted(TrainConfig(background=asked), capture, print)
@@ -226,10 +218,14 @@ def test_the_dynamic_image_is_trained_over_black_where_the_others_are_over_the_m
     assert torch.equal(dynamic, torch.zeros(3))
 
 
-def test_a_run_over_the_mean_resumes_as_it_would_have_gone_on(mean_run, tmp_path):
-    copy = shutil.copytree(mean_run, tmp_path / "run")
-    assert tiny.train(resumed(copy))
-    assert tiny.differences(tiny.state(copy), tiny.state(mean_run)) == []
+@pytest.mark.parametrize("name", ["run", "mean_run"])
+def test_a_resumed_run_goes_on_as_it_would_have(name, request, tmp_path):
+    whole = request.getfixturevalue(name)
+    copy = shutil.copytree(whole, tmp_path / "run")
+    trainer = resumed(copy)
+    assert trainer.iteration < tiny.LENGTH
+    assert tiny.train(trainer)
+    assert tiny.differences(tiny.state(copy), tiny.state(whole)) == []
 
 
 def test_a_capture_over_white_stays_so_where_others_get_the_mean(capture):

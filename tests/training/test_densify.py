@@ -113,9 +113,8 @@ def test_children_of_a_split_are_distributed_as_their_parent():
     gaussians.gather(torch.zeros(num, dtype=torch.int64))
     parent = copies(gaussians)
     _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    densify(
-        gaussians, optimizer, torch.full((num,), LARGE_GRADIENT), CONFIG, LIMITS._replace(capacity=num), generator()
-    )
+    gradients, limits = torch.full((num,), LARGE_GRADIENT), LIMITS._replace(capacity=num)
+    densify(gaussians, optimizer, gradients, CONFIG, limits, generator())
     offsets = (gaussians.means.detach() - parent["means"][:1]).double()
     expected = covariance(parent["quats"][:1].double(), parent["log_scales"][:1].double().exp())[0]
     assert offsets.shape == (2 * num, 3)
@@ -180,9 +179,8 @@ def test_a_split_takes_the_capacity_of_one_gaussian():
 
 @pytest.mark.parametrize("capacity", [0, -3])
 def test_without_capacity_transparent_gaussians_are_still_removed(capacity):
-    before, after = densified(
-        [SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, opacities=[0.8, 0.8, 0.01], capacity=capacity
-    )
+    opacities = [0.8, 0.8, 0.01]
+    before, after = densified([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, opacities, capacity)
     assert equal(chosen(before, [0, 1]), after)
 
 
@@ -289,11 +287,9 @@ def test_shortening_no_gaussians_gives_none():
     assert len(gaussians) == 0
 
 
-def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_alone(tmp_path):
+def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_alone(data, tmp_path):
     densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5)
-    trainer = tiny.trainer(
-        tiny.write(tmp_path), tmp_path / "run", dataclasses.replace(tiny.CONFIG, densify=densify_config)
-    )
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
     needles, extent = make_gaussians([SMALL]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
     trainer._set_scene(SplitScene(needles, copy.deepcopy(needles), NETWORK, torch.zeros(3), torch.ones(3)))
@@ -303,31 +299,33 @@ def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_al
     assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
 
 
+def trained(data, folder, config):
+    """A scene after a training with a config."""
+    trainer = tiny.trainer(data, folder, config)
+    with tiny.in_haste():
+        tiny.train(trainer)
+    return trainer.scene
+
+
 @pytest.mark.parametrize("static_geometry", [True, False])
-def test_training_with_a_limit_ends_without_static_needles(tmp_path, static_geometry):
+def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, static_geometry):
     limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, max_size=1e-6)
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
     config = dataclasses.replace(tiny.CONFIG, static_geometry=static_geometry, schedule=schedule)
     elongations = []
     for densify_config in (config.densify, limit):
         folder = tmp_path / str(densify_config.max_elongation)
-        trainer = tiny.trainer(tiny.write(folder), folder / "run", dataclasses.replace(config, densify=densify_config))
-        with tiny.in_haste():
-            tiny.train(trainer)
-        axes = trainer.scene.static.scales.detach().sort(1).values
+        scene = trained(data, folder, dataclasses.replace(config, densify=densify_config))
+        axes = scene.static.scales.detach().sort(1).values
         elongations.append((axes[:, 2] / axes[:, 1]).max())
     assert elongations[0] > 1.1
     assert elongations[1] <= 1.05 * (1 + 1e-5)
 
 
 @pytest.mark.parametrize(("min_pixels", "most"), [(0, 120), (8, 120), (46, 100), (60, 76), (500, 70)])
-def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(tmp_path, min_pixels, most):
+def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(data, tmp_path, min_pixels, most):
     """The capture has 6 views of 32×24 pixels; training starts with 70 Gaussians, and the config allows 120."""
     densify_config = dataclasses.replace(tiny.CONFIG.densify, min_pixels=min_pixels, gradient=0.0, weakest=0.0)
     schedule = dataclasses.replace(tiny.SCHEDULE, densify_until=10, prune_every=100, reset_every=100)
-    config = dataclasses.replace(tiny.CONFIG, densify=densify_config, schedule=schedule)
-    trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", config)
-    with tiny.in_haste():
-        tiny.train(trainer)
-    assert len(trainer.scene.static) + len(trainer.scene.dynamic) <= most
-    assert len(trainer.scene.static) + len(trainer.scene.dynamic) > most - 10
+    scene = trained(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config, schedule=schedule))
+    assert most - 10 < len(scene.static) + len(scene.dynamic) <= most

@@ -191,8 +191,8 @@ def test_a_scene_without_static_gaussians_has_nothing_to_prune():
     assert sum(prune_invisible(scene, optimizer, CAMERAS, 3, threshold=0.1)) == 0
 
 
-def test_blend_weights_are_summed_over_the_joint_images_of_all_views(tmp_path):
-    trainer = tiny.trainer(tiny.write(tmp_path / "capture"), tmp_path / "run")
+def test_blend_weights_are_summed_over_the_joint_images_of_all_views(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
     trainer._add_dynamic_gaussians()
     scene, views = trainer.scene, trainer.views
     expected = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float64)
@@ -232,8 +232,8 @@ def test_if_no_gaussian_contributes_all_stay():
 
 
 @pytest.mark.parametrize(("removed", "lines"), [(Pruned(0, 0, 0), 0), (Pruned(1, 0, 0), 1)])
-def test_only_a_pruning_that_removes_something_is_logged(tmp_path, monkeypatch, removed, lines):
-    trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", tiny.CONFIG)
+def test_only_a_pruning_that_removes_something_is_logged(data, tmp_path, monkeypatch, removed, lines):
+    trainer = tiny.trainer(data, tmp_path)
     monkeypatch.setattr("warpgs.training.trainer.prune_invisible", lambda *_: removed)
     logger = Mock(spec=TrainingLogger)
     trainer._adapt(tiny.plan_to(trainer, "prune"), logger)
