@@ -61,6 +61,7 @@ def test_the_least_visible_gaussians_are_omitted(clouds):
     camera = scenes.camera(time=0.5)
     kept = clouds.most_visible(40, [camera])
     assert set(kept.rows.tolist()).isdisjoint(torch.where(hidden)[0].tolist())
+    assert (kept.visibility([]) == clouds.visibility([camera])[kept.rows]).all()  # which is not measured again
     assert (scenes.image(kept.at(0.5), camera) - rendered(clouds, camera)).abs().max() < 1e-4
 
 

@@ -80,12 +80,13 @@ def test_a_compressed_file_renders_close_to_the_run(run, data, tmp_path):
 
 
 def test_a_page_renders_close_to_the_run(run, data, tmp_path):
-    summary = export(run, tmp_path, format="html", keys=3, precision=4.0)
+    summary = export(run, tmp_path, format="html", keys=3)
     assert "at 3 key times" in summary
     assert "cameras of " in summary
     camera = view(data, 0.5)
-    image = scenes.image(read_page(tmp_path / "out" / "scene.html").at(0.5), camera)
-    assert scenes.psnr(image, truth(run, camera)) > 45
+    page = read_page(tmp_path / "out" / "scene.html")
+    assert scenes.psnr(scenes.image(page.at(0.5), camera), truth(run, camera)) > 38
+    assert len(set(page.static.octaves.tolist())) > 1  # from how visible they are in the training cameras
 
 
 def test_the_files_of_both_branches_hold_the_whole_scene(run, tmp_path):

@@ -258,22 +258,26 @@ FEW = make_inputs(8, size=(20, 17))
         (make_walled_inputs(16, (20, 17)), torch.arange(16) >= 12),
     ],
 )
-def test_gradients_on_screen_without_depth_are_those_of_the_images(inputs, dynamic):
+def test_gradients_on_screen_are_those_of_the_images_with_or_without_depth(inputs, dynamic):
     size = (20, 17)
-    double = leaves(inputs, torch.float64)
-    images = [
-        theirs(double, size, selected)[0] for selected in ([None] if dynamic is None else [None, ~dynamic, dynamic])
-    ]
-    v_outputs = random_like(images)
-    (expected,) = torch.autograd.grad(images, double[0], v_outputs)
+    means2d, conics, opacities, features, background, depths = leaves(inputs, torch.float64)
+    with_depth = torch.cat([features, depths[:, None]], 1), torch.cat([background, torch.zeros(1, dtype=torch.float64)])
+    images, inner = [], []
+    for selected in [depths > 0] if dynamic is None else [depths > 0, ~dynamic, dynamic]:
+        image, alpha, _ = reference((means2d, conics, depths, opacities), with_depth[0], selected, size, with_depth[1])
+        images.append(image[..., :-1])
+        inner.append(torch.where(alpha > 0, image[..., -1] / torch.where(alpha > 0, alpha, 1.0), 0.0))
+    v_images, v_depths = random_like(images), random_like(inner)
+    (of_images,) = torch.autograd.grad(images, means2d, v_images, retain_graph=True)
+    (of_depths,) = torch.autograd.grad(inner, means2d, v_depths)
 
     means2d, conics, opacities, features, background, depths = inputs
     radii = torch.full(means2d.shape, 1000, dtype=torch.int32)
-    rows, order = pack(Projection(means2d, conics, depths, opacities, radii), features, with_depth=False)
+    rows, order = pack(Projection(means2d, conics, depths, opacities, radii), features, with_depth=True)
     tiles = bin_splats(rows, order, size, None if dynamic is None else dynamic.view(torch.uint8))
     _, traversal = composite_fwd(rows, tiles, size, background, statistics=False, max_alpha=0.999)
-    v_layers = [*v_outputs, *[None] * len(images)]
-    for imagegrad in (False, True):
+    v_layers = [*v_images, *[None] * len(images), *v_depths]
+    for imagegrad, expected in ((True, of_images), (False, of_images + of_depths)):
         v_rows = composite_bwd(rows, background, traversal, v_layers, imagegrad)
         v_splats = unpack((conics, opacities), rows, v_rows, size, with_offsets=True, imagegrad=imagegrad)
         assert relative_error(v_splats.screen_offsets, expected * torch.tensor(size) / 2) < 1e-5

@@ -22,10 +22,12 @@ class Clouds:
     Attributes:
         scene: The scene, on the CPU.
         rows: Indices of the Gaussians to export, static ones first; all if None.
+        weights: Their ``visibility``, if it is known.
     """
 
     scene: TrainedScene
     rows: Int64[np.ndarray, " M"] | None = None
+    weights: Float32[np.ndarray, " M"] | None = None
 
     def at(self, time: float) -> Cloud:
         """The Gaussians at a time in [0, 1], in the same rows at every time."""
@@ -34,6 +36,8 @@ class Clouds:
 
     def visibility(self, cameras: Sequence[Camera], quiet: bool = True) -> Float32[np.ndarray, " N"]:
         """Each Gaussian's sum of blend weights in the image [px], the maximum over cameras, each at its own time."""
+        if self.weights is not None:
+            return self.weights
         settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
         largest = np.zeros(len(self.at(0.0)), np.float32)
         for camera in progress(cameras, "measuring visibility", quiet):
@@ -57,5 +61,7 @@ class Clouds:
             raise ValueError(f"expected at least 1 Gaussian to keep, got {count}")
         if len(self.at(0.0)) <= count:
             return self
-        kept = np.sort(np.argsort(-self.visibility(cameras, quiet), kind="stable")[:count])
-        return dataclasses.replace(self, rows=kept if self.rows is None else self.rows[kept])
+        weights = self.visibility(cameras, quiet)
+        kept = np.sort(np.argsort(-weights, kind="stable")[:count])
+        rows = kept if self.rows is None else self.rows[kept]
+        return dataclasses.replace(self, rows=rows, weights=weights[kept])
