@@ -139,7 +139,7 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
             stopped = True
         if code or stopped:
             board.stop()
-        # Before Ray ends, which takes seconds: whoever sent SIGTERM may soon send SIGKILL.
+        # Before Ray ends, which takes seconds: a SIGKILL may soon follow the SIGTERM.
         log(tables_text(spec, board, peers))  # before they are written: the disk may be full
         try:
             write_tables(board.out, spec, board, peers)
