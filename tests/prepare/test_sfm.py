@@ -55,6 +55,26 @@ def test_errors_come_back_with_their_kind(unsuitable, kind, tmp_path, monkeypatc
     assert type(caught.value) is kind
 
 
+def test_what_libraries_print_is_no_answer(tmp_path, monkeypatch):
+    answer(
+        monkeypatch,
+        """
+        import os
+        from warpgs.prepare import cameras, colmap
+
+        def run(job, show):
+            os.write(1, b"BLAS : Bad memory unallocation!\\n")
+            raise cameras.NoCamerasError("too dark")
+
+        colmap.run = run
+        colmap.main()
+        """,
+    )
+    with pytest.raises(NoCamerasError, match="too dark"):
+        recover_cameras(tmp_path, ["a"], tmp_path / "work", Settings())
+    assert "BLAS" in (tmp_path / "work" / sfm.LOG).read_text()
+
+
 def test_an_interrupt_ends_the_process(tmp_path, monkeypatch):
     started = []
     real = subprocess.Popen

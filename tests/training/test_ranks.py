@@ -84,7 +84,7 @@ def test_a_step_averages_gradients_and_adds_statistics_over_the_ranks(data, tmp_
 def test_a_step_is_as_much_larger_as_gsplat_and_grendel_scale_it(monkeypatch, data, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
     networks = dict.fromkeys(optimizer.NETWORKS, 0.5)
-    at = optimizer.Progress(0.5, 0.0, dict.fromkeys(optimizer.BRANCHES, 0.5), networks, networks)
+    at = optimizer.RatePlan(0.5, 0.0, dict.fromkeys(optimizer.BRANCHES, 0.5), networks, networks)
     alone = optimizer.learning_rates(tiny.CONFIG.optim, 1.0, at)
     monkeypatch.setattr(ranks, "num_ranks", lambda: 4)
     scaled = optimizer.learning_rates(tiny.CONFIG.optim, 1.0, at)

@@ -370,10 +370,11 @@ def main() -> None:
     job = Job(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_input, daemon=True).start()
     pycolmap.logging.minloglevel = 4  # errors are raised as exceptions
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # warnings that OpenBLAS prints are not answers
 
     def write(**fields: Any) -> None:
-        sys.stdout.write(json.dumps(fields) + "\n")
-        sys.stdout.flush()
+        print(json.dumps(fields), file=answers, flush=True)
 
     try:
         cameras = run(job, lambda label, done, total: write(label=label, done=done, total=total))
