@@ -260,6 +260,12 @@ def test_a_dry_run_trains_nothing(sweep, tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 4
 
 
+def test_variants_that_train_the_same_are_named(sweep, tmp_path, capsys):
+    (tmp_path / "mine.toml").write_text(f"{TOML}[variants.again]\napp = false\n")
+    assert sweep("--dry-run")[0] == 0
+    assert capsys.readouterr().err == "warning: variants with the same options, which train the same: plain, again\n"
+
+
 def test_folders_that_are_no_captures_are_named_but_not_in_the_script_of_a_dry_run(sweep, tmp_path, capsys):
     (tmp_path / "captures/broken").mkdir(parents=True)
     (tmp_path / "as").rename(tmp_path / "captures/as")

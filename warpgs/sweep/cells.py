@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -144,6 +144,14 @@ def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides:
                     )
                 cells[cell.name] = cell
     return list(cells.values())
+
+
+def equal_variants(cells: Iterable[Cell]) -> list[list[str]]:
+    """Names of those variants whose trainings are the same, in groups."""
+    groups: dict[str, list[str]] = {}
+    for cell in cells:
+        groups.setdefault(repr(dataclasses.replace(cell.config, out=None)), []).append(cell.variant)
+    return [list(names) for names in dict.fromkeys(map(tuple, groups.values())) if len(names) > 1]
 
 
 def _cell(

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from warpgs.files import kept_if_used, read_json, write_json
 from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board
-from .cells import Cell, as_evaluated_before, find_scenes, is_started, parse_evaluation, plan_cells
+from .cells import Cell, as_evaluated_before, equal_variants, find_scenes, is_started, parse_evaluation, plan_cells
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
@@ -59,8 +59,8 @@ def run_sweep(options: Sweep, log: Log) -> int:
         for cell in plan_cells(spec, scenes, out, overrides)
     ]
     peers = read_peers(options.compare) if options.compare else {}
-    if unknown := sorted({scene for numbers in peers.values() for scene in numbers} - {*scenes, ALL_SCENES}):
-        warn(f"warning: {options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}")
+    for warning in _warnings(options, cells, peers, scenes):
+        warn(f"warning: {warning}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
@@ -75,6 +75,14 @@ def run_sweep(options: Sweep, log: Log) -> int:
                 locate(lpips, net)  # reports a wrong folder now, not in every cell
         _write_index(out, cells, known)
         return _run(options, spec, board, peers, log)
+
+
+def _warnings(options: Sweep, cells: list[Cell], peers: Peers, scenes: Mapping[str, str]) -> Iterator[str]:
+    """What is probably not meant, though it can run."""
+    if unknown := sorted({scene for numbers in peers.values() for scene in numbers} - {*scenes, ALL_SCENES}):
+        yield f"{options.compare}: the sweep has no capture {', '.join(unknown)}, only {', '.join(scenes)}"
+    for names in equal_variants(cells):
+        yield f"variants with the same options, which train the same: {', '.join(names)}"
 
 
 def _spec(options: Sweep) -> SweepSpec:
