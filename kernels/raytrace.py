@@ -89,27 +89,6 @@ def hit_cube(o: wp.vec3, d: wp.vec3) -> float:
 
 
 @wp.func
-def hit_torus(o: wp.vec3, d: wp.vec3) -> float:
-    # Only the part of the ray inside the bounding sphere of the torus is traced.
-    a = wp.dot(d, d)
-    b = wp.dot(o, d)
-    root = b * b - a * (wp.dot(o, o) - (1.0 + TUBE) * (1.0 + TUBE))
-    if root < 0.0:
-        return FAR
-    t = wp.max((-b - wp.sqrt(root)) / a, 0.0)
-    leave = (-b + wp.sqrt(root)) / a
-    speed = wp.sqrt(a)
-    for _step in range(MAX_TRACING_STEPS):
-        if t > leave:
-            return FAR
-        distance = torus_distance(o + t * d)
-        if distance < HIT_DISTANCE:
-            return t
-        t += distance / speed
-    return FAR
-
-
-@wp.func
 def blob_distance(p: wp.vec3, bulge: float) -> float:
     radius = wp.sqrt(wp.dot(p, p))
     lobes = p[0] * (p[0] * p[0] - 3.0 * p[1] * p[1])
@@ -117,8 +96,13 @@ def blob_distance(p: wp.vec3, bulge: float) -> float:
 
 
 @wp.func
-def hit_blob(o: wp.vec3, d: wp.vec3, bulge: float) -> float:
-    reach = 1.0 + wp.abs(bulge)
+def hit_by_tracing(shape: int, bulge: float, o: wp.vec3, d: wp.vec3) -> float:
+    """Sphere tracing of a torus or a blob, of the part of the ray inside its bounding sphere."""
+    reach = 1.0 + TUBE
+    pace = float(1.0)
+    if shape == BLOB:
+        reach = 1.0 + wp.abs(bulge)
+        pace = 0.5
     a = wp.dot(d, d)
     b = wp.dot(o, d)
     root = b * b - a * (wp.dot(o, o) - reach * reach)
@@ -130,10 +114,14 @@ def hit_blob(o: wp.vec3, d: wp.vec3, bulge: float) -> float:
     for _step in range(MAX_TRACING_STEPS):
         if t > leave:
             return FAR
-        distance = blob_distance(o + t * d, bulge)
+        distance = float(0.0)
+        if shape == BLOB:
+            distance = blob_distance(o + t * d, bulge)
+        else:
+            distance = torus_distance(o + t * d)
         if distance < HIT_DISTANCE:
             return t
-        t += 0.5 * distance / speed
+        t += pace * distance / speed
     return FAR
 
 
@@ -152,9 +140,7 @@ def hit_body(shape: int, bulge: float, o: wp.vec3, d: wp.vec3) -> float:
         return hit_sphere(o, d)
     if shape == CUBE:
         return hit_cube(o, d)
-    if shape == BLOB:
-        return hit_blob(o, d, bulge)
-    return hit_torus(o, d)
+    return hit_by_tracing(shape, bulge, o, d)
 
 
 @wp.func
