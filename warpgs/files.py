@@ -218,10 +218,7 @@ def write_array(path: Path, values: Shaped[np.ndarray, "..."]) -> None:
 def require_file(path: Path, max_bytes: int, hint: str = "") -> int:
     """Checks a file before a library opens it by its path: a FIFO would never open, and a device never end.
 
-    Args:
-        path: The file.
-        max_bytes: Its maximum size.
-        hint: Why the file is needed, for the message if it is missing.
+    The message about a missing file says by ``hint`` why it is needed.
 
     Returns:
         The size of the file [bytes].

@@ -26,10 +26,7 @@ def lower_priority(niceness: int) -> None:
 
 
 def end_with_parent(parent: int) -> bool:
-    """Lets this process be killed when its parent dies, on Linux.
-
-    Args:
-        parent: Process id of the parent.
+    """Lets this process be killed when its parent, given by its process id, dies, on Linux.
 
     Returns:
         Whether the parent was still alive.

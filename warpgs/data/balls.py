@@ -80,10 +80,7 @@ def _balls(time: float, size: BallsSize) -> list[Body]:
 def trace(time: float, position: Float[np.ndarray, "3"], size: BallsSize) -> tuple[Camera, UInt8[np.ndarray, "H W 4"]]:
     """Camera and RGBA image of a frame; colours are not multiplied by alpha.
 
-    Args:
-        time: Time in [0, 1].
-        position: Of the camera [world units].
-        size: Size of the capture.
+    The time is in [0, 1], the position in world units.
     """
     cpu, side = torch.device("cpu"), size.side * SUPERSAMPLING
     focal = 0.5 * side / math.tan(0.5 * ANGLE)

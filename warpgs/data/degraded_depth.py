@@ -19,11 +19,7 @@ BLUR = (0.0545, 0.2442, 0.4026, 0.2442, 0.0545)
 
 
 class DegradedDepth:
-    """Errors of a sequence of frames; always the same ones, and the same bits on every machine.
-
-    Args:
-        num_frames: Number of frames.
-    """
+    """Errors of a sequence of frames; always the same ones, and the same bits on every machine."""
 
     def __init__(self, num_frames: int) -> None:
         random = np.random.default_rng(0)
@@ -38,10 +34,7 @@ class DegradedDepth:
     ) -> UInt16[np.ndarray, "H W"]:
         """Inverse depth of frame ``k`` with errors, as 16 bits.
 
-        Args:
-            k: Index of the frame.
-            inverse: Exact inverse depth, up to scale and offset, in [0, 65535].
-            dynamic: What moves.
+        ``inverse`` is exact, up to scale and offset, in [0, 65535].
         """
         index, fraction = divmod(k / DRIFT_FRAMES, 1.0)
         slow = (1.0 - fraction) * self._slow[int(index)] + fraction * self._slow[int(index) + 1]

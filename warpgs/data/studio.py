@@ -122,10 +122,7 @@ def _camera(time: float, shift: float, size: StudioSize) -> Camera:
 def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
     """Image [H, W, 3], depth [H, W] in world units and static mask [H, W] of a frame.
 
-    Args:
-        time: Time in [0, 1].
-        shift: Distance of the camera to the right of the training camera [world units].
-        size: Size of the capture.
+    The time is in [0, 1], and the camera ``shift`` [world units] to the right of the training camera.
     """
     cpu = torch.device("cpu")  # a GPU rounds otherwise
     static = _static_bodies()

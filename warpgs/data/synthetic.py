@@ -101,11 +101,7 @@ def trace(
 ) -> tuple[Camera, Float[Tensor, "H W 3"], Float[Tensor, "H W"], Int32[Tensor, "H W"]]:
     """Camera, image, depth and body index of a frame in world units, on the CPU.
 
-    Args:
-        time: Time in [0, 1].
-        shift: Distance of the camera to the right of the training camera [world units].
-        scene: Size of the capture.
-        device: Device to trace on.
+    The time is in [0, 1], and the camera ``shift`` [world units] to the right of the training camera.
     """
     camera = _camera(time, scene, shift)
     bodies = as_tensors([*_static_bodies(), *_moving_bodies(time)], device)

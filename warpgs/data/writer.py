@@ -115,11 +115,7 @@ def write_points(root: Path, points: Float[np.ndarray, "P 3"], colors: UInt8[np.
 
 
 def held_out(names: Sequence[str], holdout: int) -> list[str]:
-    """The frames kept for evaluation: every N-th, from the middle of the first N on.
-
-    Args:
-        names: All frames, in temporal order.
-        holdout: N, or 0 for none.
+    """The frames kept for evaluation: every N-th in time, from the middle of the first N on; none if N is 0.
 
     Raises:
         ValueError: If N is negative or 1, or keeps none of the frames.

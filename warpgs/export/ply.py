@@ -30,13 +30,7 @@ def write_ply(path: Path, tables: Mapping[str, np.ndarray], comments: Sequence[s
 
 
 def column(path: Path, table: np.ndarray, name: str, kind: str = "f") -> np.ndarray:
-    """A column of a table.
-
-    Args:
-        path: The file, for messages.
-        table: Table of the file.
-        name: Name of the property.
-        kind: NumPy's letter for the kind of type expected, "f" for floats or "u" for unsigned integers.
+    """A column of a table, of a kind of NumPy's: "f" for floats or "u" for unsigned integers.
 
     Raises:
         ValueError: If the column is missing or has another type; the message names the file.

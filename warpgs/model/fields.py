@@ -27,9 +27,7 @@ returns [N, 10] offsets: of positions (3), of rotations as an addition to the un
 def make_deformation(config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> nn.Module:
     """The deformation model that ``config.deformation`` names.
 
-    Args:
-        config: Name and sizes.
-        center, half_size: [3] box of the scene.
+    Positions are in the box ``center`` ± ``half_size``, [3] each.
 
     Raises:
         ValueError: If there is no deformation model of this name.

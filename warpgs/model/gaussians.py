@@ -93,12 +93,9 @@ class Gaussians(nn.Module):
 
     @torch.no_grad()
     def gather(self, parents: Int64[Tensor, " M"]) -> None:
-        """Replaces the Gaussians by copies of ``parents``.
+        """Replaces the Gaussians by copies of ``parents``, which are [M] indices.
 
         Gradients are dropped. ``training.optimizer.gather`` also updates the optimizer's state.
-
-        Args:
-            parents: [M] indices of Gaussians.
         """
         for parameter in self.parameters():
             parameter.data = parameter.data[parents]

@@ -14,10 +14,7 @@ class Trunk(nn.Module):
     The last layer, the head, is initialized to zero, so that a network starts as "no change"; the other layers are
     initialized as ``nn.Linear`` does.
 
-    Args:
-        config: Sizes.
-        center, half_size: [3] box of the scene.
-        outputs: Number of output channels.
+    Positions are in the box ``center`` ± ``half_size``, [3] each.
 
     Attributes:
         center, half_size: [3] box that positions are normalized by, to about [-1, 1].

@@ -32,10 +32,7 @@ def predict(
 ) -> list[Float[np.ndarray, "H W"]]:
     """[H, W] inverse depth of each image, each with its own scale and offset.
 
-    Args:
-        images: [H, W, 3].
-        weights: Folder with the network's weights; those of metric depth can be used as well.
-        quiet: Whether to show no progress.
+    ``weights`` is a folder of the network; those of metric depth can be used as well.
 
     Raises:
         ValueError: If the weights are damaged.

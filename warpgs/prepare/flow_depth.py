@@ -33,10 +33,7 @@ def static_depth(
 ) -> list[Float[np.ndarray, "H W"]]:
     """[H, W] inverse depth of every frame in the units of the poses; NaN where dynamic or not known well.
 
-    Args:
-        frames: At working size.
-        dynamic: [H, W] dynamic mask of each frame.
-        quiet: Whether to show no progress.
+    The frames have their working size, and a dynamic mask each.
     """
     height, width = frames.images[0].shape[:2]
     frames, indices = frames.halved, range(len(frames.images))  # flow tells no more at full size

@@ -105,12 +105,7 @@ def take_frames(
 ) -> Frames:
     """Writes the selected frames of a video or a folder as PNG, and frames.json, which lists them.
 
-    Args:
-        source: Video or folder of images.
-        folder: Folder to write to.
-        selection: Frames to take.
-        quiet: Whether to show no progress.
-        notes: Messages for the user are appended to it.
+    Messages for the user are appended to ``notes``.
 
     Raises:
         ValueError: If the source is missing, is not a video or folder of images, or has too few or different frames.

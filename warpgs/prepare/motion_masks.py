@@ -156,12 +156,7 @@ def _isotropy(dx: np.ndarray, dy: np.ndarray) -> Float[np.ndarray, "H W"]:
 
 
 def find_dynamic(frames: PosedFrames, quiet: bool = True) -> list[Bool[np.ndarray, "H W"]]:
-    """[H, W] true where each frame is dynamic.
-
-    Args:
-        frames: At working size.
-        quiet: Whether to show no progress.
-    """
+    """[H, W] true where each frame, of working size, is dynamic."""
     images, indices = brighten(frames.images), range(len(frames.images))
     small = frames.halved  # flow tells no more at full size
     flows = Flows(brighten(small.images), small.expected_flow)

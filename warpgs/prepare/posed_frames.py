@@ -155,14 +155,7 @@ class PosedFrames:
 
 
 def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: float = math.inf) -> PosedFrames:
-    """The frames of the cameras, resized so that the longer side has ``side`` pixels.
-
-    Args:
-        folder: Folder of the images <name>.png.
-        cameras: Cameras of these images in full size.
-        side: Longer side [px].
-        max_factor: Maximum enlargement.
-    """
+    """The frames <folder>/<name>.png of cameras in full size, resized to a longer side of ``side`` pixels."""
     images = [resize_to_side(image, side, max_factor) for image in read_images(folder, cameras.names)]
     height, width = images[0].shape[:2]
     return PosedFrames(images, cameras.lens.resized(width, height), cameras.poses, cameras.points)

@@ -56,12 +56,7 @@ class Settings:
 def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settings, quiet: bool = True) -> Cameras:
     """The cameras of the frames <folder>/<name>.png.
 
-    Args:
-        folder: Folder of the frames.
-        names: Names of the frames.
-        work: Folder for COLMAP's files; features and matches in it are used again.
-        settings: How to recover cameras.
-        quiet: Whether to show no progress.
+    ``work`` is for COLMAP's files; features and matches in it are used again.
 
     Raises:
         NoCamerasError: If the frames are not suitable; the message says why and what to try.

@@ -29,14 +29,7 @@ def color_of(index: int) -> str:
 
 
 def chart(title: str, x_name: str, series: Sequence[Series], dots: bool = False) -> str:
-    """A chart as an SVG element; an empty string if no curve has a point.
-
-    Args:
-        title: Title above the chart.
-        x_name: Label of the x axis.
-        series: The curves.
-        dots: Whether to mark the points.
-    """
+    """A chart as an SVG element; an empty string if no curve has a point."""
     curves = [Series(s.name, s.color, _averaged(s.points)) for s in series if s.points]
     if not curves:
         return ""

@@ -233,10 +233,7 @@ def restore_newest(run: Path, restore: Callable[[Path], None], log: Callable[[st
 
     Damaged ones that are newer are renamed, with a warning.
 
-    Args:
-        run: Run folder.
-        restore: Restores a checkpoint; raises DamagedCheckpointError if it is damaged.
-        log: Receives the warnings.
+    ``restore`` raises DamagedCheckpointError if the checkpoint is damaged.
 
     Raises:
         DamagedCheckpointError: If all are damaged.

@@ -94,13 +94,7 @@ _loaded: set[tuple[wp.Module, str, int]] = set()
 
 
 def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
-    """Loads the module of a kernel; what is damaged in its folder of the cache is compiled again, with a warning.
-
-    Args:
-        kernel: A kernel of the module.
-        device: Device that it is loaded on.
-        block_dim: Threads per CUDA block.
-    """
+    """Loads the module of a kernel; what is damaged in its folder of the cache is compiled again, with a warning."""
     key = kernel.module, device.alias, 1 if device.is_cpu else block_dim  # as in wp.launch
     if key in _loaded:
         return

@@ -33,10 +33,7 @@ ORDER = ("running", "failed", "retried", "lost", "queued", "stopped", "finished"
 class Board:
     """Cells and what happens to them; a context that shows a live table if stdout is a terminal.
 
-    Args:
-        out: Folder of the sweep.
-        cells: Its cells.
-        log: Receives a line for each event if stdout is not a terminal.
+    If stdout is no terminal, ``log`` receives a line for each event.
 
     Attributes:
         metrics: Results by name of the cell, of those that have finished, also if they are to be evaluated again.

@@ -121,11 +121,7 @@ def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
 def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides: Mapping[str, Any]) -> list[Cell]:
     """Every cell of a sweep: variants within captures within seeds, so that whole tables come first.
 
-    Args:
-        spec: The sweep.
-        scenes: Captures by name.
-        out: Folder of the sweep.
-        overrides: Options of every training that precede those of the file.
+    Options of every training in ``overrides`` precede those of the file.
 
     Raises:
         ValueError: If options do not fit together, or two cells have one name; the message names what is wrong.

@@ -24,12 +24,7 @@ REASON = "a sweep's report renders nothing"
 def write_page(path: Path, title: str, tables: Sequence[Table], notes: Sequence[str], cells: Sequence[Cell]) -> None:
     """Writes the report.
 
-    Args:
-        path: The file.
-        title: Title of the sweep.
-        tables: Its tables.
-        notes: Paragraphs below the tables.
-        cells: Finished cells to show with curves and images.
+    Below the tables are the notes, a paragraph each, then curves and images of finished cells.
 
     Raises:
         ValueError: If results of a cell are damaged.

@@ -39,10 +39,6 @@ Log = Callable[[str], None]
 def run_sweep(options: Sweep, log: Log) -> int:
     """Trains what is missing, then prints and writes the tables; returns the exit code.
 
-    Args:
-        options: Options of the command.
-        log: Receives lines for the user.
-
     Raises:
         ValueError: If options, the sweep's file or the plan are wrong, or the folder holds another sweep's results.
         ImportError: If Ray is not installed.

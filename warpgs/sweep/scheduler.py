@@ -77,11 +77,7 @@ class Event(NamedTuple):
 def run_jobs(pool: Pool, jobs: Iterable[Job], on_event: Callable[[Event], None], on_poll: Callable[[], None]) -> None:
     """Runs jobs until each has finished or was given up.
 
-    Args:
-        pool: Where they run.
-        jobs: The jobs.
-        on_event: Called when an attempt at a cell has ended.
-        on_poll: Called about twice a second.
+    ``on_event`` is called when an attempt at a cell has ended, ``on_poll`` about twice a second.
 
     Raises:
         KeyboardInterrupt: After Ctrl-C or SIGTERM; by then the pool has stopped, and unfinished cells can be continued.

@@ -49,14 +49,7 @@ class Status(NamedTuple):
 
 
 class TrainingLogger:
-    """A context that shows progress and writes TensorBoard events.
-
-    Args:
-        folder: Folder of the events; None: without events.
-        num_iterations: Length of the run.
-        first_iteration: Iterations done before this session.
-        quiet: Whether to show nothing.
-    """
+    """A context that shows progress and writes TensorBoard events, unless ``folder`` is None."""
 
     def __init__(self, folder: Path | None, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
         self._console = Console(quiet=quiet)

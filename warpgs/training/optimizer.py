@@ -185,13 +185,7 @@ def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], 
 
 @torch.no_grad()
 def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
-    """Appends Gaussians, whose moments start at 0.
-
-    Args:
-        optimizer: From ``make_optimizer``.
-        gaussians: Changed in place.
-        added: Gaussians of the same degree of spherical harmonics, from any device.
-    """
+    """Appends Gaussians, of the same degree of spherical harmonics and from any device; their moments start at 0."""
     gaussians.append(added)
     for name, parameter in gaussians.named_parameters():
         state = optimizer.state.get(parameter, {})

@@ -54,11 +54,7 @@ def visibility(
     "Rendered" means that it changes a pixel of the static image. α is that of w⁰, without residuals of the appearance
     network.
 
-    Args:
-        scene: The scene.
-        cameras: Cameras on the scene's device.
-        sh_degree: Maximum degree of spherical harmonics in use.
-        settings: How images are rendered.
+    The cameras are on the scene's device.
     """
     static, settings = scene.static, replace(settings, statistics=True)
     splats = scene.static_splats(sh_degree)

@@ -30,13 +30,7 @@ MAX_INVERSION_ERROR = 0.01
 
 
 def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Callable[[View], Bool[Tensor, "H W"]]:
-    """The function that finds the pixels of a view that are dynamic, and that no dynamic Gaussian shows.
-
-    Args:
-        scene: The scene.
-        phase: Says which networks and which degree of spherical harmonics are in use.
-        settings: How images are rendered.
-    """
+    """The function that finds the pixels of a view that are dynamic, and that no dynamic Gaussian shows."""
     settings = replace(settings, branches=True)
 
     @torch.no_grad()

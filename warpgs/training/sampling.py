@@ -23,10 +23,7 @@ class Sampler:
 
     Every epoch visits each view once, in a new order; the ranks take its views in turn.
 
-    Args:
-        seed: Of the run.
-        num_views: Number of training views.
-        black: Whether the background is black instead of random.
+    The background is random unless ``black``.
     """
 
     def __init__(self, seed: int, num_views: int, black: bool) -> None:

@@ -134,9 +134,6 @@ class Slot:
     On CUDA a view is copied twice: on a stream of its own from the host, while the previous step runs, and then on
     the device to where the graph of a step reads it, in microseconds. So the host is at most one step ahead.
 
-    Args:
-        device: The device.
-
     Attributes:
         view: The view that was filled in last.
     """

@@ -371,9 +371,6 @@ class Trainer:
         Damaged ones are renamed, with a warning, and the one before them is restored. Rank 0 decides which; the others
         read the same file.
 
-        Args:
-            log: Receives the warnings.
-
         Raises:
             ValueError: If all are damaged, or the newest that is not is of another config or capture.
         """

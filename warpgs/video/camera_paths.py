@@ -108,10 +108,7 @@ def upward(capture: Capture) -> Float[Tensor, "3"]:
 def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
     """A camera that sees most of a scene, with y pointing down.
 
-    Args:
-        sphere: Bounding sphere of the scene.
-        side: Direction from the center of the scene to the camera, in x and z.
-        time: Time in [0, 1].
+    The direction from the center of the scene to the camera has ``side`` as its x and z.
     """
     position = sphere.center + DEFAULT_DISTANCE * sphere.radius * torch.tensor([side[0], 0.0, side[1]])
     focal = DEFAULT_FOCAL * DEFAULT_SIZE[1]

@@ -31,13 +31,9 @@ class BrowserCamera(NamedTuple):
 
 
 def through_training_camera(training: TrainingCameras, index: int, aspect: float = math.inf) -> BrowserCamera:
-    """A training camera without its roll.
+    """A training camera without its roll, in a canvas with an aspect of width over height.
 
-    Args:
-        training: The training cameras.
-        index: Index of the camera.
-        aspect: Width over height of the canvas. In a canvas that is narrower than the camera's image, the field of view
-            is wide enough to show the whole image.
+    In a canvas that is narrower than its image, the field of view is wide enough to show the whole image.
     """
     view = training.views[index]
     half_height = max(1.0, view.aspect / aspect) * math.tan(0.5 * view.pose.fov)

@@ -63,14 +63,7 @@ LAYERS: dict[str, Callable[[Splats, Camera, RenderSettings], Image]] = {
 
 @torch.no_grad()
 def render_layer(name: str, splats: Splats, camera: Camera, settings: RenderSettings = DEFAULTS) -> Image:
-    """An 8-bit RGB image of a layer.
-
-    Args:
-        name: Key of ``LAYERS``.
-        splats: The Gaussians at the time to show.
-        camera: The camera, on any device.
-        settings: How images are rendered.
-    """
+    """An 8-bit RGB image of the layer with a name in ``LAYERS``; the camera may be on any device."""
     return LAYERS[name](splats, camera.to(splats.means.device), settings)
 
 

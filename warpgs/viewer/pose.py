@@ -26,12 +26,7 @@ class Pose(NamedTuple):
 
 
 def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
-    """The camera of a pose, with the principal point in the middle of the image.
-
-    Args:
-        pose: The pose.
-        size: (width, height) of the image [px].
-        time: Time in [0, 1].
+    """The camera of a pose, with the principal point in the middle of an image of (width, height) [px].
 
     Raises:
         ValueError: If the pose is not finite, its rotation is zero or its field of view is not in (0, π).

@@ -23,11 +23,6 @@ NICENESS = 10
 def serve(options: View, report: Callable[[str], None], warn: Callable[[str], None]) -> None:
     """Serves a run until Ctrl-C.
 
-    Args:
-        options: Options of the command.
-        report: Shows a line of output.
-        warn: Shows a warning.
-
     Raises:
         ImportError: If viser is not installed.
         ValueError: If the run cannot be shown.

@@ -102,12 +102,7 @@ def _described(state: preview.State) -> str:
 
 
 def open_source(folder: Path, device: Device | None, follow: bool) -> Source:
-    """The source of a run folder.
-
-    Args:
-        folder: Run folder.
-        device: Device to render on; CUDA if None and there is a GPU.
-        follow: Whether to follow newer checkpoints.
+    """The source of a run folder, rendered on CUDA if ``device`` is None and there is a GPU.
 
     Raises:
         ValueError: If the folder is not a run folder, is damaged, has no checkpoint, or there is no such device.

@@ -52,13 +52,7 @@ class NerfiesLoader(ABC):
     def recognizes(self, root: Path) -> bool: ...
 
     def split(self, root: Path, dataset: dict[str, Any], metadata: dict[str, Any]) -> Split:
-        """train_ids and val_ids of dataset.json.
-
-        Args:
-            root: Folder of the capture.
-            dataset: Content of dataset.json.
-            metadata: Content of metadata.json.
-        """
+        """train_ids and val_ids of dataset.json."""
         path = root / "dataset.json"
         return Split(path, read_ids(path, dataset, "train_ids"), read_ids(path, dataset, "val_ids"))
 
@@ -114,11 +108,6 @@ def _has_estimated_masks(path: Path, dataset: dict[str, Any]) -> bool:
 
 def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
     """The list of frame ids under ``key``; empty if there is none.
-
-    Args:
-        path: The file that ``values`` come from, for messages.
-        values: Content of the file.
-        key: Key of the list.
 
     Raises:
         ValueError: If it is not a list of distinct names without slashes.
