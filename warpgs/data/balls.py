@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.files import write_json, write_png
 from warpgs.ops.raytrace import SPHERE, raytrace
+from warpgs.visualize.images import averaged, to_bytes
 
 from .bodies import Body, as_tensors, euler
 from .builtin_cache import cached, content_folder
@@ -90,13 +90,8 @@ def trace(time: float, position: Float[np.ndarray, "3"], size: BallsSize) -> tup
     center = torch.full((1, 4), 0.5)
     traced = raytrace(as_tensors(_balls(time, size), cpu), lamp, center, camera.viewmat, camera.K, camera.size)
     hit = (traced.bodies >= 0).float()[..., None]
-    alpha, color = _averaged(hit), _averaged(traced.image.clamp(0, 1) * hit)
-    rgba = torch.cat([color / alpha.clamp_min(1e-6), alpha], 2)
-    return camera, (rgba * 255.0).round().byte().numpy()
-
-
-def _averaged(image: Float[Tensor, "H W C"]) -> Float[Tensor, "h w C"]:
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), SUPERSAMPLING).permute(1, 2, 0)
+    alpha, color = averaged(hit, SUPERSAMPLING), averaged(traced.image.clamp(0, 1) * hit, SUPERSAMPLING)
+    return camera, to_bytes(torch.cat([color / alpha.clamp_min(1e-6), alpha], 2))
 
 
 def _frame(folder: Path, name: str, time: float, random: np.random.Generator, size: BallsSize) -> dict[str, Any]:

@@ -195,14 +195,13 @@ def read_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    stored = to_8_bits(decode(path, size=size))
+    return fill_transparent(to_8_bits(decode(path, size=size)))
+
+
+def fill_transparent(stored: UInt8[np.ndarray, "H W ..."]) -> UInt8[np.ndarray, "H W 3"]:
+    """RGB of an image in grey or in OpenCV's channel order, with transparent pixels inpainted."""
     if stored.ndim == 2:
         return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB)
-    return fill_transparent(stored)
-
-
-def fill_transparent(stored: UInt8[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W 3"]:
-    """RGB of an image in OpenCV's channel order, with transparent pixels inpainted."""
     image = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2RGB)
     unknown = stored[..., 3:] < 128
     if unknown.any():

@@ -28,7 +28,7 @@ def read_resized_image(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "
     Raises:
         ValueError: If the file is missing, damaged or of another shape.
     """
-    return resize(_filled(_read(path, size)), size)
+    return resize(fill_transparent(_read(path, size)), size)
 
 
 def read_resized_over_white(
@@ -40,7 +40,7 @@ def read_resized_over_white(
     """
     stored = _read(path, size)
     if stored.ndim == 2 or stored.shape[2] < 4:
-        return resize(_filled(stored), size)
+        return resize(fill_transparent(stored), size)
     alpha = stored[..., 3:].astype(np.float32) / 255.0
     blended = stored[..., 2::-1] * alpha + WHITE * (1.0 - alpha)
     is_empty = resize_mask(stored[..., 3] == 0, size)
@@ -52,11 +52,6 @@ def _read(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w ..."]:
     stored = to_8_bits(decode(path))
     check_shape(path, "the image", (stored.shape[1], stored.shape[0]), size)
     return stored
-
-
-def _filled(stored: UInt8[np.ndarray, "h w ..."]) -> UInt8[np.ndarray, "h w 3"]:
-    """RGB of a stored image, with transparent pixels inpainted."""
-    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB) if stored.ndim == 2 else fill_transparent(stored)
 
 
 def read_resized_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:

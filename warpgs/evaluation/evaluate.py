@@ -195,17 +195,12 @@ def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _at_times(camera: Camera, cameras: Sequence[Camera], max_count: int) -> list[Camera]:
-    """One camera at the first ``max_count`` times of other cameras."""
-    times = sorted({c.time for c in cameras})
-    return [Camera(camera.viewmat, camera.K, camera.width, camera.height, time) for time in times[:max_count]]
-
-
 def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | None:
+    middle, times = cameras[len(cameras) // 2], sorted({camera.time for camera in cameras})
     changes = []
     before: Rendering | None = None
-    for camera in progress(_at_times(cameras[len(cameras) // 2], cameras, FLICKER_FRAMES), "flicker", quiet):
-        after = scene.render(camera, branches=True)
+    for at in progress(times[:FLICKER_FRAMES], "flicker", quiet):
+        after = scene.render(replace(middle, time=at), branches=True)
         if before is not None:
             assert before.dynamic is not None
             assert after.dynamic is not None
@@ -220,18 +215,16 @@ def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> f
     """Frames per second of wall time, after one warm-up frame, cycling through the cameras."""
     device = cameras[0].viewmat.device
 
-    def play_all() -> None:
-        for k in range(TIMED_FRAMES):
+    def play_frames(count: int) -> None:
+        for k in range(count):
             play(cameras[k % len(cameras)])
         if device.type == "cuda":
             torch.cuda.synchronize(device)
 
-    play(cameras[0])
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    play_frames(1)
     start, rounds = time.perf_counter(), 0
     while time.perf_counter() - start < TIMED_SECONDS:
-        play_all()
+        play_frames(TIMED_FRAMES)
         rounds += 1
     return rounds * TIMED_FRAMES / (time.perf_counter() - start)
 

@@ -161,7 +161,7 @@ def interpolated(
         np.log([[float(c.K[0, 0]), float(c.K[1, 1])] for c in cameras]),
         np.array([[float(c.K[0, 2]), float(c.K[1, 2]), c.time] for c in cameras]),
     ]
-    positions, focals, others = (_linear(x, columns, wanted) for columns in values)
+    positions, focals, others = (np.stack([np.interp(wanted, x, column) for column in part.T], 1) for part in values)
     if smooth:
         positions = PchipInterpolator(x, values[0])(wanted)
     path = []
@@ -169,11 +169,6 @@ def interpolated(
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         path.append(Camera.posed(r, p, K, first.size, float(time)))
     return path
-
-
-def _linear(knots: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Interpolates each column of ``values`` linearly."""
-    return np.stack([np.interp(at, knots, column) for column in values.T], 1)
 
 
 def _smoothed(path: list[Camera], sigma: float) -> list[Camera]:

@@ -15,7 +15,7 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.rendering import Layer, render
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.depth import depth_bounds, depth_image
-from warpgs.visualize.images import to_bytes
+from warpgs.visualize.images import averaged, to_bytes
 
 from . import camera_paths
 from .command import Render
@@ -65,10 +65,10 @@ def _images(
     """The images of the chosen layers, averaged down from their supersampled size."""
     larger = camera_paths.resized(camera, float(options.supersample))
     if depths is not None:
-        return [_averaged(_depth_image(scene, larger, depths), options.supersample)]
+        return [averaged(_depth_image(scene, larger, depths), options.supersample)]
     rendering = scene.render(larger, branches=options.layers not in ("joint", "alpha"))
     if options.layers == "alpha":
-        return [_averaged(rendering.joint.alpha[..., None].expand(-1, -1, 3), options.supersample)]
+        return [averaged(rendering.joint.alpha[..., None].expand(-1, -1, 3), options.supersample)]
     by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
     layers = [by_name[name] for name in (COLORED if options.layers == "all" else (options.layers,))]
     return [_pixels(layer, options, scene.background) for layer in layers if layer is not None]
@@ -77,10 +77,10 @@ def _images(
 def _pixels(layer: Layer, options: Render, background: Float[Tensor, "3"] | None) -> Float[Tensor, "H W C"]:
     """RGB over the scene's background; with transparency RGBA, whose colour is not multiplied by its alpha."""
     if not options.transparent:
-        return _averaged(layer.image.clamp(0, 1), options.supersample)
+        return averaged(layer.image.clamp(0, 1), options.supersample)
     image = layer.image if background is None else layer.image - (1.0 - layer.alpha[..., None]) * background
     image = image.clamp(0, 1)
-    image = _averaged(torch.cat([image, layer.alpha[..., None]], -1), options.supersample)
+    image = averaged(torch.cat([image, layer.alpha[..., None]], -1), options.supersample)
     alpha = image[..., 3:]
     return torch.cat([image[..., :3] / alpha.clamp_min(1 / 255), alpha], -1).clamp(0, 1)
 
@@ -96,12 +96,6 @@ def _inverse_depth(scene: TrainedScene, camera: Camera) -> Float[np.ndarray, "H 
     """[H, W], NaN where empty."""
     settings = replace(scene.config.render_settings, depth=True)
     return render(scene.splats(camera.time), camera, settings=settings).joint.inverse_depth.cpu().numpy()
-
-
-def _averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
-    if factor == 1:
-        return image
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
 
 
 def fitted(image: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:

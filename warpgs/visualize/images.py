@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from warpgs.rendering import Rendering
 
@@ -35,6 +36,11 @@ def reduced(image: UInt8[np.ndarray, "H W 3"], max_width: int) -> UInt8[np.ndarr
         return image
     size = (max_width, max(1, round(height * max_width / width)))
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
+    """An image scaled down by a whole factor."""
+    return avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
 
 
 def comparison(truth: Float[Tensor, "H W 3"], rendering: Rendering) -> UInt8[np.ndarray, "H2 W5 3"]:
