@@ -61,7 +61,7 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
     except Exception as error:
         if not is_out_of_memory(error):
             raise
-        sys.stderr.write(f"{prog}: {out_of_memory(error)}; {advice}\n")
+        sys.stderr.write(f"{prog}: out of memory ({one_line(error)[:200]}); {advice}\n")
         return FAILED
     return code if type(code) is int else 0
 
@@ -169,8 +169,3 @@ def is_out_of_memory(error: BaseException) -> bool:
     # torch.OutOfMemoryError by name, because torch takes a second to import.
     has_type = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
     return has_type or OUT_OF_MEMORY.search(str(error)) is not None
-
-
-def out_of_memory(error: BaseException) -> str:
-    """The message for lack of memory, without advice."""
-    return f"out of memory ({one_line(error)[:200]})"

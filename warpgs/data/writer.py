@@ -159,8 +159,7 @@ def write_index(
     metadata = {}
     for name, step in time_ids.items():
         camera_id = 0 if camera_ids is None else camera_ids[name]
-        ids = {"time_id": step, "warp_id": index[step], "appearance_id": index[step], "camera_id": camera_id}
-        metadata[name] = ids
+        metadata[name] = {"time_id": step, "warp_id": index[step], "appearance_id": index[step], "camera_id": camera_id}
     write_json(root / "metadata.json", metadata)
     train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
     counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}

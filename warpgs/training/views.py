@@ -108,7 +108,8 @@ class Views:
 
     def __getitem__(self, index: int) -> View:
         stored = self._at(index) if self.resident else self._read_ahead.take(index)
-        return self._view(stored.map(self._to_device), torch.full((1,), index, device=self.device))
+        on_device = stored.map(lambda tensor: tensor.to(self.device))
+        return self._view(on_device, torch.full((1,), index, device=self.device))
 
     def _at(self, index: int) -> StoredView:
         """The memory of a resident view."""
@@ -208,6 +209,3 @@ class Views:
             stored.mask_border,
             stored.inverse_depth.float(),
         )
-
-    def _to_device(self, tensor: Tensor) -> Tensor:
-        return tensor.to(self.device)
