@@ -166,9 +166,6 @@ def test_the_disc_contains_a_fifth_of_the_gaussians():
     assert splats.is_dynamic.float().mean().item() == pytest.approx(0.2, abs=0.01)
 
 
-# Training -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("preset", ["paper", "best"])
 def test_steps_of_both_stages_are_measured(preset):
     measured = measure_steps(300, (48, 32), "cpu", 1, preset)

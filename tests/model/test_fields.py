@@ -207,9 +207,6 @@ def test_without_appearance_opacity_there_are_no_residuals_of_opacities():
     assert residuals.all()
 
 
-# Adding a deformation model ------------------------------------------------------------------------------------------
-
-
 class Drift(torch.nn.Module):
     """All dynamic Gaussians move with one velocity."""
 

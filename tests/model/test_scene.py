@@ -50,10 +50,8 @@ def differing(a, b):
     return {name for name in a if not torch.equal(a[name], b[name])}
 
 
-# Eq. 5 ---------------------------------------------------------------------------------------------------------------
-
-
 def test_a_scene_is_its_static_followed_by_its_dynamic_gaussians():
+    """Eq. 5 of the paper."""
     scene = make_scene()
     splats = scene.splats(TIME, use_deformation=False, use_appearance=False)
     for part, gaussians in ((static_part(splats), scene.static), (dynamic_part(splats), scene.dynamic)):
@@ -94,11 +92,9 @@ def test_the_static_gaussians_alone_have_their_own_appearance():
         assert error(getattr(alone, name), whole[name]) < 1e-6
 
 
-# Eq. 8 ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_residuals_are_added_to_the_coefficients_of_the_lowest_degrees(degree):
+    """Eq. 8 of the paper."""
     scene = make_scene(appearance_degree=degree)
     residual, _ = scene.appearance(scene.static.means, TIME)
     bases = (degree + 1) ** 2
@@ -148,10 +144,8 @@ def test_an_untrained_appearance_network_leaves_the_images_unchanged(appearance_
         assert getattr(before, name).alpha.any()
 
 
-# Eq. 11 --------------------------------------------------------------------------------------------------------------
-
-
 def test_positions_are_shifted_by_their_offsets():
+    """Eq. 11 of the paper."""
     scene = make_scene()
     shift = scene.deformation(scene.dynamic.means, TIME)[:, :3]
     assert shift.all()

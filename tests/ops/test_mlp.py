@@ -65,9 +65,6 @@ def test_sizes_that_do_not_fit_half_precision_are_refused():
         perceptron(random_inputs(4, 0).half(), random_values(shapes), shapes, 0, OUTPUTS)
 
 
-# Backward pass of ReLU ------------------------------------------------------------------------------------------------
-
-
 def random_half(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed)).half()
 

@@ -82,9 +82,6 @@ def constant_depth():
 ALIGNMENT = torch.tensor([[2.0, -0.2]] * 3)
 
 
-# From points ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_size_of_a_gaussian_is_the_root_mean_square_distance_to_three_neighbours():
     points = random_points(40)
     distances = (points[:, None].double() - points[None].double()).norm(dim=2).sort(1).values
@@ -198,9 +195,6 @@ def test_few_points_are_all_taken():
     assert subsample(random_points(5), 5, generator()).tolist() == [0, 1, 2, 3, 4]
 
 
-# The box -------------------------------------------------------------------------------------------------------------
-
-
 def test_the_box_contains_the_points_with_a_margin():
     points = torch.rand(1001, 3, generator=generator()) * torch.tensor([2.0, 4.0, 1.0]) + torch.tensor([5.0, 0, -3.0])
     center, half_size = scene_box(points)
@@ -226,9 +220,6 @@ def test_a_few_distant_points_do_not_widen_the_box(distance):
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.ones(1, 3), torch.ones(50, 3)])
 def test_the_box_is_never_flat(points):
     assert (scene_box(points)[1] > 0).all()
-
-
-# Colours from the views ----------------------------------------------------------------------------------------------
 
 
 def points_at(row, column, depth=DEPTH):
@@ -258,9 +249,6 @@ def test_points_outside_all_views_are_grey():
     image = torch.full((HEIGHT, WIDTH, 3), 255, dtype=torch.uint8)
     views = [(CAMERA, image, torch.ones(HEIGHT, WIDTH, dtype=torch.bool))]
     assert (color_points(points_at([12], [20], depth=-DEPTH), views) == 0.5).all()
-
-
-# From masked depth ---------------------------------------------------------------------------------------------------
 
 
 def test_unprojected_pixels_project_to_their_positions_and_depths_and_keep_their_colours():
@@ -481,9 +469,6 @@ def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
     scene = initialize.initial_scene(config, capture, generator())
     for gaussians in (scene.static, scene.dynamic, dynamic_gaussians(capture, ALIGNMENT, config)):
         assert gaussians.sh.shape[1] == (degree + 1) ** 2
-
-
-# Trust in depth ------------------------------------------------------------------------------------------------------
 
 
 def capture_of_grid(inverse_of):

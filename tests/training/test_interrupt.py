@@ -67,9 +67,6 @@ def test_the_previous_handler_is_restored_after_an_error():
         press()
 
 
-# In training --------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def config(data, tmp_path, contracts_off):
     return dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run")

@@ -69,28 +69,21 @@ def gradient(loss, image, *arguments):
     return leaf.grad
 
 
-# Images --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_images_are_compared_by_l1_and_similarity(weight):
     assert_same_loss(image_loss, lambda image: compared(image, TRUTH, weight), TRUTH, weight)
 
 
-# Eq. 9 ---------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_the_static_loss_masks_both_images(weight):
+    """Eq. 9 of the paper."""
     truth = TRUTH * where(MASK)
     assert_same_loss(static_loss, lambda image: compared(image * where(MASK), truth, weight), TRUTH, MASK, weight)
 
 
-# Eq. 12 --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("weight", WEIGHTS)
 def test_the_dynamic_loss_masks_the_ground_truth_only(weight):
+    """Eq. 12 of the paper."""
     truth = TRUTH * where(~MASK)
     assert_same_loss(dynamic_loss, lambda image: compared(image, truth, weight), TRUTH, MASK, weight, BLACK)
 
@@ -110,8 +103,6 @@ def test_a_perfect_dynamic_image_over_another_background_has_a_loss():
     expected = static_fraction * PURPLE.double().mean()
     assert error(dynamic_loss(perfect, TRUTH, MASK, 0.0, PURPLE), expected) < 1e-6
 
-
-# Eq. 15: the terms of an iteration -----------------------------------------------------------------------------------
 
 SPLATS = make_splats()
 CAMERA = make_camera()
@@ -150,7 +141,7 @@ def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **opti
 
 
 def terms_of(stage, loss=LOSS, schedule=SCHEDULE):
-    """The weighted terms of the first iteration of a stage, and the rendering that they compare."""
+    """The weighted terms of the first iteration of a stage (Eq. 15), and the rendering that they compare."""
     scene, plan, step = prepared(stage, loss, schedule=schedule)
     phase = plan.phase
     with torch.no_grad():
@@ -306,9 +297,6 @@ def test_with_a_weight_of_zero_the_depth_terms_are_zero():
     assert terms["depth_dynamic"] == 0
 
 
-# Adding a term -------------------------------------------------------------------------------------------------------
-
-
 def dynamic_alpha(inputs):
     """Mean opacity of the dynamic image."""
     return inputs.rendering.dynamic.alpha.mean()
@@ -337,8 +325,6 @@ def test_terms_are_reported_in_the_order_of_the_dictionary():
     terms, _ = terms_of("stage2")
     assert list(terms) == ["static", "dynamic", "joint", "squared", "depth", "depth_dynamic"]
 
-
-# Parameters that are trained -----------------------------------------------------------------------------------------
 
 GEOMETRY = {"means", "quats", "log_scales"}
 EARLY_APPEARANCE = {"logit_opacities", "sh_dc"}

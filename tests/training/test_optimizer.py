@@ -68,9 +68,6 @@ def rates_at(
     return learning_rates(config, extent, at)
 
 
-# The optimizer -------------------------------------------------------------------------------------------------------
-
-
 def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
     scene = make_scene()
     optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
@@ -121,9 +118,6 @@ def test_parameters_without_gradient_stay_constant():
     scene.dynamic.means.grad = torch.ones(4, 3)
     optimizer.step()
     assert torch.equal(scene.static.means, before)
-
-
-# Resizing ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("branch", ["static", "dynamic"])
@@ -202,9 +196,6 @@ def test_a_reset_of_an_untrained_parameter_changes_nothing():
     optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
     reset_moments(optimizer, scene.static.means)
     assert not optimizer.state.get(scene.static.means, {})
-
-
-# Learning rates ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("start", "end"), [(8e-4, 1.6e-6), (1e-3, 1e-3), (1e-6, 1.0), (3.0, 0.2)])

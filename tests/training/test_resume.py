@@ -262,9 +262,6 @@ def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
     assert (killed / "metrics.json").is_file()
 
 
-# Checkpoints that do not fit -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def finished(whole, tmp_path):
     """A copy of the run without interruption."""

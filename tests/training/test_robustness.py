@@ -52,9 +52,6 @@ def end_to_end(data, run, monkeypatch, capsys, **changes):
     return capsys.readouterr().out, json.loads((run / "metrics.json").read_text())
 
 
-# Values that are not finite -----------------------------------------------------------------------------------------
-
-
 def spoil_loss(monkeypatch, trainer, is_spoiled):
     """Makes the loss, and so all gradients, NaN in the iterations for which ``is_spoiled`` is true."""
     whole = losses.static_loss
@@ -120,9 +117,6 @@ def test_a_loss_that_stays_not_finite_is_an_error(data, run, monkeypatch, first,
     assert is_finite(run)
 
 
-# Memory -------------------------------------------------------------------------------------------------------------
-
-
 def run_as_main(monkeypatch, capsys, *arguments):
     """Exit code and error output of train.py."""
     monkeypatch.setattr("sys.argv", [SCRIPT, *map(str, arguments)])
@@ -157,9 +151,6 @@ def test_a_capture_that_is_refused_leaves_no_run_folder(data, run, monkeypatch, 
     assert code == 2
     assert "--assume static" in text
     assert not run.exists()
-
-
-# Incomplete captures ------------------------------------------------------------------------------------------------
 
 
 def test_without_depth_stage_1_takes_the_iterations_of_the_pretraining(data, run):

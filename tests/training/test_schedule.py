@@ -59,9 +59,6 @@ def boundaries(made):
     return stages
 
 
-# Stages --------------------------------------------------------------------------------------------------------------
-
-
 def test_the_protocol_of_the_paper_has_2k_30k_and_40k_iterations():
     stages = boundaries(Protocol(PRESETS["paper"], has_depth=True))
     assert stages == [("pretrain", 0, 1_999), ("stage1", 2_000, 31_999), ("stage2", 32_000, 71_999)]
@@ -104,9 +101,6 @@ def test_equal_phases_are_equal_keys():
     assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
 
 
-# Settling -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("has_depth", [True, False])  # without depth there is no pretraining
 def test_gaussians_settle_in_the_last_iterations_of_the_run(has_depth):
     progress = [plan.settle_progress for plan in plans(has_depth, schedule={"settle": 30})]
@@ -125,9 +119,6 @@ def test_a_settling_longer_than_the_run_begins_before_it():
 def test_gaussians_of_the_preset_best_settle_in_the_last_sixth():
     schedule = PRESETS["best"].schedule
     assert schedule.settle == (schedule.stage1 + schedule.stage2) / 6
-
-
-# Networks and losses -------------------------------------------------------------------------------------------------
 
 
 def iterations_with_joint_term(**changes):
@@ -240,7 +231,6 @@ def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_sta
     assert not Protocol(CONFIG, has_depth=True).phase_at(STAGE1).use_deformation
 
 
-# What is done in which iterations ------------------------------------------------------------------------------------
 # After iteration i of a run, i + 1 − STAGE1 iterations of stage I are done.
 
 
@@ -314,9 +304,6 @@ def test_the_paper_preset_resets_opacities_every_3000_iterations_before_15000():
     made = Protocol(PRESETS["paper"], has_depth=True)
     resets = [k for k in range(1, 30_001, 100) if made.at(2_000 + k + 98).reset]
     assert [k + 99 for k in resets] == [3_000, 6_000, 9_000, 12_000]
-
-
-# Scaling -------------------------------------------------------------------------------------------------------------
 
 
 def with_iterations(preset, iterations):

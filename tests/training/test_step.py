@@ -22,9 +22,6 @@ pytestmark = pytest.mark.usefixtures("quickly")
 CPU = torch.device("cpu")
 
 
-# Inputs by name ------------------------------------------------------------------------------------------------------
-
-
 def make_inputs():
     return StepInputs(("static", "psnr"), ("means", "networks"), CPU)
 
@@ -66,9 +63,6 @@ def test_inputs_stay_at_their_addresses():
 def test_a_missing_input_is_an_error(name):
     with pytest.raises(KeyError):
         send(make_inputs(), **{name: {}})
-
-
-# The phase decides ---------------------------------------------------------------------------------------------------
 
 
 class RecordedWork:

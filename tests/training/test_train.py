@@ -251,9 +251,6 @@ def test_ctrl_c_saves_a_checkpoint_and_tells_how_to_continue(data, tmp_path):
     assert checkpoint.load(checkpoint.list_checkpoints(folder)[-1]).metadata.iteration > 0
 
 
-# From Python ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def config(tmp_path, contracts_off, monkeypatch):
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
