@@ -79,14 +79,31 @@ def chosen(tensors, index):
     return {name: t[index] for name, t in tensors.items()}
 
 
-def test_nothing_changes_if_no_gradient_exceeds_the_threshold():
-    before, after = densified([SMALL, LARGE, SMALL, LARGE], [0.0, SMALL_GRADIENT, CONFIG.gradient, CONFIG.gradient])
-    assert equal(before, after)
+ALL_SMALL = [SMALL_GRADIENT] * 3
+SECOND_LARGE = [SMALL_GRADIENT, LARGE_GRADIENT, SMALL_GRADIENT]
+THIRD_FAINT = {"opacities": [0.8, 0.8, 0.01]}
+# Sizes, gradients and options of a densification that splits none, and the index of the Gaussians after it.
+CHOICES = {
+    "small gradients change nothing": ([SMALL, LARGE, SMALL], [0.0, SMALL_GRADIENT, CONFIG.gradient], {}, [0, 1, 2]),
+    "nor does a large one at the threshold": ([LARGE], [CONFIG.gradient], {}, [0]),
+    "a small one with a large gradient is cloned": ([SMALL, SMALL, LARGE], SECOND_LARGE, {}, [0, 1, 2, 1]),
+    "transparent ones are removed": ([SMALL, LARGE, SMALL], ALL_SMALL, {"opacities": [0.09, 0.11, 0.01]}, [1]),
+    "so are those with large gradients": ([SMALL, LARGE], [LARGE_GRADIENT] * 2, {"opacities": 0.09}, []),
+    "oversized ones are removed if requested": ([OVERSIZED, SMALL, HUGE], ALL_SMALL, {"remove_large": True}, [1, 2]),
+    "oversized ones are otherwise kept": ([OVERSIZED, SMALL, HUGE], ALL_SMALL, {}, [0, 1, 2]),
+    "infinite ones are removed": ([SMALL, math.inf, LARGE], SECOND_LARGE, {}, [0, 2]),
+    "those of unknown size are removed": ([SMALL, math.nan, LARGE], SECOND_LARGE, {}, [0, 2]),
+    "those with the largest gradients grow": ([SMALL] * 4, [0.7, 0.9, 0.6, 0.8], {"capacity": 2}, [0, 1, 2, 3, 1, 3]),
+    "none grow without capacity": ([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, {**THIRD_FAINT, "capacity": 0}, [0, 1]),
+    "nor if there are too many": ([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, {**THIRD_FAINT, "capacity": -3}, [0, 1]),
+    "of none there are none": ([], [], {"remove_large": True}, []),
+}
 
 
-def test_a_small_gaussian_with_a_large_gradient_is_cloned():
-    before, after = densified([SMALL, SMALL, LARGE], [SMALL_GRADIENT, LARGE_GRADIENT, SMALL_GRADIENT])
-    assert equal(chosen(before, [0, 1, 2, 1]), rows_in(after, 4))
+@pytest.mark.parametrize(("sizes", "gradients", "options", "index"), CHOICES.values(), ids=CHOICES)
+def test_gaussians_are_kept_cloned_or_removed(sizes, gradients, options, index):
+    before, after = densified(sizes, gradients, **options)
+    assert equal(chosen(before, index), after)
 
 
 def test_a_large_gaussian_with_a_large_gradient_is_split_in_two():
@@ -145,43 +162,9 @@ def test_the_size_threshold_is_relative_to_the_extent(extent, cloned):
     assert torch.equal(rows_in(after, 2)["log_scales"], before["log_scales"].repeat(2, 1)) == cloned
 
 
-def test_transparent_gaussians_are_removed():
-    before, after = densified([SMALL, LARGE, SMALL], [SMALL_GRADIENT] * 3, opacities=[0.09, 0.11, 0.01])
-    assert equal(chosen(before, [1]), after)
-
-
-def test_transparent_gaussians_with_large_gradients_are_removed():
-    _, after = densified([SMALL, LARGE], [LARGE_GRADIENT, LARGE_GRADIENT], opacities=0.09)
-    rows_in(after, 0)
-
-
-@pytest.mark.parametrize(("remove_large", "kept"), [(True, [1, 2]), (False, [0, 1, 2])])
-def test_oversized_gaussians_are_removed_if_requested(remove_large, kept):
-    before, after = densified([OVERSIZED, SMALL, HUGE], [SMALL_GRADIENT] * 3, remove_large=remove_large)
-    assert equal(chosen(before, kept), after)
-
-
-@pytest.mark.parametrize("size", [math.inf, math.nan])
-def test_gaussians_without_a_finite_size_are_removed(size):
-    before, after = densified([SMALL, size, LARGE], [SMALL_GRADIENT, LARGE_GRADIENT, SMALL_GRADIENT])
-    assert equal(chosen(before, [0, 2]), after)
-
-
-def test_at_limited_capacity_those_with_the_largest_gradients_grow():
-    before, after = densified([SMALL] * 4, [0.7, 0.9, 0.6, 0.8], capacity=2)
-    assert equal(chosen(before, [0, 1, 2, 3, 1, 3]), rows_in(after, 6))
-
-
 def test_a_split_takes_the_capacity_of_one_gaussian():
     _, after = densified([LARGE] * 4, [0.7, 0.9, 0.6, 0.8], capacity=3)
     rows_in(after, 7)
-
-
-@pytest.mark.parametrize("capacity", [0, -3])
-def test_without_capacity_transparent_gaussians_are_still_removed(capacity):
-    opacities = [0.8, 0.8, 0.01]
-    before, after = densified([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, opacities, capacity)
-    assert equal(chosen(before, [0, 1]), after)
 
 
 @pytest.mark.parametrize("branch", BRANCHES)
@@ -206,11 +189,6 @@ def test_moments_of_clones_and_children_start_at_zero(branch):
             assert moments.shape == getattr(gaussians, name).shape
             assert (moments[:2] >= 1).all()  # the one that is kept and the parent of the clone
             assert not moments[2:].any()  # the clone and two children
-
-
-def test_densifying_no_gaussians_gives_none():
-    _, after = densified([], [], remove_large=True)
-    rows_in(after, 0)
 
 
 def test_the_mean_gradient_is_over_the_views_with_the_gaussian_visible():
