@@ -351,19 +351,17 @@ def test_in_stage_2_the_joint_term_trains_dynamic_gaussians_and_both_networks():
     assert {"deformation", "appearance"} <= changed
 
 
-def test_in_stage_2_static_gaussians_are_frozen():
-    assert of("static", changed_by("stage2")) == set()
-
-
-def test_the_config_lets_stage_2_train_the_geometry_of_static_gaussians():
-    assert of("static", changed_by("stage2", static_geometry=True)) == GEOMETRY
-
-
-def test_the_config_lets_stage_2_train_the_appearance_of_static_gaussians():
-    assert of("static", changed_by("stage2", static_appearance=True)) == EARLY_APPEARANCE | {"sh_rest"}
-
-
-def test_without_the_appearance_network_stage_2_trains_the_appearance_of_static_gaussians():
-    changed = changed_by("stage2", app=False)
-    assert of("static", changed) == EARLY_APPEARANCE | {"sh_rest"}
-    assert "appearance" not in changed
+@pytest.mark.parametrize(
+    ("options", "trained"),
+    [
+        ({}, set()),
+        ({"static_geometry": True}, GEOMETRY),
+        ({"static_appearance": True}, EARLY_APPEARANCE | {"sh_rest"}),
+        ({"app": False}, EARLY_APPEARANCE | {"sh_rest"}),
+    ],
+    ids=["nothing", "geometry", "appearance", "appearance without its network"],
+)
+def test_stage_2_trains_of_static_gaussians_only_what_the_config_lets_it(options, trained):
+    changed = changed_by("stage2", **options)
+    assert of("static", changed) == trained
+    assert ("appearance" in changed) == options.get("app", True)

@@ -47,8 +47,12 @@ def plans(*arguments, **changes):
 
 def iterations_where(name, **changes):
     """The iterations whose plan, or its phase, has a true attribute of this name."""
-    made = plans(**changes)
-    return [i for i, plan in enumerate(made) if getattr(plan if hasattr(plan, name) else plan.phase, name)]
+    return [i for i, value in enumerate(values_of(name, **changes)) if value]
+
+
+def values_of(name, **changes):
+    """The attribute of this name of every plan, or of its phase."""
+    return [getattr(plan if hasattr(plan, name) else plan.phase, name) for plan in plans(**changes)]
 
 
 def boundaries(made):
@@ -101,21 +105,6 @@ def test_equal_phases_are_equal_keys():
     assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
 
 
-@pytest.mark.parametrize("has_depth", [True, False])  # without depth there is no pretraining
-def test_gaussians_settle_in_the_last_iterations_of_the_run(has_depth):
-    progress = [plan.settle_progress for plan in plans(has_depth, schedule={"settle": 30})]
-    assert progress == pytest.approx([0.0] * (END - 30) + [k / 30 for k in range(30)])
-
-
-def test_gaussians_never_settle_if_not_asked_to():
-    assert {plan.settle_progress for plan in plans(schedule={"settle": 0})} == {0.0}
-
-
-def test_a_settling_longer_than_the_run_begins_before_it():
-    made = plans(schedule={"settle": 2 * END})
-    assert [plan.settle_progress for plan in made] == pytest.approx([0.5 + k / (2 * END) for k in range(END)])
-
-
 def test_gaussians_of_the_preset_best_settle_in_the_last_sixth():
     schedule = PRESETS["best"].schedule
     assert schedule.settle == (schedule.stage1 + schedule.stage2) / 6
@@ -148,42 +137,21 @@ def test_without_stage_2_there_is_no_joint_term():
     assert iterations_with_joint_term(stage2=False) == []
 
 
-def test_the_sh_degree_rises_in_steps_from_stage_1_on():
-    degrees = [plan.phase.sh_degree for plan in plans()]
-    assert degrees == [0] * (STAGE1 + 12) + [1] * 12 + [2] * 12 + [3] * (END - STAGE1 - 36)
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_the_sh_degree_never_exceeds_that_of_the_model(degree):
     degrees = {plan.phase.sh_degree for plan in plans(model=ModelConfig(sh_degree=degree))}
     assert degrees == set(range(degree + 1))
 
 
-def test_noise_on_time_decays_linearly_from_a_tenth_of_a_frame_interval():
-    noise = [plan.time_noise for plan in plans()]
-    expected = [0.0] * STAGE1 + [0.1 * (40 - k) / 40 for k in range(40)] + [0.0] * (END - STAGE1 - 40)
-    assert noise == pytest.approx(expected, abs=1e-12)
-
-
 def test_noise_until_iteration_0_ends_after_one_iteration():
-    noise = [plan.time_noise for plan in plans(schedule={"noise_until": 0})]
+    noise = values_of("time_noise", schedule={"noise_until": 0})
     assert max(noise[STAGE1 + 1 :]) == 0.0
 
 
-def test_the_depth_weight_decays_exponentially_over_the_run():
-    weights = [plan.depth_weight for plan in plans()]
-    assert weights == pytest.approx([2.0 * 0.01 ** (k / END) for k in range(END)], rel=1e-9)
-
-
-@pytest.mark.parametrize("end", [0.0, 2.0])
-def test_the_depth_weight_may_decay_to_zero_or_stay_constant(end):
-    weights = [plan.depth_weight for plan in plans(loss=LossConfig(depth=2.0, depth_end=end))]
+def test_the_depth_weight_may_decay_to_zero():
+    weights = values_of("depth_weight", loss=LossConfig(depth=2.0, depth_end=0.0))
     assert weights[0] == pytest.approx(2.0)
-    assert weights[-1] == pytest.approx(end, abs=1e-9)
-
-
-def test_progress_rises_linearly_from_zero_to_one():
-    assert [plan.progress for plan in plans()] == pytest.approx([k / END for k in range(END)])
+    assert weights[-1] == pytest.approx(0.0, abs=1e-9)
 
 
 def means_progress(branch, **changes):
@@ -267,6 +235,7 @@ ACTIONS = {
     "dropout: from stage 1 on": ("use_dropout", DROPPING, last(STAGE1)),
     "dropout: until Gaussians settle": ("use_dropout", {**DROPPING, **SETTLING}, list(range(STAGE1, END - 30))),
     "dropout: not unless asked to": ("use_dropout", SETTLING, []),
+    "settling: not unless asked to": ("settle_progress", {"schedule": {"settle": 0}}, []),
     "depth weight: without pretraining, too": ("depth_weight", {"dap": False}, last(0)),
     "depth weight: none without depth": ("depth_weight", {"has_depth": False}, []),
     "depth weight: none without depth and pretraining": ("depth_weight", {"has_depth": False, "dap": False}, []),
@@ -298,6 +267,31 @@ ACTIONS = {
 @pytest.mark.parametrize(("name", "changes", "expected"), ACTIONS.values(), ids=ACTIONS)
 def test_iterations_do_what_the_schedule_says(name, changes, expected):
     assert iterations_where(name, **changes) == expected
+
+
+SETTLED = [0.0] * (END - 30) + [k / 30 for k in range(30)]
+LATER_HALF = [0.5 + k / (2 * END) for k in range(END)]
+NOISE = [0.0] * STAGE1 + [0.1 * (40 - k) / 40 for k in range(40)] + [0.0] * (END - STAGE1 - 40)
+DEGREES = [0] * (STAGE1 + 12) + [1] * 12 + [2] * 12 + [3] * (END - STAGE1 - 36)
+COURSES = {
+    "Gaussians settle in the last iterations": ("settle_progress", SETTLING, SETTLED),
+    "likewise without pretraining": ("settle_progress", {"has_depth": False, **SETTLING}, SETTLED),
+    "a settling longer than the run begins before it": (
+        "settle_progress",
+        {"schedule": {"settle": 2 * END}},
+        LATER_HALF,
+    ),
+    "the SH degree rises in steps from stage 1 on": ("sh_degree", {}, DEGREES),
+    "noise on time decays linearly from a tenth of a frame interval": ("time_noise", {}, NOISE),
+    "the depth weight decays exponentially": ("depth_weight", {}, [2.0 * 0.01 ** (k / END) for k in range(END)]),
+    "the depth weight may stay constant": ("depth_weight", {"loss": LossConfig(depth=2.0, depth_end=2.0)}, [2.0] * END),
+    "progress rises linearly from zero to one": ("progress", {}, [k / END for k in range(END)]),
+}
+
+
+@pytest.mark.parametrize(("name", "changes", "expected"), COURSES.values(), ids=COURSES)
+def test_values_follow_the_schedule(name, changes, expected):
+    assert values_of(name, **changes) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
 def test_the_paper_preset_resets_opacities_every_3000_iterations_before_15000():
