@@ -51,8 +51,10 @@ def iterations_where(name, **changes):
 
 
 def values_of(name, **changes):
-    """The attribute of this name of every plan, or of its phase."""
-    return [getattr(plan if hasattr(plan, name) else plan.phase, name) for plan in plans(**changes)]
+    """The attribute of this name of every plan, or of its phase; of a dictionary the value of a key after a dot."""
+    name, _, key = name.partition(".")
+    values = [getattr(plan if hasattr(plan, name) else plan.phase, name) for plan in plans(**changes)]
+    return [value[key] for value in values] if key else values
 
 
 def boundaries(made):
@@ -154,43 +156,9 @@ def test_the_depth_weight_may_decay_to_zero():
     assert weights[-1] == pytest.approx(0.0, abs=1e-9)
 
 
-def means_progress(branch, **changes):
-    return [plan.means_progress[branch] for plan in plans(**changes)]
-
-
-TRAINED = OptimConfig(means_anneal="trained")
-
-
 @pytest.mark.parametrize("branch", ["static", "dynamic"])
 def test_by_default_the_rate_of_positions_decays_over_the_run(branch):
-    assert means_progress(branch) == [plan.progress for plan in plans()]
-
-
-def test_the_rate_of_static_positions_can_decay_until_stage_2_in_which_they_are_constant():
-    expected = [min(1.0, k / STAGE2) for k in range(END)]
-    assert means_progress("static", optim=TRAINED) == pytest.approx(expected)
-    whole = [k / END for k in range(END)]
-    assert means_progress("static", optim=TRAINED, static_geometry=True) == pytest.approx(whole)
-    assert means_progress("static", optim=TRAINED, stage2=False) == pytest.approx(whole)
-
-
-def test_the_rate_of_dynamic_positions_can_decay_from_stage_1_on_in_which_they_begin():
-    expected = [0.0] * STAGE1 + [k / (END - STAGE1) for k in range(END - STAGE1)]
-    assert means_progress("dynamic", optim=TRAINED) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    ("name", "schedule", "first"),
-    [
-        ("deformation", {}, STAGE1 + 25),
-        ("appearance", {}, STAGE1 + 35),
-        ("deformation", {"deform_from": 1000}, STAGE2),
-        ("appearance", {"appearance_from": 1000}, STAGE2),
-    ],
-)
-def test_the_progress_of_a_network_covers_its_iterations(name, schedule, first):
-    expected = [0.0] * first + [k / (END - first) for k in range(END - first)]
-    assert [plan.network_progress[name] for plan in plans(schedule=schedule)] == pytest.approx(expected)
+    assert values_of(f"means_progress.{branch}") == values_of("progress")
 
 
 def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_stage_1():
@@ -269,6 +237,14 @@ def test_iterations_do_what_the_schedule_says(name, changes, expected):
     assert iterations_where(name, **changes) == expected
 
 
+def rising_from(first):
+    """Rises linearly from 0 at an iteration to 1 at the end of the run."""
+    return [0.0] * first + [k / (END - first) for k in range(END - first)]
+
+
+TRAINED = {"optim": OptimConfig(means_anneal="trained")}
+LATE_MOTION, LATE_COLOURS = ({"schedule": {name: 1000}} for name in ("deform_from", "appearance_from"))
+UNTIL_STAGE2 = [min(1.0, k / STAGE2) for k in range(END)]
 SETTLED = [0.0] * (END - 30) + [k / 30 for k in range(30)]
 LATER_HALF = [0.5 + k / (2 * END) for k in range(END)]
 NOISE = [0.0] * STAGE1 + [0.1 * (40 - k) / 40 for k in range(40)] + [0.0] * (END - STAGE1 - 40)
@@ -285,7 +261,15 @@ COURSES = {
     "noise on time decays linearly from a tenth of a frame interval": ("time_noise", {}, NOISE),
     "the depth weight decays exponentially": ("depth_weight", {}, [2.0 * 0.01 ** (k / END) for k in range(END)]),
     "the depth weight may stay constant": ("depth_weight", {"loss": LossConfig(depth=2.0, depth_end=2.0)}, [2.0] * END),
-    "progress rises linearly from zero to one": ("progress", {}, [k / END for k in range(END)]),
+    "progress rises linearly from zero to one": ("progress", {}, rising_from(0)),
+    "that of static positions can end before stage 2": ("means_progress.static", TRAINED, UNTIL_STAGE2),
+    "but not if stage 2 trains them": ("means_progress.static", {"static_geometry": True, **TRAINED}, rising_from(0)),
+    "nor if there is no stage 2": ("means_progress.static", {"stage2": False, **TRAINED}, rising_from(0)),
+    "that of dynamic positions can begin in stage 1": ("means_progress.dynamic", TRAINED, rising_from(STAGE1)),
+    "that of a deformation begins with it": ("network_progress.deformation", {}, rising_from(STAGE1 + 25)),
+    "that of an appearance begins with it": ("network_progress.appearance", {}, rising_from(STAGE1 + 35)),
+    "that of a late deformation begins in stage 2": ("network_progress.deformation", LATE_MOTION, rising_from(STAGE2)),
+    "that of a late appearance begins in stage 2": ("network_progress.appearance", LATE_COLOURS, rising_from(STAGE2)),
 }
 
 
