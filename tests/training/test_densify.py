@@ -95,7 +95,7 @@ CHOICES = {
     "those of unknown size are removed": ([SMALL, math.nan, LARGE], SECOND_LARGE, {}, [0, 2]),
     "those with the largest gradients grow": ([SMALL] * 4, [0.7, 0.9, 0.6, 0.8], {"capacity": 2}, [0, 1, 2, 3, 1, 3]),
     "none grow without capacity": ([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, {**THIRD_FAINT, "capacity": 0}, [0, 1]),
-    "nor if there are too many": ([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, {**THIRD_FAINT, "capacity": -3}, [0, 1]),
+    "nor if there are too many": ([SMALL, LARGE, SMALL], [LARGE_GRADIENT] * 3, {**THIRD_FAINT, "capacity": -1}, [0, 1]),
     "of none there are none": ([], [], {"remove_large": True}, []),
 }
 
