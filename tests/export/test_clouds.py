@@ -65,7 +65,7 @@ def test_the_least_visible_gaussians_are_omitted(clouds):
     assert (scenes.image(kept.at(0.5), camera) - rendered(clouds, camera)).abs().max() < 1e-4
 
 
-def test_visibility_is_the_largest_blend_weight_in_any_camera():
+def test_visibility_is_the_maximum_over_cameras_of_summed_blend_weights():
     clouds = scenes.clouds()
     away = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -90], [0, 0, 0, 1]])
     behind = dataclasses.replace(scenes.camera(), viewmat=away)

@@ -204,15 +204,15 @@ def _branch(
     middle = np.median(log_scales[0].max(1)) if len(order) else 0.0
     log_scales = np.clip(log_scales, middle + SCALES[0], middle + SCALES[1])
 
-    def over_time(values: np.ndarray, step: float) -> Levels:
-        return Levels.of(values, np.full(values.shape[2], step * np.sqrt(len(values))))
+    def over_time(values: np.ndarray, step: float | np.ndarray, octaves: np.ndarray | None = None) -> Levels:
+        return Levels.of(values, np.full(values.shape[2], step * np.sqrt(len(values))), octaves)
 
     chroma, octaves = np.array(CHROMA), octaves[order]
     return Branch(
         means=over_time(means, steps["means"] * size),
         rotations=over_time(rotations, steps["rotations"]),
         log_scales=over_time(log_scales, steps["log_scales"]),
-        colors=Levels.of(colors[..., :3] @ YCOCG.T, chroma * steps["colors"] * np.sqrt(len(colors)), octaves),
+        colors=over_time(colors[..., :3] @ YCOCG.T, chroma * steps["colors"], octaves),
         opacities=over_time(colors[..., 3:], steps["opacities"]),
         rest=Levels.of((rest @ YCOCG.T).transpose(1, 0, 2), chroma * steps["rest"], octaves, over_time=False),
     )

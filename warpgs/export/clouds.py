@@ -29,6 +29,10 @@ class Clouds:
     rows: Int64[np.ndarray, " M"] | None = None
     weights: Float32[np.ndarray, " M"] | None = None
 
+    def __len__(self) -> int:
+        scene = self.scene.scene
+        return len(scene.static) + len(scene.dynamic) if self.rows is None else len(self.rows)
+
     def at(self, time: float) -> Cloud:
         """The Gaussians at a time in [0, 1], in the same rows at every time."""
         cloud = Cloud.of_splats(self.scene.splats(time), self.scene.config.antialias)
@@ -39,7 +43,7 @@ class Clouds:
         if self.weights is not None:
             return self.weights
         settings = dataclasses.replace(self.scene.config.render_settings, statistics=True)
-        largest = np.zeros(len(self.at(0.0)), np.float32)
+        largest = np.zeros(len(self), np.float32)
         for camera in progress(cameras, "measuring visibility", quiet):
             weights = render(self.at(camera.time).splats(), camera, settings=settings).weights
             assert weights is not None
@@ -59,7 +63,7 @@ class Clouds:
         """
         if count < 1:
             raise ValueError(f"expected at least 1 Gaussian to keep, got {count}")
-        if len(self.at(0.0)) <= count:
+        if len(self) <= count:
             return self
         weights = self.visibility(cameras, quiet)
         kept = np.sort(np.argsort(-weights, kind="stable")[:count])
