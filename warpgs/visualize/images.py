@@ -40,6 +40,8 @@ def reduced(image: UInt8[np.ndarray, "H W 3"], max_width: int) -> UInt8[np.ndarr
 
 def averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
     """An image scaled down by a whole factor."""
+    if factor == 1:
+        return image
     return avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
 
 
