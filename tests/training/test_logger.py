@@ -36,7 +36,7 @@ def test_a_report_is_one_line(tmp_path, capsys):
         log.report(status(50))
     output = capsys.readouterr().out
     assert output.count("\n") == 1
-    for part in ("50/500", "stage1", "loss 0.7500", "PSNR 21.50", "static 12,345", "dynamic 67"):
+    for part in ("50/500", "stage1", "loss 0.7500", "train PSNR 21.50", "static 12,345", "dynamic 67"):
         assert part in output
 
 

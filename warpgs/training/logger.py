@@ -98,15 +98,13 @@ class TrainingLogger:
         rate = (status.iteration - last_iteration) / max(now - last_time, 1e-9)
         self._last = (status.iteration, now)
         text = (
-            f"loss {status.loss:.4f}  PSNR {status.psnr:.2f}  "
+            f"loss {status.loss:.4f}  train PSNR {status.psnr:.2f}  "
             f"static {status.num_static:,}  dynamic {status.num_dynamic:,}  {rate:.1f} it/s"
         )
         if self._bar is not None and self._task is not None:
-            shown = (
-                text
-                if self._is_wide
-                else (f"PSNR {status.psnr:.2f}  {status.num_static + status.num_dynamic:,} Gaussians  {rate:.0f} it/s")
-            )
+            num = status.num_static + status.num_dynamic
+            narrow = f"train PSNR {status.psnr:.2f}  {num:,} Gaussians  {rate:.0f} it/s"
+            shown = text if self._is_wide else narrow
             self._bar.update(self._task, completed=status.iteration, description=status.stage, status=shown)
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
