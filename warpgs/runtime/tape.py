@@ -38,18 +38,25 @@ class Recorded(NamedTuple):
 class _Node(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, op: Callable[..., Recorded], *tensors: Tensor | None) -> tuple[Tensor, ...]:
-        recorded = op(*tensors)
-        ctx.backward_function, ctx.num_outputs = recorded.backward, len(recorded.outputs)
+        outputs, ctx.backward_function, saved, constants = op(*tensors)
+        ctx.num_outputs = len(outputs)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*recorded.saved)
-        ctx.mark_non_differentiable(*recorded.constants)
-        return recorded.outputs + recorded.constants
+        ctx.save_for_backward(*saved)
+        ctx.mark_non_differentiable(*constants)
+        return outputs + constants
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        v_outputs = [None if v is None else v.contiguous() for v in gradients[: ctx.num_outputs]]
-        return None, *ctx.backward_function(ctx.saved_tensors, v_outputs)
+        # Autograd records a backward pass only if it is asked to, which costs this check instead of a context manager.
+        return (_backward_once if torch.is_grad_enabled() else _backward)(ctx, *gradients)
+
+
+def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    v_outputs = [None if v is None else v.contiguous() for v in gradients[: ctx.num_outputs]]
+    return None, *ctx.backward_function(ctx.saved_tensors, v_outputs)
+
+
+_backward_once = once_differentiable(_backward)
 
 
 def differentiable(op: Callable[..., Recorded], *tensors: Tensor | None) -> tuple[Tensor, ...]:
