@@ -1,7 +1,7 @@
 """Alpha compositing of splats into one or three images, and its backward pass (kernels/compositing_{fwd,bwd}.py)."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -31,6 +31,9 @@ MAX_SMALL_IMAGE_PIXELS = 1 << 18
 """Images of at most this number of pixels are small."""
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
+
+WORK = TILE_SIZE * TILE_SIZE
+"""Of a thread on CPU, see ``launch``."""
 
 MAX_PIXELS = 1 << 31
 """All images together must have fewer pixels than this, because kernels count pixels with ints."""
@@ -64,27 +67,26 @@ class Traversal(NamedTuple):
     It is valid together with these lists only: the number of intersections may differ where a render is repeated.
 
     Attributes:
-        tiles: Lists of the Gaussians of each tile.
-        size: (width, height) [px].
-        max_alpha: As in ``RenderSettings``.
+        num_images: 1, or 3 with branches.
+        pixels: Columns and rows of the pixels of a lane.
+        num_threads: Of both kernels.
+        lists: Arguments of both kernels, from ``tile_ranges`` to ``half``: the Gaussians of each tile.
+        view: Arguments of both kernels, from ``background_stride`` to ``max_alpha``.
         depth: [pixels of all images, in any shape] rendered depth; None without.
         transmittance: [the same] at the end of each pixel.
         last: [the same] int32 number of Gaussians of the list until the last one that contributed.
         joint_state: [blocks] int32, see ``equals_joint``; None for a single image.
     """
 
-    tiles: Tiles
-    size: tuple[int, int]
-    max_alpha: float
+    num_images: int
+    pixels: tuple[int, int]
+    num_threads: int
+    lists: tuple[Tensor, Tensor | None, Tensor, int]
+    view: tuple[int, int, int, float]
     depth: Tensor | None
     transmittance: Tensor
     last: Tensor
     joint_state: Tensor | None
-
-    @property
-    def num_images(self) -> int:
-        """1, or 3 with branches."""
-        return 1 if self.tiles.branch_lengths is None else NUM_BRANCH_IMAGES
 
 
 def is_small(size: tuple[int, int]) -> bool:
@@ -105,27 +107,6 @@ def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, 
     return (columns, rows), num_tiles * blocks_of_tile, lanes
 
 
-def _launch(
-    make_kernel: Callable[..., Any],
-    variant: bool,
-    rows: Rows,
-    background: Tensor | None,
-    traversal: Traversal,
-    *arguments: Any,
-    per_shard: Tensor | None,
-) -> None:
-    """Launches a compositing kernel over all blocks of pixels of all images."""
-    tiles, size, num_images = traversal.tiles, traversal.size, traversal.num_images
-    pixels, blocks, lanes = _layout(size, tiles)
-    stride = 0 if background is None or background.ndim == 1 else rows.num_features
-    lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
-    inputs = (*lists, rows.packed, background, stride, *size, traversal.max_alpha)
-    kernel = make_kernel(rows.num_features, rows.with_depth, num_images, pixels, variant)
-    work = TILE_SIZE * TILE_SIZE
-    dim = num_images * blocks * lanes
-    launch(kernel, dim, *inputs, *arguments, per_shard=(per_shard,), block_dim=BLOCK_DIM, work=work)
-
-
 def composite_fwd(
     rows: Rows, tiles: Tiles, size: tuple[int, int], background: Tensor | None, statistics: bool, max_alpha: float
 ) -> tuple[Composite, Traversal]:
@@ -144,21 +125,25 @@ def composite_fwd(
     """
     width, height = size
     num_images = 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
-    num_pixels = num_images * height * width
-    if num_pixels >= MAX_PIXELS:
+    if num_images * height * width >= MAX_PIXELS:
         raise ValueError(f"{num_images} images of {width} x {height} pixels are too large to be rendered at once")
-    new, new_int = rows.packed.new_empty, tiles.ranges.new_empty
+    packed, num_features, with_depth = rows
+    new, new_int = packed.new_empty, tiles.ranges.new_empty
+    pixels, blocks, lanes = _layout(size, tiles)
+    stride = 0 if background is None or background.ndim == 1 else num_features
     shape = (height, width) if num_images == 1 else (num_images, height, width)
-    image, alpha = new(*shape, rows.num_features), new(shape)
-    depth = new(shape) if rows.with_depth else None
-    joint_state = None if num_images == 1 else new_int(_layout(size, tiles)[1]).zero_()
+    image, alpha, depth = new(*shape, num_features), new(shape), new(shape) if with_depth else None
     own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
-    traversal = Traversal(tiles, size, max_alpha, own_depth, new(shape), new_int(shape), joint_state)
-    N, shards = rows.packed.shape[0], num_shards(image.device)
-    contributed = new(N, dtype=torch.uint8).zero_() if statistics else None
-    weights = new(shards, N).zero_() if statistics else None
-    outputs = (image, depth, alpha, *traversal[4:], contributed)
-    _launch(make_composite_fwd, statistics, rows, background, traversal, *outputs, per_shard=weights)
+    joint_state = None if num_images == 1 else new_int(blocks).zero_()
+    lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
+    own = (own_depth, new(shape), new_int(shape), joint_state)
+    traversal = Traversal(num_images, pixels, num_images * blocks * lanes, lists, (stride, *size, max_alpha), *own)
+    contributed = packed.new_zeros(packed.shape[0], dtype=torch.uint8) if statistics else None
+    weights = packed.new_zeros(num_shards(packed), packed.shape[0]) if statistics else None
+    kernel = make_composite_fwd(num_features, with_depth, num_images, pixels, statistics)
+    inputs = (*traversal.lists, packed, background, *traversal.view)
+    outputs = (image, depth, alpha, *own[1:], contributed)
+    launch(kernel, traversal.num_threads, *inputs, *outputs, per_shard=(weights,), block_dim=BLOCK_DIM, work=WORK)
     found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
     images, alphas, depths = (_layers(t, num_images) for t in (image, alpha, depth))
     return Composite(images, alphas, depths, found), traversal
@@ -192,10 +177,11 @@ def composite_bwd(
         if v is not None:
             v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = v
             images_with_gradient |= 1 << (k % num_images)
-    packed = rows.packed
-    v_rows = packed.new_zeros(num_shards(packed.device), packed.shape[0], gradient_stride(rows.num_channels))
-    inputs = (*traversal[3:], *v_arrays, images_with_gradient)
-    _launch(make_composite_bwd, imagegrad, rows, background, traversal, *inputs, per_shard=v_rows)
+    packed, num_features, with_depth = rows
+    v_rows = packed.new_zeros(num_shards(packed), packed.shape[0], gradient_stride(num_features + int(with_depth)))
+    kernel = make_composite_bwd(num_features, with_depth, num_images, traversal.pixels, imagegrad)
+    inputs = (*traversal.lists, packed, background, *traversal.view, *traversal[5:], *v_arrays, images_with_gradient)
+    launch(kernel, traversal.num_threads, *inputs, per_shard=(v_rows,), block_dim=BLOCK_DIM, work=WORK)
     return v_rows
 
 

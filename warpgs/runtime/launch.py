@@ -38,9 +38,13 @@ CPU = -1
 _CORES = os.cpu_count() or 1
 
 
-def num_shards(device: torch.device) -> int:
-    """Number of cores that a CPU launch uses (``torch.get_num_threads()``); 1 on CUDA."""
-    return 1 if device.type == "cuda" else max(1, min(torch.get_num_threads(), _CORES))
+def num_shards(tensor: Tensor) -> int:
+    """Number of cores that a launch uses on the device of a tensor: ``torch.get_num_threads()`` on CPU, 1 on CUDA."""
+    return 1 if tensor.is_cuda else _num_cores()
+
+
+def _num_cores() -> int:
+    return max(1, min(torch.get_num_threads(), _CORES))
 
 
 def launch(
@@ -91,7 +95,7 @@ def launch_on_cpu(
     kernel: wp.Kernel, dim: int, arguments: tuple[Any, ...], per_shard: tuple[Tensor | None, ...], work: int | float
 ) -> None:
     """Launches a kernel on one core, or cut into shards on all of them."""
-    shards = num_shards(torch.device("cpu")) if dim * work >= MIN_SHARD else 1
+    shards = _num_cores() if dim * work >= MIN_SHARD else 1
     chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
     def run_shard(shard: int) -> None:
@@ -108,7 +112,7 @@ def on_all_cores(function: Callable[[int], None], number: int) -> None:
 
     It helps those functions that release Python's global interpreter lock.
     """
-    if number == 1 or num_shards(torch.device("cpu")) == 1:
+    if number == 1 or _num_cores() == 1:
         for index in range(number):
             function(index)
     else:
