@@ -84,11 +84,12 @@ class _Request(NamedTuple):
 
     size: tuple[int, int]
     settings: RenderSettings
+    num_features: int
     sh_degree: int | None
 
 
 class _Inputs(NamedTuple):
-    """All tensors that a render depends on, or their gradients."""
+    """All tensors that a render depends on."""
 
     means: Any
     quats: Any
@@ -99,17 +100,30 @@ class _Inputs(NamedTuple):
     K: Any
     background: Any
     screen_offsets: Any
-    branch: Any = None
+    branch: Any
 
 
 class _Saved(NamedTuple):
-    """The tensors of the forward pass that the backward pass reads besides its inputs."""
+    """What the backward pass reads of the tensors that autograd saved.
 
-    conics: Tensor
+    ``features`` and ``sh`` are None without spherical harmonics. ``layers`` are the depths, to be checked for changes,
+    and the alphas if the background requires a gradient.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
     opacities: Tensor
+    viewmat: Tensor
+    K: Tensor
+    background: Tensor | None
+    sh: Any
+    features: Any
+    conics: Tensor
+    splat_opacities: Tensor
     radii: Tensor
-    features: Tensor
-    packed: Tensor
+    rows: Rows
+    layers: tuple[Tensor, ...]
 
 
 def render(
@@ -154,21 +168,16 @@ def _request(splats: Splats, camera: Camera, settings: RenderSettings) -> _Reque
     degree = None
     if splats.sh is not None:
         degree = degree_of(splats.sh.shape[1]) if splats.sh_degree is None else splats.sh_degree
-    return _Request(camera.size, settings, degree)
+    return _Request(camera.size, settings, splats.num_channels, degree)
 
 
 def _inputs(
     splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings, screen_offsets: Tensor | None
 ) -> _Inputs:
-    return _Inputs(
-        *(splats.means, splats.quats, splats.scales, splats.opacities),
-        appearance=splats.colors if splats.sh is None else splats.sh,
-        viewmat=camera.viewmat,
-        K=camera.K,
-        background=background,
-        screen_offsets=screen_offsets,
-        branch=splats.is_dynamic.view(torch.uint8) if settings.branches and splats.is_dynamic is not None else None,
-    )
+    geometry = splats.means, splats.quats, splats.scales, splats.opacities
+    appearance = splats.colors if splats.sh is None else splats.sh
+    branch = splats.is_dynamic.view(torch.uint8) if settings.branches and splats.is_dynamic is not None else None
+    return _Inputs(*geometry, appearance, camera.viewmat, camera.K, background, screen_offsets, branch)
 
 
 def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Rendering:
@@ -201,8 +210,8 @@ def _check_inputs(
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
     """project → bin → composite; every differentiable step records its backward function on one tape."""
-    inputs, (size, settings, sh_degree) = _Inputs(*tensors), request
-    back, tape = _Backward(request), Tape()
+    inputs, (size, settings, _, sh_degree) = _Inputs(*tensors), request
+    back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
     splats, features, order = _project(request, inputs)
     for step in [back.unpack_and_unproject] if sh_degree is None else [back.unproject, back.color, back.unpack]:
@@ -213,39 +222,43 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, *options)
     tape.record_func(back.composite, [])
 
-    saved = _Saved(*splats[:3], features, rows.packed)
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
+    sh = None if sh_degree is None else inputs.appearance
+    camera = (inputs.viewmat, inputs.K, inputs.background)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
         backward=partial(_backward, back, tape),
-        saved=(*inputs, *saved, *composite.depths, *alphas),
-        constants=(saved.radii, *composite.statistics, *num_intersections),
+        saved=(*inputs[:4], *camera, sh, features, *splats[:3], rows.packed, *composite.depths, *alphas),
+        constants=(splats.radii, *composite.statistics, *num_intersections),
     )
 
 
-def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor, DepthOrder]:
-    """project → color → pack: splats, features, order by depth; without spherical harmonics it is a single kernel."""
+def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor | None, DepthOrder]:
+    """project → color → pack: splats, colours, order by depth; without spherical harmonics it is a single kernel."""
     geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *request.size)
-    settings, features, offsets = request.settings, inputs.appearance, inputs.screen_offsets
+    settings, appearance, offsets = request.settings, inputs.appearance, inputs.screen_offsets
     near, antialias, with_depth = settings.near, settings.antialias, settings.depth
     if request.sh_degree is None:
-        splats, order = project_and_pack(geometry, features, view, near, antialias, with_depth, offsets)
-        return splats, features, order
+        splats, order = project_and_pack(geometry, appearance, view, near, antialias, with_depth, offsets)
+        return splats, None, order
     projection = project_fwd(geometry, view, near, antialias, offsets)
-    features = sh_fwd(inputs.means, features, inputs.viewmat, projection.radii, request.sh_degree)
+    features = sh_fwd(inputs.means, appearance, inputs.viewmat, projection.radii, request.sh_degree)
     rows, order = pack(projection, features, with_depth)
     return PackedSplats(projection.conics, projection.opacities, projection.radii, rows), features, order
 
 
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
     """composite → unproject: plays the tape in reverse."""
-    back.begin(saved, v_layers)
+    num_tensors = len(_Saved._fields) - 2
+    rows = Rows(saved[num_tensors], back.request.num_features, back.request.settings.depth)
+    back.saved = _Saved._make((*saved[:num_tensors], rows, saved[num_tensors + 1 :]))
+    back.v = {"layers": v_layers}
     try:
         tape.backward()
-        return back.gradients()
+        return [back.v.get(name) for name in _Inputs._fields]
     finally:
-        back.end()
+        del back.saved, back.v  # outputs among them would keep their own node alive
 
 
 class _Backward:
@@ -255,86 +268,65 @@ class _Backward:
 
     Attributes:
         request: Of the render.
+        with_offsets: Whether ``screen_offsets`` get a gradient.
+        imagegrad: Whether it is that of the images alone.
         traversal: Of the forward pass.
-        inputs, saved, layers: What was saved for the backward pass; during it only.
-        v_layers: Gradients of the images, alphas and depths.
-        v_rows, v_splats: Gradients that one method leaves to the next.
-        v: Gradients of the inputs so far, by name.
+        saved: What autograd saved; during the backward pass only.
+        v: Gradients so far: of inputs by their names, and of ``layers``, ``rows`` and ``splats``; during it only.
     """
 
     traversal: Traversal
+    saved: _Saved
+    v: dict[str, Any]
 
-    def __init__(self, request: _Request) -> None:
-        self.request = request
-
-    def begin(self, saved: tuple[Any, ...], v_layers: Gradients) -> None:
-        """Receives the saved tensors and the gradients of the layers."""
-        first, second = len(_Inputs._fields), len(_Inputs._fields) + len(_Saved._fields)
-        self.inputs, self.saved, self.layers = _Inputs(*saved[:first]), _Saved(*saved[first:second]), saved[second:]
-        self.v_layers, self.v = v_layers, dict[str, Tensor | None]()
+    def __init__(self, request: _Request, with_offsets: bool) -> None:
+        self.request, self.with_offsets = request, with_offsets
+        self.imagegrad = request.settings.imagegrad and with_offsets
 
     def composite(self) -> None:
-        background, traversal = self.inputs.background, self.traversal
-        self.v_rows = composite_bwd(self._rows(), background, traversal, self.v_layers, self._imagegrad())
-        if _has_gradient(background):
-            alphas = self.layers[-traversal.num_images :]
-            self.v["background"] = background_bwd(background, alphas, self.v_layers[: traversal.num_images])
+        saved, traversal, v = self.saved, self.traversal, self.v
+        v["rows"] = composite_bwd(saved.rows, saved.background, traversal, v["layers"], self.imagegrad)
+        if saved.background is not None and saved.background.requires_grad:
+            alphas = saved.layers[-traversal.num_images :]
+            v["background"] = background_bwd(saved.background, alphas, v["layers"][: traversal.num_images])
 
     def unpack(self) -> None:
-        splats, with_offsets = (self.saved.conics, self.saved.opacities), _has_gradient(self.inputs.screen_offsets)
-        size = self.request.size
-        self.v_splats = unpack(splats, self._rows(), self.v_rows, size, with_offsets, self._imagegrad())
-        self.v["appearance"], self.v["screen_offsets"] = self.v_splats.features, self.v_splats.screen_offsets
+        saved, v = self.saved, self.v
+        splats, size = (saved.conics, saved.splat_opacities), self.request.size
+        v["splats"] = unpack(splats, saved.rows, v["rows"], size, self.with_offsets, self.imagegrad)
+        v["screen_offsets"] = v["splats"].screen_offsets
 
     def color(self) -> None:
-        means, sh, viewmat = self.inputs.means, self.inputs.appearance, self.inputs.viewmat
-        degree, features = self.request.sh_degree, self.saved.features
+        saved, v, degree = self.saved, self.v, self.request.sh_degree
         assert degree is not None
-        v_means, v_sh, v_viewmat = sh_bwd(
-            (means, sh, viewmat, self.saved.radii), degree, features, self.v_splats.features
-        )
-        self.v |= {"means": v_means, "appearance": v_sh, "viewmat": v_viewmat}
+        inputs = (saved.means, saved.sh, saved.viewmat, saved.radii)
+        v["means"], v["appearance"], v["viewmat"] = sh_bwd(inputs, degree, saved.features, v["splats"].features)
 
     def unproject(self) -> None:
-        view = View(self.inputs.viewmat, self.inputs.K, *self.request.size)
-        splats, antialias = (self.saved.conics, self.saved.radii), self.request.settings.antialias
-        v_geometry, v_viewmat, self.v["K"] = project_bwd(
-            Geometry(*self.inputs[:4]), view, antialias, splats, self.v_splats[:4], self.v.get("means")
+        saved, v, antialias = self.saved, self.v, self.request.settings.antialias
+        splats, v_colors = (saved.conics, saved.radii), v["viewmat"]
+        v_geometry, v_viewmat, v["K"] = project_bwd(
+            Geometry(*saved[:4]), self._view(), antialias, splats, v["splats"][:4], v["means"]
         )
-        self.v |= v_geometry._asdict()
-        v_colors = self.v.get("viewmat")
-        self.v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
+        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
+        v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
 
     def unpack_and_unproject(self) -> None:
-        inputs, saved, settings = self.inputs, self.saved, self.request.settings
-        v_geometry, (v_viewmat, v_K), v_features, v_offsets = unpack_and_unproject(
-            Geometry(*inputs[:4]),
-            View(inputs.viewmat, inputs.K, *self.request.size),
-            settings.antialias,
-            PackedSplats(saved.conics, saved.opacities, saved.radii, self._rows()),
-            self.v_rows,
-            _has_gradient(inputs.screen_offsets),
-            self._imagegrad(),
+        saved, v = self.saved, self.v
+        v_geometry, v_camera, v["appearance"], v["screen_offsets"] = unpack_and_unproject(
+            Geometry(*saved[:4]),
+            self._view(),
+            self.request.settings.antialias,
+            PackedSplats(saved.conics, saved.splat_opacities, saved.radii, saved.rows),
+            v["rows"],
+            self.with_offsets,
+            self.imagegrad,
         )
-        self.v |= v_geometry._asdict()
-        self.v |= {"appearance": v_features, "viewmat": v_viewmat, "K": v_K, "screen_offsets": v_offsets}
+        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
+        v["viewmat"], v["K"] = v_camera
 
-    def gradients(self) -> Gradients:
-        """The gradients of the inputs."""
-        return [self.v.get(name) for name in _Inputs._fields]
-
-    def end(self) -> None:
-        """Frees everything of this pass, also after an error: outputs among it would keep their own node alive."""
-        for name in ("inputs", "saved", "layers", "v_layers", "v_rows", "v_splats", "v"):
-            self.__dict__.pop(name, None)
-
-    def _rows(self) -> Rows:
-        features = self.saved.features.shape[1]
-        return Rows(self.saved.packed, features, self.request.settings.depth)
-
-    def _imagegrad(self) -> bool:
-        """Whether ``screen_offsets`` get the gradient of the images alone."""
-        return self.request.settings.imagegrad and _has_gradient(self.inputs.screen_offsets)
+    def _view(self) -> View:
+        return View(self.saved.viewmat, self.saved.K, *self.request.size)
 
 
 def _has_gradient(tensor: Tensor | None) -> bool:

@@ -120,15 +120,16 @@ def new_geometry(geometry: Geometry) -> Geometry:
     return Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))
 
 
-def new_camera_gradients(view: View, num_gaussians: int) -> Tensor:
-    """Memory for what each Gaussian contributes to the gradient of the camera; empty if the camera requires none."""
-    with_camera = view.viewmat.requires_grad or view.K.requires_grad
-    return view.viewmat.new_empty(num_gaussians, kernels.CAMERA_GRADIENTS if with_camera else 0)
+def new_camera_gradients(view: View, num_gaussians: int) -> Tensor | None:
+    """Memory for what each Gaussian contributes to the gradient of the camera; None if the camera requires none."""
+    if view.viewmat.requires_grad or view.K.requires_grad:
+        return view.viewmat.new_empty(num_gaussians, kernels.CAMERA_GRADIENTS)
+    return None
 
 
-def sum_camera_gradients(view: View, v_cameras: Tensor) -> tuple[Tensor | None, Tensor | None]:
+def sum_camera_gradients(view: View, v_cameras: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
     """Gradients of ``viewmat`` and ``K``; None if the camera requires none."""
-    if v_cameras.shape[1] == 0:
+    if v_cameras is None:
         return None, None
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
