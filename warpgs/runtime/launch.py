@@ -69,26 +69,15 @@ def launch(
     """
     if dim == 0:
         return
-    if profiling.is_on():  # a context manager takes the host longer, even one that does nothing
-        with profiling.span(kernel.func.__name__, arguments[0].device):
-            _launch(kernel, dim, arguments, per_shard, block_dim, work)
-    else:
-        _launch(kernel, dim, arguments, per_shard, block_dim, work)
-
-
-def _launch(
-    kernel: wp.Kernel,
-    dim: int,
-    arguments: tuple[Any, ...],
-    per_shard: tuple[Tensor | None, ...],
-    block_dim: int,
-    work: int | float,
-) -> None:
+    # A context manager takes the host longer, even one that does nothing.
+    begun = profiling.begin(arguments[0].device) if profiling.is_on() else None
     index = arguments[0].get_device()
     if index == CPU:
         launch_on_cpu(kernel, dim, arguments, per_shard, work)
     else:
         command_for(kernel, index, block_dim)(dim, 0, arguments + per_shard, current_stream(index))
+    if begun is not None:
+        profiling.end(kernel.func.__name__, begun, arguments[0].device)
 
 
 def launch_on_cpu(
@@ -254,10 +243,8 @@ _warp_stream = threading.Lock()
 def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
     arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
-    with profiling.span("sort_pairs", keys.device):
-        if not keys.is_cuda:
-            _native.wp_radix_sort_pairs_int_host(*arguments)
-            return
+    begun = profiling.begin(keys.device) if profiling.is_on() else None
+    if keys.is_cuda:
         stream = current_stream(keys.get_device())
         with _warp_stream:
             previous = stream.device.stream
@@ -267,6 +254,10 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
                     _native.wp_radix_sort_pairs_int_device(*arguments)
             finally:
                 stream.device.set_stream(previous, sync=False)
+    else:
+        _native.wp_radix_sort_pairs_int_host(*arguments)
+    if begun is not None:
+        profiling.end("sort_pairs", begun, keys.device)
 
 
 _native = wp.get_device("cpu").runtime.core

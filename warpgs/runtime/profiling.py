@@ -30,13 +30,6 @@ class Profile:
             torch.cuda.synchronize()
         return [KernelTime(n, _milliseconds(self._entries[0][1], a), _milliseconds(a, b)) for n, a, b in self._entries]
 
-    @contextlib.contextmanager
-    def span(self, name: str, device: torch.device) -> Iterator[None]:
-        """Times the body of a ``with`` statement as one entry."""
-        begin = _now(device)
-        yield
-        self._entries.append((name, begin, _now(device)))
-
 
 def _now(device: torch.device) -> Any:
     """A CUDA event on the current stream, or the time on CPU."""
@@ -52,7 +45,6 @@ def _milliseconds(begin: Any, end: Any) -> float:
 
 
 _active_profile: Profile | None = None
-_NOTHING = contextlib.nullcontext()
 
 
 @contextlib.contextmanager
@@ -77,6 +69,20 @@ def is_on() -> bool:
     return _active_profile is not None
 
 
-def span(name: str, device: torch.device) -> contextlib.AbstractContextManager[None]:
+def begin(device: torch.device) -> Any:
+    """The time now, for ``end``; None unless a profile is active."""
+    return None if _active_profile is None else _now(device)
+
+
+def end(name: str, begun: Any, device: torch.device) -> None:
+    """Adds an entry from the time of ``begin`` until now."""
+    if _active_profile is not None and begun is not None:
+        _active_profile._entries.append((name, begun, _now(device)))
+
+
+@contextlib.contextmanager
+def span(name: str, device: torch.device) -> Iterator[None]:
     """Times the body of a ``with`` statement if a profile is active."""
-    return _NOTHING if _active_profile is None else _active_profile.span(name, device)
+    begun = begin(device)
+    yield
+    end(name, begun, device)
