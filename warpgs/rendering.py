@@ -196,14 +196,14 @@ def _check_inputs(
 ) -> None:
     if not isinstance(camera, Camera):
         raise TypeError(f"camera must be one Camera, got {type(camera).__name__}: call render once per camera")
-    C = splats.num_channels
     if background is not None:
         is_per_image = settings.branches and isinstance(background, Tensor) and background.ndim == 2
+        C = splats.num_channels
         check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_per_image else (C,), {})
     if screen_offsets is not None:
         check_tensor("screen_offsets", screen_offsets, ("N", 2), {"N": len(splats.means)})
-    tensors = {"background": background, "screen_offsets": screen_offsets}
-    check_same_device({"splats": splats.means, "camera": camera.viewmat, **tensors})
+    tensors = (splats.means, camera.viewmat, background, screen_offsets)
+    check_same_device(dict(zip(("splats", "camera", "background", "screen_offsets"), tensors, strict=True)))
     if settings.branches and splats.is_dynamic is None:
         raise ValueError("branches were requested, but splats.is_dynamic is None")
 

@@ -132,11 +132,11 @@ def composite_fwd(
     pixels, blocks, lanes = _layout(size, tiles)
     stride = 0 if background is None or background.ndim == 1 else num_features
     shape = (height, width) if num_images == 1 else (num_images, height, width)
-    image, alpha, depth = new(*shape, num_features), new(shape), new(shape) if with_depth else None
+    image, alpha, depth = new(*shape, num_features), new(*shape), new(*shape) if with_depth else None
     own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
     joint_state = None if num_images == 1 else new_int(blocks).zero_()
     lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
-    own = (own_depth, new(shape), new_int(shape), joint_state)
+    own = (own_depth, new(*shape), new_int(*shape), joint_state)
     traversal = Traversal(num_images, pixels, num_images * blocks * lanes, lists, (stride, *size, max_alpha), *own)
     contributed = packed.new_zeros(packed.shape[0], dtype=torch.uint8) if statistics else None
     weights = packed.new_zeros(num_shards(packed), packed.shape[0]) if statistics else None

@@ -57,10 +57,11 @@ class _Budget:
         self.recent_max: float | None = None
         with torch.inference_mode(False):  # otherwise it could not be written to outside of inference mode
             self.num_isects = torch.zeros(1, dtype=int64, pin_memory=torch.cuda.is_available())
+        self._number = self.num_isects.numpy()  # the same memory, which the host reads faster
 
     def capacity(self, num_gaussians: int) -> int:
         """Buffer size for the next frame, rounded up to an eighth of it so that the allocator sees few sizes."""
-        self.recent_max = max(float(self.num_isects.item()), (self.recent_max or 0.0) * DECAY)
+        self.recent_max = max(float(self._number[0]), (self.recent_max or 0.0) * DECAY)
         wanted = max(int(self.recent_max * HEADROOM), num_gaussians, 1024)
         step = 1 << max(wanted.bit_length() - 4, 0)
         return -(-wanted // step) * step
@@ -70,7 +71,7 @@ class _Budgets(threading.local):
     """The budgets of this thread, by device and size of the image."""
 
     def __init__(self) -> None:
-        self.by_size: dict[tuple[torch.device, tuple[int, int]], _Budget] = {}
+        self.by_size: dict[tuple[int, tuple[int, int]], _Budget] = {}
 
 
 _budgets = _Budgets()
@@ -88,19 +89,19 @@ def _capacity(end_of_rank: Tensor, size: tuple[int, int], max_intersections: int
     Raises:
         RuntimeError: If that is unknown during a CUDA graph capture, which must not wait for the device.
     """
-    N, device = end_of_rank.shape[0], end_of_rank.device
+    N, key = end_of_rank.shape[0], (end_of_rank.get_device(), size)
     if max_intersections is not None:
         return max(max_intersections, N), end_of_rank.new_empty(1)
-    if device.type == "cpu":
+    if not end_of_rank.is_cuda:
         return max(int(end_of_rank[-1]), N), end_of_rank.new_empty(1)
-    budget = _budgets.by_size.get((device, size))
+    budget = _budgets.by_size.get(key)
     if budget is None or budget.recent_max is None:
         if torch.cuda.is_current_stream_capturing():
             raise RuntimeError(
                 f"a CUDA graph captures the first render of {size[0]} x {size[1]} pixels on this thread: "
                 "set RenderSettings.max_intersections, or render once before"
             )
-        budget = _budgets.by_size.setdefault((device, size), budget or _Budget())
+        budget = _budgets.by_size.setdefault(key, budget or _Budget())
         budget.num_isects.copy_(end_of_rank[-1:])
     return budget.capacity(N), budget.num_isects
 
@@ -143,23 +144,26 @@ def bin_splats(
     end_of_rank = splats.new_empty(N, dtype=int64)  # intersections of each Gaussian and all in front of it
     launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, end_of_rank)
     torch.cumsum(end_of_rank, 0, out=end_of_rank)
-    return _bin(splats, (order.gaussian_from_rank, end_of_rank, is_dynamic), size, max_intersections)
+    capacity, num_isects = _capacity(end_of_rank, size, max_intersections)
+    return _bin(splats, (order.gaussian_from_rank, end_of_rank, is_dynamic), grid, capacity, num_isects)
 
 
 def _bin(
-    splats: Tensor, ranks: tuple[Tensor, Tensor, Tensor | None], size: tuple[int, int], max_intersections: int | None
+    splats: Tensor,
+    ranks: tuple[Tensor, Tensor, Tensor | None],
+    grid: tuple[int, int],
+    capacity: int,
+    num_isects: Tensor,
 ) -> Tiles:
     """Bins splats that have been sorted and counted."""
-    (_, end_of_rank, is_dynamic), (columns, rows) = ranks, num_tiles(*size)
-    N, total, new_int = splats.shape[0], columns * rows, ranks[0].new_empty
-    capacity, num_isects = _capacity(end_of_rank, size, max_intersections)
+    N, total, new_int = splats.shape[0], grid[0] * grid[1], ranks[0].new_empty
     isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
-    launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, columns, rows, capacity, *isects, num_isects)
+    launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, *grid, capacity, *isects, num_isects)
     sort_pairs(*isects, capacity, total.bit_length())
     ranges = new_int(total, 2)
     launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
-    tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
-    if is_dynamic is not None:
+    tiles = Tiles(ranges, isects[1], None if ranks[2] is None else torch.empty_like(ranges), num_isects)
+    if ranks[2] is not None:
         threads = total * (WARP_SIZE if splats.is_cuda else 1)
         launch(kernels.split_tiles, threads, ranges, tiles.half, *tiles[1:3], block_dim=BLOCK_DIM)
     return tiles

@@ -52,7 +52,7 @@ def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
         device = tensor.device
         if first is None:
             first_name, first = name, device
-            if first.type not in ("cpu", "cuda"):
+            if not (tensor.is_cuda or tensor.is_cpu):
                 raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
         elif device != first:
             raise ValueError(f"all tensors must be on one device: {first_name} is on {first}, {name} on {device}")
