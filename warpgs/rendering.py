@@ -210,7 +210,7 @@ def _check_inputs(
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
     """project → bin → composite; every differentiable step records its backward function on one tape."""
-    inputs, (size, settings, _, sh_degree) = _Inputs(*tensors), request
+    inputs, (size, settings, _, sh_degree) = _Inputs._make(tensors), request
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
     splats, features, order = _project(request, inputs)

@@ -47,16 +47,13 @@ class _Node(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        # Autograd records a backward pass only if it is asked to, which costs this check instead of a context manager.
-        return (_backward_once if torch.is_grad_enabled() else _backward)(ctx, *gradients)
+        if torch.is_grad_enabled():  # with create_graph=True only; the host would take longer to disable it always
+            return _backward_once(ctx, *gradients)
+        v_outputs = [None if v is None else v.contiguous() for v in gradients[: ctx.num_outputs]]
+        return None, *ctx.backward_function(ctx.saved_tensors, v_outputs)
 
 
-def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-    v_outputs = [None if v is None else v.contiguous() for v in gradients[: ctx.num_outputs]]
-    return None, *ctx.backward_function(ctx.saved_tensors, v_outputs)
-
-
-_backward_once = once_differentiable(_backward)
+_backward_once = once_differentiable(_Node.backward)
 
 
 def differentiable(op: Callable[..., Recorded], *tensors: Tensor | None) -> tuple[Tensor, ...]:
