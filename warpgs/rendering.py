@@ -202,8 +202,8 @@ def _check_inputs(
         check_tensor("background", background, (NUM_BRANCH_IMAGES, C) if is_per_image else (C,), {})
     if screen_offsets is not None:
         check_tensor("screen_offsets", screen_offsets, ("N", 2), {"N": len(splats.means)})
-    tensors = (splats.means, camera.viewmat, background, screen_offsets)
-    check_same_device(dict(zip(("splats", "camera", "background", "screen_offsets"), tensors, strict=True)))
+    tensors = {"background": background, "screen_offsets": screen_offsets}
+    check_same_device({"splats": splats.means, "camera": camera.viewmat, **tensors})
     if settings.branches and splats.is_dynamic is None:
         raise ValueError("branches were requested, but splats.is_dynamic is None")
 

@@ -45,6 +45,36 @@ def test_leading_axes_of_a_kernel_argument_are_flattened():
     assert torch.equal(sums, expected)
 
 
+def projected_radii(num: int, near: float, offsets: torch.Tensor | None) -> torch.Tensor:
+    splats, camera = make_splats(num), make_camera()
+    inputs = (splats.means, splats.quats, splats.scales, splats.opacities, camera.viewmat, camera.K, *camera.size)
+    means2d, radii = torch.zeros(num, 2), torch.zeros(num, 2, dtype=torch.int32)
+    outputs = (means2d, torch.zeros(num, 3), torch.zeros(num), torch.zeros(num), radii)
+    launching.launch(project_fwd, num, *inputs, near, 0, offsets, *outputs)
+    return torch.cat([means2d, radii], 1)
+
+
+def test_numbers_shapes_and_missing_arrays_may_change_from_launch_to_launch():
+    expected = projected_radii(7, 0.01, None)
+    assert expected[:, 2:].any()
+    assert not projected_radii(7, 1000.0, None).any()
+    shifted = projected_radii(7, 0.01, torch.full((7, 2), 0.1))
+    assert not torch.equal(shifted, expected)
+    assert projected_radii(9, 0.01, torch.full((9, 2), 0.1)).shape == (9, 4)
+    assert torch.equal(projected_radii(7, 0.01, torch.full((7, 2), 0.1)), shifted)
+    assert torch.equal(projected_radii(7, 0.01, None), expected)
+
+
+def test_a_camera_without_gradients_may_follow_one_with_gradients():
+    splats, camera = as_leaves(make_splats()), make_camera()
+    found = []
+    for with_gradient in (False, True, False):
+        camera.viewmat.requires_grad_(with_gradient)
+        found.append(torch.autograd.grad(render(splats, camera).joint.image.sum(), splats.means)[0])
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
 def image_and_gradients(seed: int) -> list[torch.Tensor]:
     splats = as_leaves(make_splats(80, seed=seed))
     image = render(splats, make_camera(40 + seed, 37)).joint.image

@@ -11,7 +11,6 @@ from warpgs.kernels import ssim as kernels
 from warpgs.runtime.launch import on_all_cores
 from warpgs.runtime.profiling import span
 
-CPU = torch.device("cpu")
 MAX_CHANNELS = 128
 """OpenCV's limit."""
 
@@ -27,7 +26,7 @@ def ssim_fwd(
     image: Tensor, target: Tensor, mask: Tensor | None, weights: tuple[float, float, float], with_partials: bool
 ) -> tuple[Tensor, Tensor]:
     """The forward pass; arguments and results are those of ``ssim.ssim_fwd``."""
-    with span("ssim_fwd", CPU):
+    with span("ssim_fwd", image):
         base, l1, similarity_weight = weights
         x, y = _masked(image, mask), _masked(target, mask)
         # The variances of both images are only needed as a sum.
@@ -62,7 +61,7 @@ def ssim_bwd(
     v_sum: Tensor,
 ) -> Tensor:
     """The backward pass; arguments and result are those of ``ssim.ssim_bwd``."""
-    with span("ssim_bwd", CPU):
+    with span("ssim_bwd", image):
         _, l1, similarity_weight = weights
         x, y = _masked(image, mask), _masked(target, mask)
         mean, square, cross = _windowed_means(*partials)

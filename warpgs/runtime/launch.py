@@ -69,15 +69,14 @@ def launch(
     """
     if dim == 0:
         return
-    # A context manager takes the host longer, even one that does nothing.
-    begun = profiling.begin(arguments[0].device) if profiling.is_on() else None
+    begun = profiling.begin(arguments[0])  # a context manager takes the host longer, even one that does nothing
     index = arguments[0].get_device()
     if index == CPU:
         launch_on_cpu(kernel, dim, arguments, per_shard, work)
     else:
         command_for(kernel, index, block_dim)(dim, 0, arguments + per_shard, current_stream(index))
     if begun is not None:
-        profiling.end(kernel.func.__name__, begun, arguments[0].device)
+        profiling.end(kernel.func.__name__, begun, arguments[0])
 
 
 def launch_on_cpu(
@@ -129,8 +128,8 @@ class Command:
     """A recorded launch of one kernel, whose arguments are overwritten in place.
 
     ``wp.launch`` packs and checks all arguments every time (22 µs on the host for a typical kernel, more than many
-    kernels take). Here, an argument with the same shape as last time only updates a pointer, and a number that is the
-    same nothing. Arrays are described in one piece of memory, which costs fewer cache misses than one for each.
+    kernels take). Here, an argument with the same shape as last time only updates a pointer, and an equal number
+    nothing. All arrays are described in one piece of memory, which costs fewer cache misses than one piece for each.
 
     Args:
         kernel: Its first parameter is ``first``, the index of the first thread.
@@ -243,7 +242,7 @@ _warp_stream = threading.Lock()
 def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
     arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
-    begun = profiling.begin(keys.device) if profiling.is_on() else None
+    begun = profiling.begin(keys)
     if keys.is_cuda:
         stream = current_stream(keys.get_device())
         with _warp_stream:
@@ -256,8 +255,7 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
                 stream.device.set_stream(previous, sync=False)
     else:
         _native.wp_radix_sort_pairs_int_host(*arguments)
-    if begun is not None:
-        profiling.end("sort_pairs", begun, keys.device)
+    profiling.end("sort_pairs", begun, keys)
 
 
 _native = wp.get_device("cpu").runtime.core

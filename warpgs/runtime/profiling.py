@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from torch import Tensor
 
 
 @dataclass
@@ -31,9 +32,9 @@ class Profile:
         return [KernelTime(n, _milliseconds(self._entries[0][1], a), _milliseconds(a, b)) for n, a, b in self._entries]
 
 
-def _now(device: torch.device) -> Any:
+def _now(tensor: Tensor) -> Any:
     """A CUDA event on the current stream, or the time on CPU."""
-    if device.type == "cpu":
+    if not tensor.is_cuda:
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
     event.record()
@@ -69,20 +70,20 @@ def is_on() -> bool:
     return _active_profile is not None
 
 
-def begin(device: torch.device) -> Any:
-    """The time now, for ``end``; None unless a profile is active."""
-    return None if _active_profile is None else _now(device)
+def begin(tensor: Tensor) -> Any:
+    """The time now on the device of a tensor, for ``end``; None unless a profile is active."""
+    return None if _active_profile is None else _now(tensor)
 
 
-def end(name: str, begun: Any, device: torch.device) -> None:
+def end(name: str, begun: Any, tensor: Tensor) -> None:
     """Adds an entry from the time of ``begin`` until now."""
     if _active_profile is not None and begun is not None:
-        _active_profile._entries.append((name, begun, _now(device)))
+        _active_profile._entries.append((name, begun, _now(tensor)))
 
 
 @contextlib.contextmanager
-def span(name: str, device: torch.device) -> Iterator[None]:
+def span(name: str, tensor: Tensor) -> Iterator[None]:
     """Times the body of a ``with`` statement if a profile is active."""
-    begun = begin(device)
+    begun = begin(tensor)
     yield
-    end(name, begun, device)
+    end(name, begun, tensor)
