@@ -56,6 +56,20 @@ def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(
     assert f"{later} left" in second
 
 
+def test_after_a_return_to_a_checkpoint_the_speed_is_that_of_the_iterations_since(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        for seconds, iteration in {20.0: 100, 40.0: 200}.items():
+            clock[0] += seconds
+            log.report(status(iteration))
+        log.begin(50)
+        for seconds, iteration in {30.0: 80, 60.0: 200}.items():
+            clock[0] += seconds
+            log.report(status(iteration))
+    *_, third, last = capsys.readouterr().out.splitlines()
+    assert third.endswith(" 1.0 it/s")
+    assert "2.0 it/s  150 s left" in last
+
+
 def test_lines_have_a_minimum_distance_in_time(tmp_path, capsys, clock):
     with TrainingLogger(tmp_path, 500, 0) as log:
         for iteration in range(10, 70, 10):

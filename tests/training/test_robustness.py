@@ -17,7 +17,9 @@ from warpgs.evaluation import evaluate, evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.training import command, losses
 from warpgs.training import train as script
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.step import Step
+from warpgs.training.trainer import MAX_ROLLBACKS
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -115,6 +117,27 @@ def test_a_loss_that_stays_not_finite_is_an_error(data, run, monkeypatch, first,
         tiny.train(trainer)
     assert (str(checkpoint.path_of(run, 7)) in str(caught.value)) == (first == 8)
     assert is_finite(run)
+
+
+@pytest.mark.parametrize(
+    ("device", "half", "hints"), [("cuda", True, True), ("cuda", False, False), ("cpu", True, False)]
+)
+def test_where_networks_train_in_half_precision_that_error_names_the_option(data, run, device, half, hints):
+    trainer = tiny.trainer(data, run)
+    trainer.device, trainer.rollbacks = torch.device(device), MAX_ROLLBACKS
+    trainer.config = dataclasses.replace(trainer.config, model=dataclasses.replace(trainer.config.model, half=half))
+    with TrainingLogger(None, tiny.LENGTH, 0) as log, pytest.raises(ValueError, match="not finite") as caught:
+        trainer._roll_back(log)
+    assert ("--model.no-half" in str(caught.value)) == hints
+
+
+def test_a_rollback_measures_the_speed_anew(spoiled_once, monkeypatch):
+    begun, begin = [], TrainingLogger.begin
+    monkeypatch.setattr(
+        TrainingLogger, "begin", lambda log, iteration: begun.append(iteration) or begin(log, iteration)
+    )
+    tiny.train(spoiled_once)
+    assert begun == [0, 7]
 
 
 def run_as_main(monkeypatch, capsys, *arguments):

@@ -51,14 +51,16 @@ class Status(NamedTuple):
 class TrainingLogger:
     """A context that shows progress and writes TensorBoard events, unless ``folder`` is None."""
 
+    _first: int
+    _last: tuple[int, float]
+
     def __init__(self, folder: Path | None, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
         self._console = Console(quiet=quiet)
         self._events = None if folder is None else SummaryWriter(str(folder), purge_step=first_iteration)
         self._total = num_iterations
         self._bar: Progress | None = None
         self._task: TaskID | None = None
-        self._first = first_iteration
-        self._last = (first_iteration, time.monotonic())
+        self.begin(first_iteration)
         self._last_line = 0.0
         if sys.stdout.isatty() and not quiet:
             self._bar = Progress(
@@ -123,6 +125,11 @@ class TrainingLogger:
         """Adds an 8-bit RGB image to the events."""
         if self._events is not None:
             self._events.add_image(name, image, iteration, dataformats="HWC")
+
+    def begin(self, iteration: int) -> None:
+        """Measures the speed from this iteration on, as when a training begins or returns to a checkpoint."""
+        self._first = iteration
+        self._last = (iteration, time.monotonic())
 
     def skip(self, seconds: float) -> None:
         """Leaves out time in which nothing was trained [s]."""

@@ -289,11 +289,14 @@ class Trainer:
         failed_at, rollbacks = self.iteration, self.rollbacks + 1
         saved = checkpoint.list_checkpoints(self.run)
         if rollbacks > MAX_ROLLBACKS or not saved:
+            half = self.config.model.half and self.device.type == "cuda"
             raise ValueError(
                 f"the loss or a parameter is not finite after iteration {failed_at}, even after {self.rollbacks} "
                 f"returns to a checkpoint; {saved[-1] if saved else 'no checkpoint'} holds the last valid state"
+                + ("; --model.no-half trains the networks in single precision" if half else "")
             )
         self.restore_newest(logger.log)
+        logger.begin(self.iteration)
         self.rollbacks = rollbacks
         logger.log(
             f"the loss or a parameter is not finite after iteration {failed_at}: back to iteration {self.iteration}, "
