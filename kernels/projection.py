@@ -212,7 +212,6 @@ def unproject(
     width: int,
     height: int,
     compensate: int,
-    conics: wp.array[wp.vec3],
     radii: wp.array[wp.vec2i],
     v_splat: Splat,
     v_means: wp.array[wp.vec3],
@@ -251,22 +250,21 @@ def unproject(
     shape = orientation * wp.diag(s)
     spread = to_image * shape
 
-    conic = conics[i]
+    a_sharp = wp.dot(spread[0], spread[0])
+    b = wp.dot(spread[0], spread[1])
+    c_sharp = wp.dot(spread[1], spread[1])
+    det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+    det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
+    A = (c_sharp + LOW_PASS) / det
+    B = -b / det
+    C = (a_sharp + LOW_PASS) / det
     v_conic = v_splat.conic
-    A = conic[0]
-    B = conic[1]
-    C = conic[2]
     v_a = -(A * A * v_conic[0] + A * B * v_conic[1] + B * B * v_conic[2])
     v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
     v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
 
     v_opacity = float(v_splat.opacity)
     if compensate != 0:
-        a_sharp = wp.dot(spread[0], spread[0])
-        b = wp.dot(spread[0], spread[1])
-        c_sharp = wp.dot(spread[1], spread[1])
-        det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
-        det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
         compensation = wp.sqrt(det_sharp / det)
         # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
         # finite for needles and for discs seen edge-on, whose compensated opacity is far below ALPHA_MIN.
@@ -344,7 +342,6 @@ def project_bwd(
     width: int,
     height: int,
     compensate: int,
-    conics: wp.array[wp.vec3],
     radii: wp.array[wp.vec2i],
     v_means2d: wp.array[wp.vec2],
     v_conics: wp.array[wp.vec3],
@@ -380,7 +377,6 @@ def project_bwd(
         width,
         height,
         compensate,
-        conics,
         radii,
         v_splat,
         v_means,

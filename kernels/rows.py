@@ -17,8 +17,8 @@ import functools
 
 import warp as wp
 
-from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LOG2_E
-from .lanes import native
+from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LN_2, LOG2_E
+from .lanes import exp2, native
 from .projection import Splat, project, unproject
 
 GEOMETRY_PARTS = wp.constant(2)
@@ -165,8 +165,6 @@ def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         compensate: int,
         screen_offsets: wp.array[wp.vec2],
         features: wp.array2d[float],
-        conics: wp.array[wp.vec3],
-        splat_opacities: wp.array[float],
         radii: wp.array[wp.vec2i],
         rows: wp.array2d[wp.vec4],
         depth_keys: wp.array[int],
@@ -174,8 +172,6 @@ def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
     ):
         i = first + wp.tid()
         splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
-        conics[i] = splat.conic
-        splat_opacities[i] = splat.opacity
         if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank):
             splat.radius = wp.vec2i(0, 0)
         radii[i] = splat.radius
@@ -198,8 +194,6 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     @wp.func
     def unpack_splat(
         i: int,
-        conics: wp.array[wp.vec3],
-        opacities: wp.array[float],
         rows: wp.array2d[wp.vec4],
         gradients: wp.array3d[float],
         half_width: float,
@@ -224,11 +218,13 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
                 total += gradients[shard, i, wp.static(num_channels) + k]
             s[k] = total
         v_offset = wp.vec2(0.0)
-        if rows[i, 1][1] != CULLED_LOG2_OPACITY:
-            conic = conics[i]
+        row0 = row_load(rows, i, 0)
+        row1 = row_load(rows, i, 1)
+        if row1[1] != CULLED_LOG2_OPACITY:
+            conic = LN_2 * wp.vec3(2.0 * row0[2], row0[3], 2.0 * row1[0])
             v_splat.mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
             v_splat.conic = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
-            v_splat.opacity = s[0] / opacities[i]
+            v_splat.opacity = s[0] / exp2(row1[1])
             v_offset = v_splat.mean
             if imagegrad != 0:
                 v_offset = -wp.vec2(s[6], s[7])
@@ -247,8 +243,6 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
     @wp.kernel(enable_backward=False, module="unique")
     def unpack(
         first: int,
-        conics: wp.array[wp.vec3],
-        opacities: wp.array[float],
         rows: wp.array2d[wp.vec4],
         gradients: wp.array3d[float],
         half_width: float,
@@ -262,9 +256,7 @@ def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
         v_screen_offsets: wp.array[wp.vec2],
     ):
         i = first + wp.tid()
-        v_splat = unpack_splat(
-            i, conics, opacities, rows, gradients, half_width, half_height, imagegrad, v_features, v_screen_offsets
-        )
+        v_splat = unpack_splat(i, rows, gradients, half_width, half_height, imagegrad, v_features, v_screen_offsets)
         v_means2d[i] = v_splat.mean
         v_conics[i] = v_splat.conic
         v_opacities[i] = v_splat.opacity
@@ -291,8 +283,6 @@ def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
         width: int,
         height: int,
         compensate: int,
-        conics: wp.array[wp.vec3],
-        splat_opacities: wp.array[float],
         radii: wp.array[wp.vec2i],
         rows: wp.array2d[wp.vec4],
         gradients: wp.array3d[float],
@@ -312,8 +302,6 @@ def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
         half_height = 0.5 * float(height)
         v_splat = unpack_splat(
             i,
-            conics,
-            splat_opacities,
             rows,
             gradients,
             half_width,
@@ -333,7 +321,6 @@ def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
             width,
             height,
             compensate,
-            conics,
             radii,
             v_splat,
             v_means,

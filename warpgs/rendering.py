@@ -119,8 +119,6 @@ class _Saved(NamedTuple):
     background: Tensor | None
     sh: Any
     features: Any
-    conics: Tensor
-    splat_opacities: Tensor
     radii: Tensor
     rows: Rows
     layers: tuple[Tensor, ...]
@@ -229,7 +227,7 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     return Recorded(
         outputs=composite.layers,
         backward=partial(_backward, back, tape),
-        saved=(*inputs[:4], *camera, sh, features, *splats[:3], rows.packed, *composite.depths, *alphas),
+        saved=(*inputs[:4], *camera, sh, features, splats.radii, rows.packed, *composite.depths, *alphas),
         constants=(splats.radii, *composite.statistics, *num_intersections),
     )
 
@@ -245,7 +243,7 @@ def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor |
     projection = project_fwd(geometry, view, near, antialias, offsets)
     features = sh_fwd(inputs.means, appearance, inputs.viewmat, projection.radii, request.sh_degree)
     rows, order = pack(projection, features, with_depth)
-    return PackedSplats(projection.conics, projection.opacities, projection.radii, rows), features, order
+    return PackedSplats(projection.radii, rows), features, order
 
 
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
@@ -292,8 +290,7 @@ class _Backward:
 
     def unpack(self) -> None:
         saved, v = self.saved, self.v
-        splats, size = (saved.conics, saved.splat_opacities), self.request.size
-        v["splats"] = unpack(splats, saved.rows, v["rows"], size, self.with_offsets, self.imagegrad)
+        v["splats"] = unpack(saved.rows, v["rows"], self.request.size, self.with_offsets, self.imagegrad)
         v["screen_offsets"] = v["splats"].screen_offsets
 
     def color(self) -> None:
@@ -304,9 +301,9 @@ class _Backward:
 
     def unproject(self) -> None:
         saved, v, antialias = self.saved, self.v, self.request.settings.antialias
-        splats, v_colors = (saved.conics, saved.radii), v["viewmat"]
+        geometry, v_colors = Geometry(*saved[:4]), v["viewmat"]
         v_geometry, v_viewmat, v["K"] = project_bwd(
-            Geometry(*saved[:4]), self._view(), antialias, splats, v["splats"][:4], v["means"]
+            geometry, self._view(), antialias, saved.radii, v["splats"][:4], v["means"]
         )
         v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
         v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
@@ -317,7 +314,7 @@ class _Backward:
             Geometry(*saved[:4]),
             self._view(),
             self.request.settings.antialias,
-            PackedSplats(saved.conics, saved.splat_opacities, saved.radii, saved.rows),
+            PackedSplats(saved.radii, saved.rows),
             v["rows"],
             self.with_offsets,
             self.imagegrad,

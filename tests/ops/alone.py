@@ -16,13 +16,13 @@ def project(geometry, view, *, near=0.01, antialias=False) -> Projection:
     def op(*tensors):
         *tensors, viewmat, K = tensors
         splats = project_fwd(Geometry(*tensors), View(viewmat, K, *size), near, antialias)
-        saved = (*tensors, viewmat, K, splats.conics, splats.radii)
+        saved = (*tensors, viewmat, K, splats.radii)
         return Recorded(splats[:4], backward, saved, constants=(splats.radii,))
 
     def backward(saved, v_splats):
-        *tensors, viewmat, K, conics, radii = saved
+        *tensors, viewmat, K, radii = saved
         view = View(viewmat, K, *size)
-        v_geometry, *v_camera = project_bwd(Geometry(*tensors), view, antialias, (conics, radii), v_splats)
+        v_geometry, *v_camera = project_bwd(Geometry(*tensors), view, antialias, radii, v_splats)
         return *v_geometry, *v_camera
 
     return Projection(*differentiable(op, *geometry, view.viewmat, view.K))
@@ -57,12 +57,12 @@ def composite(
         result, traversal = composite_fwd(rows, tiles, size, background, statistics, max_alpha)
 
         def backward(saved, v_layers):
-            _, conics, _, opacities, _, background, *alphas = saved
-            v_splats = unpack((conics, opacities), rows, composite_bwd(rows, background, traversal, v_layers), size)
+            background, *alphas = saved
+            v_splats = unpack(rows, composite_bwd(rows, background, traversal, v_layers), size)
             v_background = None if background is None else background_bwd(background, alphas, v_layers[:n])
             return *v_splats[:5], v_background
 
-        return Recorded(result.layers, backward, (*tensors, *result.alphas), constants=result.statistics)
+        return Recorded(result.layers, backward, (background, *result.alphas), constants=result.statistics)
 
     tensors = differentiable(op, *splats[:4], features, background)
     return Composite(tensors[:n], tensors[n : 2 * n], (), tensors[2 * n :])

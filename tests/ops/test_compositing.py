@@ -279,7 +279,7 @@ def test_gradients_on_screen_are_those_of_the_images_with_or_without_depth(input
     v_layers = [*v_images, *[None] * len(images), *v_depths]
     for imagegrad, expected in ((True, of_images), (False, of_images + of_depths)):
         v_rows = composite_bwd(rows, background, traversal, v_layers, imagegrad)
-        v_splats = unpack((conics, opacities), rows, v_rows, size, with_offsets=True, imagegrad=imagegrad)
+        v_splats = unpack(rows, v_rows, size, with_offsets=True, imagegrad=imagegrad)
         assert relative_error(v_splats.screen_offsets, expected * torch.tensor(size) / 2) < 1e-5
 
 

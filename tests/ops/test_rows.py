@@ -81,8 +81,8 @@ def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
     projection = project_fwd(geometry, view, 0.01, True, offsets)
     rows, order = pack(projection, features, with_depth)
     splats, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
-    expected = (projection.conics, projection.opacities, projection.radii, rows.packed, *order)
-    for result, tensor in zip((*splats[:3], splats.rows.packed, *own_order), expected, strict=True):
+    expected = (projection.radii, rows.packed, *order)
+    for result, tensor in zip((splats.radii, splats.rows.packed, *own_order), expected, strict=True):
         assert torch.equal(result.view(torch.int32)[:NUM], tensor.view(torch.int32)[:NUM])
 
 
@@ -93,8 +93,8 @@ def test_unpacking_and_unprojecting_at_once_gives_the_same_bits(with_depth, imag
     view.viewmat.requires_grad_()
     packed, _ = project_and_pack(geometry, random_features(), view, 0.01, True, with_depth)
     v_rows = torch.randn(2, NUM, gradient_stride(packed.rows.num_channels), generator=generator())
-    v_splats = unpack(packed[:2], packed.rows, v_rows, SIZE, True, imagegrad)
-    v_geometry, *v_camera = project_bwd(geometry, view, True, (packed.conics, packed.radii), v_splats[:4])
+    v_splats = unpack(packed.rows, v_rows, SIZE, True, imagegrad)
+    v_geometry, *v_camera = project_bwd(geometry, view, True, packed.radii, v_splats[:4])
     result = unpack_and_unproject(geometry, view, True, packed, v_rows, True, imagegrad)
     expected = (*v_geometry, *v_camera, v_splats.features, v_splats.screen_offsets)
     for value, tensor in zip((*result[0], *result[1], *result[2:]), expected, strict=True):
@@ -119,7 +119,7 @@ def test_gradients_equal_the_reference(with_depth):
     v_alpha = torch.randn(NUM, 40, generator=generator(2)).double()
     rows, _ = pack(splats, features, with_depth)
     gradient_rows = random_gradient_rows(splats, pixels, v_alpha, rows.num_channels)
-    v_splats = unpack((splats.conics, splats.opacities), rows, gradient_rows, SIZE, with_offsets=True)
+    v_splats = unpack(rows, gradient_rows, SIZE, with_offsets=True)
 
     leaves = [t[visible].double().requires_grad_() for t in (splats.means2d, splats.conics, splats.opacities)]
     (reference.log_alpha(*leaves, pixels).exp() * v_alpha[visible]).sum().backward()
@@ -138,7 +138,7 @@ def test_gradients_are_summed_over_shards():
     splats, features = projected(), random_features()
     rows, _ = pack(splats, features, False)
     shards = torch.rand(3, NUM, gradient_stride(5), generator=generator())
-    v_splats = unpack((splats.conics, splats.opacities), rows, shards, SIZE)
+    v_splats = unpack(rows, shards, SIZE)
     assert error(v_splats.features, shards[:, :, :5].sum(0)) < 1e-6
     assert v_splats.screen_offsets is None
 
@@ -147,6 +147,6 @@ def test_gradients_are_summed_over_shards():
 def test_few_gaussians_are_enough(num):
     splats, features = projected(num), random_features(num)
     rows, _ = pack(splats, features, False)
-    v_splats = unpack((splats.conics, splats.opacities), rows, torch.zeros(1, num, gradient_stride(5)), SIZE)
+    v_splats = unpack(rows, torch.zeros(1, num, gradient_stride(5)), SIZE)
     assert rows.packed.shape == (num, 4, 4)
     assert v_splats.features.shape == (num, 5)

@@ -92,7 +92,7 @@ def project_bwd(
     geometry: Geometry,
     view: View,
     antialias: bool,
-    splats: tuple[Tensor, Tensor],
+    radii: Tensor,
     v_splats: Sequence[Tensor | None],
     v_means_of_colors: Tensor | None = None,
 ) -> tuple[Geometry, Tensor | None, Tensor | None]:
@@ -100,7 +100,7 @@ def project_bwd(
 
     Args:
         geometry, view, antialias: As in ``project_fwd``.
-        splats: Conics and radii of its result.
+        radii: Of its result.
         v_splats: Gradients of means2d, conics, depths and opacities of its result; None for zeros.
         v_means_of_colors: [N, 3] gradient of the means through the colours, to be added; overwritten.
     """
@@ -109,7 +109,7 @@ def project_bwd(
     if v_means_of_colors is not None:
         v_geometry = v_geometry._replace(means=v_means_of_colors)
     v_cameras = new_camera_gradients(view, N)
-    inputs = (*geometry, *view, int(antialias), *splats)
+    inputs = (*geometry, *view, int(antialias), radii)
     launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras, v_means_of_colors)
     return v_geometry, *sum_camera_gradients(view, v_cameras)
 

@@ -46,10 +46,13 @@ def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, 
 
 
 class PackedSplats(NamedTuple):
-    """Projected Gaussians: what compositing needs, and what the backward pass needs beside it (see ``Projection``)."""
+    """Projected Gaussians: what compositing and the backward pass need.
 
-    conics: Tensor
-    opacities: Tensor
+    Attributes:
+        radii: [N, 2] int32, as in ``Projection``.
+        rows: N packed splats.
+    """
+
     radii: Tensor
     rows: Rows
 
@@ -65,13 +68,12 @@ def project_and_pack(
 ) -> tuple[PackedSplats, DepthOrder]:
     """``pack(project_fwd(…), features, with_depth)`` in one kernel."""
     N, num_features = features.shape
-    new, radii = features.new_empty, features.new_empty(N, 2, dtype=int32)
-    rows = Rows(new(N, kernels.row_parts(num_features + int(with_depth)), 4), num_features, with_depth)
-    splats = PackedSplats(new(N, 3), new(N), radii, rows)
+    packed = features.new_empty(N, kernels.row_parts(num_features + int(with_depth)), 4)
+    radii = features.new_empty(N, 2, dtype=int32)
     order = DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N))
     inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
-    launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, *splats[:3], rows.packed, *order)
-    return splats, order
+    launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, radii, packed, *order)
+    return PackedSplats(radii, Rows(packed, num_features, with_depth)), order
 
 
 class PackGradients(NamedTuple):
@@ -86,7 +88,6 @@ class PackGradients(NamedTuple):
 
 
 def unpack(
-    splats: tuple[Tensor, Tensor],
     rows: Rows,
     v_rows: Tensor,
     size: tuple[int, int],
@@ -96,24 +97,22 @@ def unpack(
     """The backward pass of ``pack``.
 
     Args:
-        splats: Conics and opacities of the splats.
         rows: First result of ``pack``.
         v_rows: [shards, N, gradient_stride] sums from ``composite_bwd``.
         size: (width, height) of the image [px].
         with_offsets: Whether to return the gradient of ``screen_offsets``.
         imagegrad: As in ``composite_bwd``.
     """
-    conics = splats[0]
-    N = conics.shape[0]
+    N, new = rows.packed.shape[0], rows.packed.new_empty
     v_splats = PackGradients(
-        means2d=conics.new_empty(N, 2),
-        conics=conics.new_empty(N, 3),
-        depths=conics.new_empty(N) if rows.with_depth else None,
-        opacities=conics.new_empty(N),
-        features=conics.new_empty(N, rows.num_features),
-        screen_offsets=conics.new_empty(N, 2) if with_offsets else None,
+        means2d=new(N, 2),
+        conics=new(N, 3),
+        depths=new(N) if rows.with_depth else None,
+        opacities=new(N),
+        features=new(N, rows.num_features),
+        screen_offsets=new(N, 2) if with_offsets else None,
     )
-    inputs = (*splats, rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], int(imagegrad))
+    inputs = (rows.packed, v_rows, 0.5 * size[0], 0.5 * size[1], int(imagegrad))
     launch(kernels.make_unpack(rows.num_features, rows.with_depth), N, *inputs, *v_splats)
     return v_splats
 
@@ -138,11 +137,11 @@ def unpack_and_unproject(
         Gradients of the geometry; of ``viewmat`` and ``K``, if one of them requires a gradient; of the features; and of
         ``screen_offsets``.
     """
-    (*projection, rows), means = splats, geometry.means
+    (radii, rows), means = splats, geometry.means
     N = means.shape[0]
     v_features, v_offsets = means.new_empty(N, rows.num_features), means.new_empty(N, 2) if with_offsets else None
     v_geometry, v_cameras = new_geometry(geometry), new_camera_gradients(view, N)
-    inputs = (*geometry, *view, int(antialias), *projection, rows.packed, v_rows, int(imagegrad))
+    inputs = (*geometry, *view, int(antialias), radii, rows.packed, v_rows, int(imagegrad))
     kernel = kernels.make_unpack_and_unproject(rows.num_features, rows.with_depth)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras, None)
     return v_geometry, sum_camera_gradients(view, v_cameras), v_features, v_offsets
