@@ -111,6 +111,18 @@ def test_graphs_are_measured_beside_plain_calls(monkeypatch):
         assert torch.equal(ours, plain)
 
 
+def test_graphs_are_captured_after_plain_calls_are_measured(monkeypatch):
+    """With the nodes that a graphed callable keeps, torch synchronises plain calls more often."""
+    order = []
+    monkeypatch.setattr(
+        torch.cuda, "make_graphed_callables", lambda render, _parameters: order.append("graph") or render
+    )
+    monkeypatch.setattr(measure, "capture", lambda step: order.append("graph") or step)
+    monkeypatch.setattr(measure, "milliseconds", lambda step, device: order.append("call") or 1.0)
+    measure.time_passes({"one_image": tiny_workload()}, ["one_image"], "cpu", repeats=1)
+    assert order == ["call", "call", "graph", "call", "graph", "call"]
+
+
 def test_a_workload_renders_the_given_parameters():
     workload = tiny_workload()
     images = workload.render()

@@ -3,7 +3,7 @@
 import dataclasses
 import statistics
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -87,18 +87,19 @@ def time_passes(
     passes = {"forward_ms": Workload.forward, "forward_backward_ms": Workload.forward_backward}
     if device == "cuda":
         passes["one_thread_forward_backward_ms"] = Workload.forward_backward_on_one_thread
-    metrics: dict[str, dict[str, Callable[[], object]]] = {
-        metric: {name: partial(run, workload) for name, workload in workloads.items()} for metric, run in passes.items()
+    times = {
+        metric: time_in_turn({name: partial(run, workload) for name, workload in workloads.items()}, device, repeats)
+        for metric, run in passes.items()
     }
-    if graphs:
-        metrics["callable_forward_backward_ms"] = {name: graphed(workloads[name]).forward_backward for name in graphs}
-        metrics["graph_forward_backward_ms"] = {name: capture(workloads[name].forward_backward) for name in graphs}
-    return {
-        (n, metric): ms for metric, steps in metrics.items() for n, ms in time_in_turn(steps, device, repeats).items()
-    }
+    if graphs:  # last: a graphed callable keeps nodes of autograd, with which torch synchronises plain calls more often
+        callables = {name: graphed(workloads[name]).forward_backward for name in graphs}
+        times["callable_forward_backward_ms"] = time_in_turn(callables, device, repeats)
+        captured = {name: capture(workloads[name].forward_backward) for name in graphs}
+        times["graph_forward_backward_ms"] = time_in_turn(captured, device, repeats)
+    return {(name, metric): ms for metric, medians in times.items() for name, ms in medians.items()}
 
 
-def time_in_turn(steps: dict[str, Callable[[], object]], device: str, repeats: int) -> dict[str, float]:
+def time_in_turn(steps: Mapping[str, Callable[[], object]], device: str, repeats: int) -> dict[str, float]:
     """Median times [ms] of alternating steps, so that clock rates and sleeping threads affect all of them equally."""
     for _ in range(WARM_UPS[device]):
         for step in steps.values():
