@@ -34,6 +34,18 @@ def test_a_kernel_argument_that_is_not_contiguous_is_refused():
         launch(torch.ones(7, 4), torch.ones(3, 7).T)
 
 
+def test_a_tensor_in_the_place_of_a_number_is_refused():
+    with pytest.raises(TypeError, match="near is a number, got a tensor"):
+        projected_radii(7, torch.tensor(0.5), None)
+
+
+def test_a_wrong_number_of_arguments_is_refused():
+    features, gradients = torch.zeros(2, 6, 8).half()
+    launching.launch(relu_bwd, 2, features, gradients, torch.zeros(2, 8))
+    with pytest.raises(ValueError, match="shorter"):
+        launching.launch(relu_bwd, 2, features, gradients)
+
+
 def test_leading_axes_of_a_kernel_argument_are_flattened():
     features, gradients = torch.randn(2, 6, 8, generator=generator()).half()
     expected, sums = torch.zeros(2, 2, 8)

@@ -76,7 +76,7 @@ def begin(tensor: Tensor) -> Any:
 
 
 def end(name: str, begun: Any, tensor: Tensor) -> None:
-    """Adds an entry from the time of ``begin`` until now."""
+    """Adds an entry from the time of ``begin`` until now, if a profile was active then and is now."""
     if _active_profile is not None and begun is not None:
         _active_profile._entries.append((name, begun, _now(tensor)))
 
