@@ -79,6 +79,21 @@ def test_other_outputs_may_be_changed_and_gradients_are_correct(name):
     assert torch.equal(*found)
 
 
+@pytest.mark.parametrize("name", ["colors", "screen_offsets"])
+def test_inputs_that_the_backward_pass_does_not_read_may_be_changed(name):
+    found, colors = [], torch.rand(len(make_splats().means), 3)
+    for change in (False, True):
+        splats = as_leaves(dataclasses.replace(make_splats(), sh=None, colors=colors))
+        offsets = torch.zeros(len(colors), 2, requires_grad=True)
+        rendering = render(splats, CAMERA, screen_offsets=offsets)
+        with torch.no_grad():
+            {"colors": splats.colors, "screen_offsets": offsets}[name].mul_(2).add_(int(change))
+        rendering.joint.image.square().sum().backward()
+        found.append((splats.means.grad, splats.colors.grad, offsets.grad))
+    for plain, changed in zip(*found, strict=True):
+        assert torch.equal(plain, changed)
+
+
 def test_gradients_continue_to_the_inputs_of_the_parameters():
     splats = make_splats()
     raw = splats.scales.log().requires_grad_()

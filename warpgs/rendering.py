@@ -104,10 +104,9 @@ class _Inputs(NamedTuple):
 
 
 class _Saved(NamedTuple):
-    """What the backward pass reads of the tensors that autograd saved.
+    """The tensors that autograd saves for the backward pass, besides some layers.
 
-    ``features`` and ``sh`` are None without spherical harmonics. ``layers`` are the depths, to be checked for changes,
-    and the alphas if the background requires a gradient.
+    ``sh`` and ``features``, the colours of it, are None without spherical harmonics; ``packed`` are the splats' rows.
     """
 
     means: Tensor
@@ -120,8 +119,7 @@ class _Saved(NamedTuple):
     sh: Any
     features: Any
     radii: Tensor
-    rows: Rows
-    layers: tuple[Tensor, ...]
+    packed: Tensor
 
 
 def render(
@@ -222,12 +220,13 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
 
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
     sh = None if sh_degree is None else inputs.appearance
-    camera = (inputs.viewmat, inputs.K, inputs.background)
+    camera, background = (inputs.viewmat, inputs.K), inputs.background
+    saved = _Saved(*inputs[:4], *camera, background, sh, features, splats.radii, rows.packed)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
         backward=partial(_backward, back, tape),
-        saved=(*inputs[:4], *camera, sh, features, splats.radii, rows.packed, *composite.depths, *alphas),
+        saved=(*saved, *composite.depths, *alphas),
         constants=(splats.radii, *composite.statistics, *num_intersections),
     )
 
@@ -248,15 +247,13 @@ def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor |
 
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
     """composite → unproject: plays the tape in reverse."""
-    num_tensors = len(_Saved._fields) - 2
-    rows = Rows(saved[num_tensors], back.request.num_features, back.request.settings.depth)
-    back.saved = _Saved._make((*saved[:num_tensors], rows, saved[num_tensors + 1 :]))
-    back.v = {"layers": v_layers}
+    num_saved = len(_Saved._fields)
+    back.saved, back.layers, back.v = _Saved._make(saved[:num_saved]), saved[num_saved:], {"layers": v_layers}
     try:
         tape.backward()
         return [back.v.get(name) for name in _Inputs._fields]
     finally:
-        del back.saved, back.v  # outputs among them would keep their own node alive
+        del back.saved, back.layers, back.v  # outputs among them would keep their own node alive
 
 
 class _Backward:
@@ -269,12 +266,14 @@ class _Backward:
         with_offsets: Whether ``screen_offsets`` get a gradient.
         imagegrad: Whether it is that of the images alone.
         traversal: Of the forward pass.
-        saved: What autograd saved; during the backward pass only.
-        v: Gradients so far: of inputs by their names, and of ``layers``, ``rows`` and ``splats``; during it only.
+        saved: What autograd saved; during the backward pass only, as all that follows.
+        layers: The depths, which torch checks for changes, and the alphas if the background requires a gradient.
+        v: Gradients so far: of inputs by their names, and of all layers, ``rows`` and ``splats``.
     """
 
     traversal: Traversal
     saved: _Saved
+    layers: tuple[Tensor, ...]
     v: dict[str, Any]
 
     def __init__(self, request: _Request, with_offsets: bool) -> None:
@@ -283,14 +282,14 @@ class _Backward:
 
     def composite(self) -> None:
         saved, traversal, v = self.saved, self.traversal, self.v
-        v["rows"] = composite_bwd(saved.rows, saved.background, traversal, v["layers"], self.imagegrad)
+        v["rows"] = composite_bwd(self._rows(), saved.background, traversal, v["layers"], self.imagegrad)
         if saved.background is not None and saved.background.requires_grad:
-            alphas = saved.layers[-traversal.num_images :]
+            alphas = self.layers[-traversal.num_images :]
             v["background"] = background_bwd(saved.background, alphas, v["layers"][: traversal.num_images])
 
     def unpack(self) -> None:
-        saved, v = self.saved, self.v
-        v["splats"] = unpack(saved.rows, v["rows"], self.request.size, self.with_offsets, self.imagegrad)
+        v = self.v
+        v["splats"] = unpack(self._rows(), v["rows"], self.request.size, self.with_offsets, self.imagegrad)
         v["screen_offsets"] = v["splats"].screen_offsets
 
     def color(self) -> None:
@@ -314,13 +313,16 @@ class _Backward:
             Geometry(*saved[:4]),
             self._view(),
             self.request.settings.antialias,
-            PackedSplats(saved.radii, saved.rows),
+            PackedSplats(saved.radii, self._rows()),
             v["rows"],
             self.with_offsets,
             self.imagegrad,
         )
         v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
         v["viewmat"], v["K"] = v_camera
+
+    def _rows(self) -> Rows:
+        return Rows(self.saved.packed, self.request.num_features, self.request.settings.depth)
 
     def _view(self) -> View:
         return View(self.saved.viewmat, self.saved.K, *self.request.size)

@@ -33,7 +33,7 @@ MAX_SMALL_IMAGE_PIXELS = 1 << 18
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
 WORK = TILE_SIZE * TILE_SIZE
-"""Of a thread on CPU, see ``launch``."""
+"""``work`` of a thread on CPU, as ``launch`` counts it."""
 
 MAX_PIXELS = 1 << 31
 """All images together must have fewer pixels than this, because kernels count pixels with ints."""
@@ -61,6 +61,22 @@ class Composite(NamedTuple):
         return (*self.images, *self.alphas, *self.depths)
 
 
+class PixelState(NamedTuple):
+    """What the forward pass leaves of each pixel, as arguments of the backward kernel.
+
+    Attributes:
+        depth: [pixels of all images, in any shape] rendered depth; None without.
+        transmittance: [the same] at the end of each pixel.
+        last: [the same] int32 number of Gaussians of the list until the last one that contributed.
+        joint_state: [blocks] int32, see ``equals_joint``; None for a single image.
+    """
+
+    depth: Tensor | None
+    transmittance: Tensor
+    last: Tensor
+    joint_state: Tensor | None
+
+
 class Traversal(NamedTuple):
     """What the forward pass leaves for the backward pass besides rows and layers.
 
@@ -72,10 +88,7 @@ class Traversal(NamedTuple):
         num_threads: Of both kernels.
         lists: Arguments of both kernels, from ``tile_ranges`` to ``half``: the Gaussians of each tile.
         view: Arguments of both kernels, from ``background_stride`` to ``max_alpha``.
-        depth: [pixels of all images, in any shape] rendered depth; None without.
-        transmittance: [the same] at the end of each pixel.
-        last: [the same] int32 number of Gaussians of the list until the last one that contributed.
-        joint_state: [blocks] int32, see ``equals_joint``; None for a single image.
+        state: Of the pixels of all images.
     """
 
     num_images: int
@@ -83,10 +96,7 @@ class Traversal(NamedTuple):
     num_threads: int
     lists: tuple[Tensor, Tensor | None, Tensor, int]
     view: tuple[int, int, int, float]
-    depth: Tensor | None
-    transmittance: Tensor
-    last: Tensor
-    joint_state: Tensor | None
+    state: PixelState
 
 
 def is_small(size: tuple[int, int]) -> bool:
@@ -128,21 +138,21 @@ def composite_fwd(
     if num_images * height * width >= MAX_PIXELS:
         raise ValueError(f"{num_images} images of {width} x {height} pixels are too large to be rendered at once")
     packed, num_features, with_depth = rows
-    new, new_int = packed.new_empty, tiles.ranges.new_empty
+    new = packed.new_empty
     pixels, blocks, lanes = _layout(size, tiles)
     stride = 0 if background is None or background.ndim == 1 else num_features
     shape = (height, width) if num_images == 1 else (num_images, height, width)
     image, alpha, depth = new(*shape, num_features), new(*shape), new(*shape) if with_depth else None
     own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
-    joint_state = None if num_images == 1 else new_int(blocks).zero_()
+    joint_state = None if num_images == 1 else tiles.ranges.new_zeros(blocks)
+    state = PixelState(own_depth, new(*shape), tiles.ranges.new_empty(*shape), joint_state)
     lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
-    own = (own_depth, new(*shape), new_int(*shape), joint_state)
-    traversal = Traversal(num_images, pixels, num_images * blocks * lanes, lists, (stride, *size, max_alpha), *own)
+    traversal = Traversal(num_images, pixels, num_images * blocks * lanes, lists, (stride, *size, max_alpha), state)
     contributed = packed.new_zeros(packed.shape[0], dtype=torch.uint8) if statistics else None
     weights = packed.new_zeros(num_shards(packed), packed.shape[0]) if statistics else None
     kernel = make_composite_fwd(num_features, with_depth, num_images, pixels, statistics)
     inputs = (*traversal.lists, packed, background, *traversal.view)
-    outputs = (image, depth, alpha, *own[1:], contributed)
+    outputs = (image, depth, alpha, state.transmittance, state.last, state.joint_state, contributed)
     launch(kernel, traversal.num_threads, *inputs, *outputs, per_shard=(weights,), block_dim=BLOCK_DIM, work=WORK)
     found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
     images, alphas, depths = (_layers(t, num_images) for t in (image, alpha, depth))
@@ -180,7 +190,7 @@ def composite_bwd(
     packed, num_features, with_depth = rows
     v_rows = packed.new_zeros(num_shards(packed), packed.shape[0], gradient_stride(num_features + int(with_depth)))
     kernel = make_composite_bwd(num_features, with_depth, num_images, traversal.pixels, imagegrad)
-    inputs = (*traversal.lists, packed, background, *traversal.view, *traversal[5:], *v_arrays, images_with_gradient)
+    inputs = (*traversal.lists, packed, background, *traversal.view, *traversal.state, *v_arrays, images_with_gradient)
     launch(kernel, traversal.num_threads, *inputs, per_shard=(v_rows,), block_dim=BLOCK_DIM, work=WORK)
     return v_rows
 

@@ -56,7 +56,7 @@ class _Budget:
     def __init__(self) -> None:
         self.recent_max: float | None = None
         with torch.inference_mode(False):  # otherwise it could not be written to outside of inference mode
-            self.num_isects = torch.zeros(1, dtype=int64, pin_memory=torch.cuda.is_available())
+            self.num_isects = torch.zeros(1, dtype=int64, device="cpu", pin_memory=torch.cuda.is_available())
         self._number = self.num_isects.numpy()  # the same memory, which the host reads faster
 
     def capacity(self, num_gaussians: int) -> int:
@@ -156,14 +156,15 @@ def _bin(
     num_isects: Tensor,
 ) -> Tiles:
     """Bins splats that have been sorted and counted."""
-    N, total, new_int = splats.shape[0], grid[0] * grid[1], ranks[0].new_empty
+    (gaussian_from_rank, _, is_dynamic), N, total = ranks, splats.shape[0], grid[0] * grid[1]
+    new_int = gaussian_from_rank.new_empty
     isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
     launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, *grid, capacity, *isects, num_isects)
     sort_pairs(*isects, capacity, total.bit_length())
     ranges = new_int(total, 2)
     launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
-    tiles = Tiles(ranges, isects[1], None if ranks[2] is None else torch.empty_like(ranges), num_isects)
-    if ranks[2] is not None:
+    tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
+    if is_dynamic is not None:
         threads = total * (WARP_SIZE if splats.is_cuda else 1)
         launch(kernels.split_tiles, threads, ranges, tiles.half, *tiles[1:3], block_dim=BLOCK_DIM)
     return tiles
