@@ -293,7 +293,7 @@ class Trainer:
             raise ValueError(
                 f"the loss or a parameter is not finite after iteration {failed_at}, even after {self.rollbacks} "
                 f"returns to a checkpoint; {saved[-1] if saved else 'no checkpoint'} holds the last valid state"
-                + ("; --model.no-half trains the networks in single precision" if half else "")
+                + ("; a new run with --model.no-half trains the networks in single precision" if half else "")
             )
         self.restore_newest(logger.log)
         logger.begin(self.iteration)
