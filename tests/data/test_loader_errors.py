@@ -82,8 +82,9 @@ def test_a_missing_mask_of_a_training_frame_is_refused_on_opening(root):
     ("folder", "message"),
     [
         ("..", "has no dataset.json and the files of no other layout .*colmap.*; warpgs prepare makes a capture"),
-        ("rgb", "has no dataset.json and the files of no other layout"),
-        ("scene.json", "has no dataset.json and the files of no other layout"),
+        ("rgb", "rgb is a part of a capture: give "),
+        ("rgb/1x", "1x is a part of a capture: give "),
+        ("scene.json", "scene.json is a file: give the folder of the capture"),
         ("nowhere", "nowhere does not exist"),
     ],
 )
@@ -93,7 +94,7 @@ def test_what_has_no_part_of_a_capture_is_refused(root, folder, message):
 
 def test_a_run_folder_is_not_taken_for_a_capture(tmp_path):
     (tmp_path / "config.json").write_text("{}")
-    refused(tmp_path, "is a run folder: give the capture that it was trained on, or --resume")
+    refused(tmp_path, "is a run folder: give the capture that it was trained on; warpgs train --resume")
 
 
 def test_a_model_without_its_images_is_named(tmp_path):

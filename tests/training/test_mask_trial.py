@@ -123,7 +123,7 @@ def test_a_signal_ends_the_trial_and_leaves_nothing_behind(folder, monkeypatch, 
 
     monkeypatch.setattr(mask_trial, "Trainer", Interrupted)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with pytest.raises(KeyboardInterrupt, match="the run has not begun"):
+    with pytest.raises(KeyboardInterrupt, match="the run has not begun: give the same command again"):
         decide(folder)
     assert list(tmp_path.iterdir()) == []
 

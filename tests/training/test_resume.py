@@ -162,7 +162,7 @@ def test_a_run_of_few_frames_has_few_frequencies_of_time_and_can_be_resumed(data
     config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", model=model)
     lines = []
     trainer = script.make_trainer(config, lines.append)
-    assert "6 frames determine 2 of the 8 frequencies of time" in lines
+    assert "the networks get 2 of 8 frequencies of time: 6 frames determine no more" in lines
     assert trainer.config.model.time_bands == trainer.scene.deformation.trunk.bands[1] == 2
     trainer.save()
     assert script.make_trainer(TrainConfig(resume=trainer.run)).config == trainer.config

@@ -140,7 +140,7 @@ def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
 
 def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):
     error = error_line(capsys, "view", run, "--port", taken)
-    assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use" in error
+    assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use; choose another --port" in error
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such host"])

@@ -47,7 +47,7 @@ def _check_format(options: Export) -> None:
         if field.name not in specific or field.name in WRITERS[options.format].options:
             continue
         if getattr(options, field.name) != field.default:
-            formats = " and ".join(name for name, writer in WRITERS.items() if field.name in writer.options)
+            formats = ", ".join(name for name, writer in WRITERS.items() if field.name in writer.options)
             raise ValueError(f"{_flag(field.name)} is for --format {formats}, not for {options.format}")
 
 

@@ -44,6 +44,8 @@ def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, j
             num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
     one, several = f"{job.file(file)}: {max_count:,} Gaussians", f"{num_files} files of up to {max_count:,} Gaussians"
     written = one if num_files == 1 else f"{several} in {folder}"
+    if options.frames is None:
+        written += f" at time {times[0]:g} of 0 to 1"
     return f"{written}, {size / 1e6:.1f} MB\n{job.up_note}"
 
 

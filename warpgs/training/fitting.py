@@ -34,7 +34,10 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
         raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')
     bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
     if bands < config.model.time_bands:
-        log(f"{len(capture.train)} frames determine {bands} of the {config.model.time_bands} frequencies of time")
+        num = len(capture.train)
+        log(
+            f"the networks get {bands} of {config.model.time_bands} frequencies of time: {num} frames determine no more"
+        )
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     if loss.branches_in_stage2 == "given-masks":
         if seen.uses_estimated_masks:

@@ -122,5 +122,7 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
             finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()
     if not finished:
-        raise KeyboardInterrupt("stopped while the masks were tried out; the run has not begun")
+        raise KeyboardInterrupt(
+            "stopped while the masks were tried out; the run has not begun: give the same command again"
+        )
     return sum(values) / len(values)

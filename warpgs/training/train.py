@@ -112,7 +112,9 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
     if capture.val:
-        log(f"evaluating {len(capture.val)} views")  # without a terminal, there is no progress bar for minutes
+        log(
+            f"evaluating {len(capture.val)} view{'s' * (len(capture.val) > 1)}"
+        )  # without a terminal, there is no progress bar for minutes
     lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
     command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
     later = f"run it with {shlex.join(command)}"
@@ -177,7 +179,10 @@ def _describe(trainer: Trainer, log: Log) -> None:
         log(f"depth is switched off: {NO_DEPTH}")
     elif num_aligned < num_views - refused:
         reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
-        log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
+        if not num_aligned and trainer.capture.frame(trainer.capture.train[0]).inverse_depth is None:
+            log(f"the capture has no depth, which warpgs prepare {config.data} --add depth makes{reason}")
+        else:
+            log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
         changed = f"{trainer.num_with_objects} of {num_views} views"
         log(f"the size of dynamic objects gives or corrects their depth in {changed}")

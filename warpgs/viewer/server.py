@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import socket
 import threading
 import time
@@ -44,8 +45,12 @@ def check_address(host: str, port: int) -> None:
         with socket.create_server(address[:2], family=family):
             pass
     except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise OSError(f"cannot listen on {host}, port {port}: {reason}; choose another --port or --host") from error
+        # Python adds the address to the system's text of an error in binding, whose number is positive.
+        number = getattr(error, "errno", None) or 0
+        reason = os.strerror(number) if number > 0 else getattr(error, "strerror", None) or error
+        raise OSError(
+            f"cannot listen on {host}, port {port}: {reason}; choose another --port (0 takes a free one) or --host"
+        ) from error
 
 
 class Viewer:

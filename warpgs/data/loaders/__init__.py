@@ -108,8 +108,15 @@ def require_capture(root: Path) -> None:
         return
     if not root.exists():
         raise ValueError(f"{root} does not exist")
+    if root.is_file():
+        raise ValueError(f"{root} is a file: give the folder of the capture")
     if (root / "config.json").exists():
-        raise ValueError(f"{root} is a run folder: give the capture that it was trained on, or --resume {root}")
+        raise ValueError(
+            f"{root} is a run folder: give the capture that it was trained on; warpgs train --resume {root} trains on"
+        )
+    for parent in root.resolve().parents[:2]:
+        if is_capture(parent):
+            raise ValueError(f"{root} is a part of a capture: give {parent}")
     if find_model(root) is not None:
         raise ValueError(f"{root} has a COLMAP model, but not the folder images/ with its images")
     raise ValueError(
