@@ -15,7 +15,7 @@ from torch.utils.tensorboard.writer import SummaryWriter
 LINE_EVERY = 10.0
 """Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
 
-WIDE = 120
+WIDE = 126
 """Minimum width of a terminal that shows the bar and all numbers; others show the most important ones in full."""
 
 LINE = re.compile(r"(\d+)/(\d+) .* it/s(?:  (\d+) s left)?")
