@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import torch
 from jaxtyping import Bool, Float, Int32, Int64
@@ -283,7 +283,7 @@ class _Backward:
     def composite(self) -> None:
         saved, traversal, v = self.saved, self.traversal, self.v
         v["rows"] = composite_bwd(self._rows(), saved.background, traversal, v["layers"], self.imagegrad)
-        if saved.background is not None and saved.background.requires_grad:
+        if _has_gradient(saved.background):
             alphas = self.layers[-traversal.num_images :]
             v["background"] = background_bwd(saved.background, alphas, v["layers"][: traversal.num_images])
 
@@ -328,5 +328,5 @@ class _Backward:
         return View(self.saved.viewmat, self.saved.K, *self.request.size)
 
 
-def _has_gradient(tensor: Tensor | None) -> bool:
+def _has_gradient(tensor: Tensor | None) -> TypeGuard[Tensor]:
     return tensor is not None and tensor.requires_grad

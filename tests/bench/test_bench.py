@@ -112,7 +112,7 @@ def test_graphs_are_measured_beside_plain_calls(monkeypatch):
 
 
 def test_graphs_are_captured_after_plain_calls_are_measured(monkeypatch):
-    """With the nodes that a graphed callable keeps, torch synchronises plain calls more often."""
+    """Beside a graphed callable, torch warns that plain calls may synchronise without need."""
     order = []
     monkeypatch.setattr(
         torch.cuda, "make_graphed_callables", lambda render, _parameters: order.append("graph") or render

@@ -37,7 +37,7 @@ def test_the_sharpest_images_of_a_folder_are_taken(tmp_path, images):
 
 
 @pytest.mark.parametrize(("fps", "count"), [(5.0, 10), (1000.0, 20)])
-def test_fps_samples_a_video_at_most_at_its_own_frame_rate(tmp_path, images, fps, count):
+def test_fps_does_not_exceed_the_frame_rate_of_the_video(tmp_path, images, fps, count):
     video = write_video(tmp_path / "video.mp4", images, rate=10.0)
     assert len(take_frames(video, tmp_path / "frames", Selection(fps=fps)).taken) == count
 

@@ -91,7 +91,7 @@ def time_passes(
         metric: time_in_turn({name: partial(run, workload) for name, workload in workloads.items()}, device, repeats)
         for metric, run in passes.items()
     }
-    if graphs:  # last: a graphed callable keeps nodes of autograd, with which torch synchronises plain calls more often
+    if graphs:  # last: beside a graphed callable, torch warns that plain calls may synchronise without need
         callables = {name: graphed(workloads[name]).forward_backward for name in graphs}
         times["callable_forward_backward_ms"] = time_in_turn(callables, device, repeats)
         captured = {name: capture(workloads[name].forward_backward) for name in graphs}

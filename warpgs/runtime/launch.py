@@ -193,9 +193,8 @@ _UNKNOWN = object()
 def _describe(argument: Any, slot: Any, tensor: Tensor | None) -> None:
     """Writes the shape and strides of a tensor to a kernel argument, after checking that they fit the kernel."""
     if tensor is None:
-        ctypes.memset(
-            ctypes.addressof(slot), 0, ctypes.sizeof(slot)
-        )  # kernels ask an array that is missing for its sizes
+        # All sizes become zero: kernels recognize an array that is missing by one of them.
+        ctypes.memset(ctypes.addressof(slot), 0, ctypes.sizeof(slot))
         return
     dtype, ndim = argument.type.dtype, argument.type.ndim
     inner = tuple(getattr(dtype, "_shape_", ()))

@@ -112,9 +112,8 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         _describe_corrections(trainer.views.poses, log)
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
     if capture.val:
-        log(
-            f"evaluating {len(capture.val)} view{'s' * (len(capture.val) > 1)}"
-        )  # without a terminal, there is no progress bar for minutes
+        # Without a terminal, there is no progress bar for minutes.
+        log(f"evaluating {len(capture.val)} view{'s' * (len(capture.val) != 1)}")
     lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
     command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
     later = f"run it with {shlex.join(command)}"
