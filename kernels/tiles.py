@@ -19,6 +19,7 @@ from .constants import CULLED_LOG2_OPACITY, LOG2_ALPHA_MIN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
 from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
 from .rows import row_load
+from .scan import running_sum, sum_of_all
 
 SLACK = wp.constant(0.01)
 """Spans are widened by this [px], well above the rounding error of float32 at 8K, so that no intersection is missed."""
@@ -26,6 +27,10 @@ SLACK = wp.constant(0.01)
 
 MANY_TILES = wp.constant(24)
 """A Gaussian with more intersections than this is written by a whole lane group instead of one thread."""
+
+
+NUM_FILLING = wp.constant(8192)
+"""Threads that give the unused intersections their tile index."""
 
 
 DYNAMIC = wp.constant(1 << 30)
@@ -80,17 +85,9 @@ def tile_columns(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tile_y: int, 
     return wp.vec2i(wp.max(low, 0), wp.min(high, tiles_x - 1) + 1)
 
 
-@wp.kernel(enable_backward=False)
-def count_tiles(
-    first: int,
-    rows: wp.array2d[wp.vec4],
-    gaussian_from_rank: wp.array[int],
-    tiles_x: int,
-    tiles_y: int,
-    num_tiles_of_rank: wp.array[wp.int64],
-):
-    rank = first + wp.tid()
-    g = gaussian_from_rank[rank]
+@wp.func
+def num_tiles_of(rows: wp.array2d[wp.vec4], g: int, tiles_x: int, tiles_y: int) -> int:
+    """Number of tiles that a Gaussian's ellipse intersects."""
     count = int(0)
     row0 = row_load(rows, g, 0)
     row1 = row_load(rows, g, 1)
@@ -100,17 +97,32 @@ def count_tiles(
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             count += wp.max(span_x[1] - span_x[0], 0)
-    num_tiles_of_rank[rank] = wp.int64(count)
+    return count
 
 
 @wp.kernel(enable_backward=False)
+def count_tiles(
+    first: int,
+    rows: wp.array2d[wp.vec4],
+    gaussian_from_rank: wp.array[int],
+    tiles_x: int,
+    tiles_y: int,
+    num_tiles_of_rank: wp.array[wp.int64],
+):
+    """On CPU only, see ``scan``."""
+    rank = first + wp.tid()
+    num_tiles_of_rank[rank] = wp.int64(num_tiles_of(rows, gaussian_from_rank[rank], tiles_x, tiles_y))
+
+
+@wp.kernel(enable_backward=False, grid_stride=False)  # running_sum needs a CUDA block to be a block of threads
 def emit_isects(
     first: int,
     rows: wp.array2d[wp.vec4],
     gaussian_from_rank: wp.array[int],
-    end_of_rank: wp.array[wp.int64],
+    ends: wp.array[wp.int64],
     is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
+    num_ranks: int,
     tiles_x: int,
     tiles_y: int,
     capacity: int,
@@ -118,25 +130,30 @@ def emit_isects(
     gaussian_from_isect: wp.array[int],
     demand: wp.array[wp.int64],
 ):
+    """Launched with ``num_ranks`` threads, ``num_gaussians`` rounded up to whole blocks, and ``NUM_FILLING`` more.
+
+    With the capacity 0 it only counts.
+    """
     thread = first + wp.tid()
-    total = end_of_rank[num_gaussians - 1]
-    if thread == 0:
-        demand[0] = total
-    if thread < capacity and wp.int64(thread) >= total:
-        tile_from_isect[thread] = tiles_x * tiles_y
-    if total > wp.int64(capacity):
+    if thread >= num_ranks:
+        total = sum_of_all(ends)
+        if thread == num_ranks:
+            demand[0] = total
+        for unused in range(int(wp.min(total, wp.int64(capacity))) + thread - num_ranks, capacity, NUM_FILLING):
+            tile_from_isect[unused] = tiles_x * tiles_y
         return
     lane = thread % lane_count()
-    isect = int(0)
-    end = int(0)
     g = int(0)
+    count = int(0)
     gaussian = int(0)  # see make_isect
     if thread < num_gaussians:
         g = gaussian_from_rank[thread]
         gaussian = make_isect(g, is_dynamic)
-        end = int(end_of_rank[thread])
-        if thread > 0:
-            isect = int(end_of_rank[thread - 1])
+        if lane_count() > 1:  # on CPU, count_tiles has counted
+            count = num_tiles_of(rows, g, tiles_x, tiles_y)
+    span = running_sum(count, thread, ends)
+    isect = int(wp.min(span[0], wp.int64(capacity)))
+    end = int(wp.min(span[1], wp.int64(capacity)))
     many = int(end - isect > MANY_TILES)
     if end > isect and many == 0:
         row0 = row_load(rows, g, 0)
@@ -146,7 +163,7 @@ def emit_isects(
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             for x in range(span_x[0], span_x[1]):
-                # The count is from another kernel, whose rounding may differ: never write past it.
+                # Rounding may differ from that of the count: never write past it.
                 if isect < end:
                     tile_from_isect[isect] = y * tiles_x + x
                     gaussian_from_isect[isect] = gaussian
@@ -195,7 +212,7 @@ def emit_isects(
 def tile_ranges(
     first: int,
     gaussian_from_rank: wp.array[int],
-    end_of_rank: wp.array[wp.int64],
+    ends: wp.array[wp.int64],
     is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     num_tiles: int,
@@ -206,7 +223,7 @@ def tile_ranges(
 ):
     """Launched with ``max(capacity, num_tiles) + 1`` threads over the sorted intersections."""
     thread = first + wp.tid()
-    if end_of_rank[num_gaussians - 1] > wp.int64(capacity):
+    if sum_of_all(ends) > wp.int64(capacity):
         if thread < num_gaussians:
             gaussian_from_isect[thread] = make_isect(gaussian_from_rank[thread], is_dynamic)
         if thread < num_tiles:

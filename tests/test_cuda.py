@@ -237,6 +237,17 @@ def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
         assert torch.equal(captured.joint.image, render(splats, camera).joint.image)
 
 
+def test_the_intersections_of_many_blocks_of_threads_are_all_listed():
+    splats, camera = make_splats(20_000).to("cuda"), make_camera(480, 270).to("cuda")
+    with torch.no_grad():
+        # The first lists all Gaussians in every tile, whatever the running sum of intersections is.
+        all_gaussians, lists = (
+            render(splats, camera, settings=RenderSettings(max_intersections=number)) for number in (1, 10_000_000)
+        )
+    assert torch.equal(lists.joint.image, all_gaussians.joint.image)
+    assert 20_000 < int(lists.num_intersections) == int(all_gaussians.num_intersections) < 10_000_000
+
+
 def test_a_checkpointed_render_has_the_same_gradients():
     splats, camera = make_splats(200).to("cuda"), make_camera().to("cuda")
     image = image_of(splats, camera)

@@ -1,6 +1,5 @@
 """Differentiable rendering: splats, camera, background → images."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeGuard
 
@@ -55,8 +54,7 @@ class Layer(NamedTuple):
         return torch.where(visible, 1.0 / self.depth, torch.nan)
 
 
-@dataclass(frozen=True)
-class Rendering:
+class Rendering(NamedTuple):
     """The result of ``render``.
 
     Attributes:

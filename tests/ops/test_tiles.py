@@ -121,7 +121,7 @@ def images_and_gradients(is_dynamic):
 def test_more_intersections_than_expected_give_the_same_image(is_dynamic, monkeypatch):
     expected = images_and_gradients(is_dynamic)
     capacity = tiles._capacity
-    monkeypatch.setattr(tiles, "_capacity", lambda end_of_rank, size, _: capacity(end_of_rank, size, 1))
+    monkeypatch.setattr(tiles, "_capacity", lambda order, size, _, count: capacity(order, size, 1, count))
     actual = images_and_gradients(is_dynamic)
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)

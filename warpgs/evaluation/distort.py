@@ -1,7 +1,5 @@
 """Renders as a distorting lens sees them."""
 
-import dataclasses
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,7 +21,7 @@ def distort(rendering: Rendering, positions: Float[Tensor, "H W 2"]) -> Renderin
     static, dynamic = (
         None if layer is None else _sampled(layer, grid) for layer in (rendering.static, rendering.dynamic)
     )
-    return dataclasses.replace(rendering, joint=_sampled(rendering.joint, grid), static=static, dynamic=dynamic)
+    return rendering._replace(joint=_sampled(rendering.joint, grid), static=static, dynamic=dynamic)
 
 
 def _sampled(layer: Layer, grid: Float[Tensor, "H W 2"]) -> Layer:

@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
-from torch import Tensor, int32
+from torch import Tensor, int32, int64
 
 from warpgs.kernels import rows as kernels
+from warpgs.kernels.scan import SCAN_BLOCK_DIM
 from warpgs.runtime.launch import launch
 
 from .projection import Geometry, Projection, View, new_camera_gradients, new_geometry, sum_camera_gradients
@@ -30,17 +31,31 @@ class Rows(NamedTuple):
 
 
 class DepthOrder(NamedTuple):
-    """Keys and values of the depth sort, [2 N] int32 in the first half."""
+    """What binning starts from.
+
+    Attributes:
+        keys, gaussian_from_rank: Keys and values of the depth sort, [2 N] int32 in the first half.
+        isect_ends: int64, for the running sum of intersections (kernels/scan.py): a zero for each block of threads; on
+            CPU, [N] without content.
+    """
 
     keys: Tensor
     gaussian_from_rank: Tensor
+    isect_ends: Tensor
+
+
+def _new_order(radii: Tensor) -> DepthOrder:
+    """Memory for the order of as many splats; it has no content."""
+    N = radii.shape[0]
+    num_ends = -(-N // SCAN_BLOCK_DIM) if radii.is_cuda else N
+    return DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N), radii.new_empty(num_ends, dtype=int64))
 
 
 def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, DepthOrder]:
     """Packs N splats with [N, num_features] features; sets the radii of those that are skipped to 0."""
     N, num_features = features.shape
     packed = features.new_empty(N, kernels.row_parts(num_features + int(with_depth)), 4)
-    order = DepthOrder(*(splats.radii.new_empty(2 * N) for _ in range(2)))
+    order = _new_order(splats.radii)
     launch(kernels.make_pack(num_features, with_depth), N, *splats, features, packed, *order)
     return Rows(packed, num_features, with_depth), order
 
@@ -70,7 +85,7 @@ def project_and_pack(
     N, num_features = features.shape
     packed = features.new_empty(N, kernels.row_parts(num_features + int(with_depth)), 4)
     radii = features.new_empty(N, 2, dtype=int32)
-    order = DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N))
+    order = _new_order(radii)
     inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
     launch(kernels.make_project_and_pack(num_features, with_depth), N, *inputs, radii, packed, *order)
     return PackedSplats(radii, Rows(packed, num_features, with_depth)), order

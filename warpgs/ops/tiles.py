@@ -1,6 +1,8 @@
 """Tile binning: the Gaussians of each tile, front to back (kernels/tiles.py)."""
 
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor, int32, int64
 from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
+from warpgs.kernels.scan import SCAN_BLOCK_DIM
 from warpgs.runtime.launch import launch, sort_pairs
 
 from .rows import DepthOrder, Rows
@@ -83,26 +86,36 @@ def reset_budgets() -> None:
         budget.recent_max = None
 
 
-def _capacity(end_of_rank: Tensor, size: tuple[int, int], max_intersections: int | None) -> tuple[int, Tensor]:
+def _capacity(
+    order: DepthOrder, size: tuple[int, int], max_intersections: int | None, count: Callable[[Tensor], None]
+) -> tuple[int, Tensor]:
     """How many intersections to allocate buffers for, and where the device writes how many there are.
+
+    Args:
+        order, size, max_intersections: As in ``bin_splats``.
+        count: Counts the intersections on a GPU and writes their number to a tensor.
 
     Raises:
         RuntimeError: If that is unknown during a CUDA graph capture, which must not wait for the device.
     """
-    N, key = end_of_rank.shape[0], (end_of_rank.get_device(), size)
+    ends, N = order.isect_ends, order.keys.shape[0] // 2
     if max_intersections is not None:
-        return max(max_intersections, N), end_of_rank.new_empty(1)
-    if not end_of_rank.is_cuda:
-        return max(int(end_of_rank[-1]), N), end_of_rank.new_empty(1)
+        return max(max_intersections, N), ends.new_empty(1)
+    if not ends.is_cuda:
+        return max(int(ends[-1]), N), ends.new_empty(1)
+    key = ends.get_device(), size
     budget = _budgets.by_size.get(key)
-    if budget is None or budget.recent_max is None:
+    if budget is None:
+        budget = _budgets.by_size.setdefault(key, _Budget())
+    if budget.recent_max is None:
         if torch.cuda.is_current_stream_capturing():
             raise RuntimeError(
                 f"a CUDA graph captures the first render of {size[0]} x {size[1]} pixels on this thread: "
                 "set RenderSettings.max_intersections, or render once before"
             )
-        budget = _budgets.by_size.setdefault(key, budget or _Budget())
-        budget.num_isects.copy_(end_of_rank[-1:])
+        count(budget.num_isects)
+        torch.cuda.current_stream(ends.device).synchronize()
+        ends.zero_()
     return budget.capacity(N), budget.num_isects
 
 
@@ -140,31 +153,46 @@ def bin_splats(
         empty = splats.new_zeros(total, 2, dtype=int32)
         none, no_isects = splats.new_empty(1, dtype=int32), splats.new_zeros(1, dtype=int64)
         return Tiles(empty, none, None if is_dynamic is None else empty, no_isects)
-    sort_pairs(*order, N, DEPTH_BITS)
-    end_of_rank = splats.new_empty(N, dtype=int64)  # intersections of each Gaussian and all in front of it
-    launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, end_of_rank)
-    torch.cumsum(end_of_rank, 0, out=end_of_rank)
-    capacity, num_isects = _capacity(end_of_rank, size, max_intersections)
-    return _bin(splats, (order.gaussian_from_rank, end_of_rank, is_dynamic), grid, capacity, num_isects)
+    sort_pairs(order.keys, order.gaussian_from_rank, N, DEPTH_BITS)
+    if not splats.is_cuda:  # there the kernel that emits intersections sums up their numbers itself, see scan.py
+        launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, order.isect_ends)
+        torch.cumsum(order.isect_ends, 0, out=order.isect_ends)
+    emit = partial(_emit, splats, order, is_dynamic, grid)
+    capacity, num_isects = _capacity(order, size, max_intersections, lambda number: emit(0, (None, None), number))
+    new_int = order.keys.new_empty
+    isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
+    emit(capacity, isects, num_isects)
+    sort_pairs(*isects, capacity, total.bit_length())
+    return _lists(order, is_dynamic, total, isects, num_isects)
 
 
-def _bin(
+def _emit(
     splats: Tensor,
-    ranks: tuple[Tensor, Tensor, Tensor | None],
+    order: DepthOrder,
+    is_dynamic: Tensor | None,
     grid: tuple[int, int],
     capacity: int,
+    isects: tuple[Tensor | None, Tensor | None],
     num_isects: Tensor,
+) -> None:
+    """Writes the intersections of splats in their order, up to a capacity, and how many there are."""
+    N = splats.shape[0]
+    num_ranks = -(-N // SCAN_BLOCK_DIM) * SCAN_BLOCK_DIM if splats.is_cuda else N
+    inputs = (splats, order.gaussian_from_rank, order.isect_ends, is_dynamic, N, num_ranks, *grid, capacity)
+    threads = num_ranks + kernels.NUM_FILLING
+    launch(kernels.emit_isects, threads, *inputs, *isects, num_isects, block_dim=SCAN_BLOCK_DIM)
+
+
+def _lists(
+    order: DepthOrder, is_dynamic: Tensor | None, total: int, isects: tuple[Tensor, Tensor], num_isects: Tensor
 ) -> Tiles:
-    """Bins splats that have been sorted and counted."""
-    (gaussian_from_rank, _, is_dynamic), N, total = ranks, splats.shape[0], grid[0] * grid[1]
-    new_int = gaussian_from_rank.new_empty
-    isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
-    launch(kernels.emit_isects, max(N, capacity), splats, *ranks, N, *grid, capacity, *isects, num_isects)
-    sort_pairs(*isects, capacity, total.bit_length())
-    ranges = new_int(total, 2)
+    """The lists of ``total`` tiles from sorted intersections."""
+    N, capacity = order.keys.shape[0] // 2, isects[0].shape[0] // 2
+    ranges = order.keys.new_empty(total, 2)
+    ranks = order.gaussian_from_rank, order.isect_ends, is_dynamic
     launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
     tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
     if is_dynamic is not None:
-        threads = total * (WARP_SIZE if splats.is_cuda else 1)
+        threads = total * (WARP_SIZE if ranges.is_cuda else 1)
         launch(kernels.split_tiles, threads, ranges, tiles.half, *tiles[1:3], block_dim=BLOCK_DIM)
     return tiles

@@ -5,7 +5,6 @@ overwritten in place afterwards, which costs the host less than ``wp.launch``. O
 all cores.
 """
 
-import contextlib
 import ctypes
 import functools
 import math
@@ -246,14 +245,18 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     begun = profiling.begin(keys)
     if keys.is_cuda:
         stream = current_stream(keys.get_device())
+        context, previous = stream.device.context, stream.device.stream
         with _warp_stream:
-            previous = stream.device.stream
-            stream.device.set_stream(stream, sync=False)  # a capture forbids to wait for another stream
+            _native.wp_cuda_context_set_stream(context, stream.cuda_stream, 0)
             try:
-                with _announced_capture(stream):
+                if torch.cuda.is_current_stream_capturing():
+                    # Warp has to know, so that the graph owns the scratch memory of the sort.
+                    with wp.ScopedCapture(stream=stream, external=True, force_module_load=False):
+                        _native.wp_radix_sort_pairs_int_device(*arguments)
+                else:
                     _native.wp_radix_sort_pairs_int_device(*arguments)
             finally:
-                stream.device.set_stream(previous, sync=False)
+                _native.wp_cuda_context_set_stream(context, previous.cuda_stream, 0)
     else:
         _native.wp_radix_sort_pairs_int_host(*arguments)
     profiling.end("sort_pairs", begun, keys)
@@ -261,10 +264,3 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
 
 _native = wp.get_device("cpu").runtime.core
 """Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which cost the host as much as the sort."""
-
-
-def _announced_capture(stream: wp.Stream) -> contextlib.AbstractContextManager[object]:
-    """Tells Warp that a stream is being captured, so that the graph owns the scratch memory of the sort."""
-    if not torch.cuda.is_current_stream_capturing():
-        return contextlib.nullcontext()
-    return wp.ScopedCapture(stream=stream, external=True, force_module_load=False)
