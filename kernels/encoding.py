@@ -22,6 +22,8 @@ CUDA_LANES_LOG2 = 3
 def make_encode(half: bool) -> wp.Kernel:
     """Kernel that writes the columns of x, y, z or t of a row, in half or single precision.
 
+    Rows after the last position are copies of the last one.
+
     2^``lanes_log2`` threads share these columns, one frequency at a time: neighbouring threads on CUDA, which write
     neighbouring addresses, and one thread on CPU. ``begin_column`` is the first column of the encoding; ``raw`` is 1 if
     the values themselves come first, 0 if not. The angles are in [-π, π], where CUDA's fast sine has an error of at
@@ -53,7 +55,7 @@ def make_encode(half: bool) -> wp.Kernel:
         begin = begin_column
         p = time[0]
         if axis < 3:
-            p = (means[row, axis] - center[axis]) / half_size[axis]
+            p = (means[wp.min(row, means.shape[0] - 1), axis] - center[axis]) / half_size[axis]
         else:
             axis = 0
             dims = 1

@@ -7,6 +7,7 @@ single precision, which is the same: a product of two such numbers is exact in i
 import pytest
 import torch
 
+from tests.ops.test_mlp import single_precision_product
 from tests.reference.sh import bases
 from tests.scenes import generator, relative_error
 from warpgs.config.presets import PRESETS
@@ -48,12 +49,8 @@ def test_colours_opacities_and_gradients_are_those_of_single_precision(field, mo
     v_outputs = torch.randn(NUM, 3, generator=generator(2)), torch.randn(NUM, generator=generator(3))
     colors, opacities, gradient = evaluated(field, *v_outputs)
 
-    def product(a, b, out=None):
-        value = a.float() @ b.float()
-        return value if out is None else out.copy_(value)
-
     encode = trunk.encode
-    monkeypatch.setattr(mlp, "_product", product)
+    monkeypatch.setattr(mlp, "_product", single_precision_product)
     monkeypatch.setattr(trunk, "encode", lambda *inputs: encode(*inputs[:5], True, inputs[6]))
     half_colors, half_opacities, half_gradient = evaluated(field, *v_outputs)
     assert 0 < (half_colors - colors).abs().max() < 0.1 / 255  # of levels of 8-bit images

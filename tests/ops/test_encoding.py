@@ -8,7 +8,7 @@ import torch
 from tests.reference.encoding import encode as reference
 from tests.scenes import error, generator
 from warpgs.kernels.encoding import CUDA_LANES_LOG2, make_encode
-from warpgs.ops.encoding import ALIGNMENT, encode, encoded_size
+from warpgs.ops.encoding import ALIGNMENT, ROW_ALIGNMENT, encode, encoded_size
 from warpgs.runtime.launch import launch
 
 TIME = torch.tensor([0.3])
@@ -52,7 +52,14 @@ def test_the_encoding_is_equation_6_for_position_and_time(bands, raw):
 
 def test_half_precision_is_rounded_single_precision():
     means = random_means(20)
-    assert torch.equal(encode_unit_box(means, 4, 3, half=True), encode_unit_box(means, 4, 3).half())
+    assert torch.equal(encode_unit_box(means, 4, 3, half=True)[:20], encode_unit_box(means, 4, 3).half())
+
+
+@pytest.mark.parametrize("num", [1, 64, 65])
+def test_in_half_precision_copies_of_the_last_row_follow(num):
+    encoded = encode_unit_box(random_means(num), 4, 3, half=True)
+    assert len(encoded) == math.ceil(num / ROW_ALIGNMENT) * ROW_ALIGNMENT
+    assert (encoded[num:] == encoded[num - 1]).all()
 
 
 @pytest.mark.parametrize("bands", [(10, 10), (3, 2), (0, 0), (1, 3)])

@@ -5,6 +5,7 @@ import torch
 
 from tests.reference import mlp as reference
 from tests.scenes import error, generator, random_like, relative_error
+from warpgs.ops import mlp
 from warpgs.ops.mlp import MAX_CHUNKS, ROWS_PER_CHUNK, num_sums, num_values, perceptron, relu_backward, split
 
 COLUMNS, WIDTH, OUTPUTS = 6, 16, 5
@@ -52,6 +53,30 @@ def test_outputs_and_gradients_equal_the_reference(depth, skip, num):
             assert error(gradient, part.grad) < 1e-5 * (1 + part.grad.abs().max())
 
 
+def single_precision_product(a, b, out=None):
+    value = a.float() @ b.float()
+    return value if out is None else out.copy_(value)
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("num", [0, 1, 40])
+def test_padding_rows_change_neither_outputs_nor_gradients(half, num, monkeypatch):
+    if half:  # the CPU has no such products
+        monkeypatch.setattr(mlp, "_product", single_precision_product)
+    shapes = [(WIDTH, 8), (WIDTH, WIDTH + 8), (8, WIDTH)]
+    values = random_values(shapes)
+    results = []
+    for rows in (num, 40):
+        inputs = torch.randn(40, 8 + WIDTH, generator=generator())[:rows].to(torch.float16 if half else torch.float32)
+        values.grad = None
+        outputs = perceptron(inputs.contiguous(), values, shapes, 1, OUTPUTS, num)
+        outputs.backward(torch.randn(40, OUTPUTS, generator=generator(2))[:num])
+        results.append((outputs.detach(), values.grad))
+    for padded, expected in zip(*results, strict=True):
+        assert padded.shape == expected.shape
+        assert torch.allclose(padded, expected, rtol=0.0, atol=1e-5)
+
+
 def test_inputs_get_no_gradient():
     shapes = make_shapes(3, 0)
     inputs = random_inputs(4, 0).requires_grad_()
@@ -63,6 +88,19 @@ def test_sizes_that_do_not_fit_half_precision_are_refused():
     shapes = make_shapes(3, 0)
     with pytest.raises(ValueError, match="multiples of 8"):
         perceptron(random_inputs(4, 0).half(), random_values(shapes), shapes, 0, OUTPUTS)
+
+
+def test_half_precision_on_part_of_the_multiprocessors_is_refused(monkeypatch):
+    monkeypatch.setattr(mlp, "_product", single_precision_product)
+    shapes = [(8, 8), (8, 8)]
+    inputs, values = torch.zeros(4, 8), random_values(shapes)
+    for percentage in ("100", ""):
+        monkeypatch.setenv("CUDA_MPS_ACTIVE_THREAD_PERCENTAGE", percentage)
+        perceptron(inputs.half(), values, shapes, 0, OUTPUTS)
+    monkeypatch.setenv("CUDA_MPS_ACTIVE_THREAD_PERCENTAGE", "35")
+    perceptron(inputs, values, shapes, 0, OUTPUTS)
+    with pytest.raises(ValueError, match=r"CUDA_MPS_ACTIVE_THREAD_PERCENTAGE=35: .* --model.no-half"):
+        perceptron(inputs.half(), values, shapes, 0, OUTPUTS)
 
 
 def random_half(*shape, seed=0):

@@ -9,7 +9,9 @@ import torch
 from tests import tiny
 from tests.scenes import generator, relative_error
 from tests.training.test_motion_fit import EXTENT, TIMES, UNEVEN, fit, max_error, new_deformation
+from warpgs.config.presets import PRESETS
 from warpgs.model.fields import FIELDS
+from warpgs.model.trunk import Trunk
 from warpgs.ops.encoding import aligned
 from warpgs.ops.mlp import num_values, perceptron, split
 from warpgs.rendering import render
@@ -192,6 +194,20 @@ def plain(encoding, weights, biases, skip):
         values = torch.cat([values, encoding], 1) if k == skip else values
         values = rounded((values @ rounded(weight).T + rounded(bias)).clamp_min(0.0))
     return values @ rounded(weights[-1]).T + biases[-1]
+
+
+@pytest.mark.parametrize(("num", "last"), [(61_249, 1), (70_545, 17), (81_349, 5), (83_340, 12)])
+def test_gradients_of_weights_omit_no_gaussian(num, last):
+    """On an H100, cuBLAS 13.0 omits the last rows of matrices of these sizes from the product of a head's gradient."""
+    config = dataclasses.replace(PRESETS["paper"].model, half=True)
+    trunk = Trunk(config, torch.zeros(3), torch.ones(3), 10).cuda()
+    trunk.layers(trunk.values.data)[-1].weight.normal_()
+    means, time = torch.rand(num, 3, device="cuda") * 2 - 1, torch.full((1,), 0.3, device="cuda")
+    v_outputs = torch.zeros(num, 10, device="cuda")
+    v_outputs[-last:].normal_()
+    (actual,) = torch.autograd.grad(trunk(means, time), trunk.values, v_outputs)
+    (expected,) = torch.autograd.grad(trunk(means[-last:].contiguous(), time), trunk.values, v_outputs[-last:])
+    assert relative_error(actual, expected) < 1e-2
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])

@@ -57,7 +57,7 @@ class Trunk(nn.Module):
         half = self.uses_half and means.is_cuda
         box = (self.center, self.half_size)
         inputs = encode(means.detach(), time, self.bands, box, self.reserved_columns, half, self.raw)
-        return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0])
+        return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0], len(means))
 
 
 def in_single_precision(model: nn.Module) -> nn.Module:

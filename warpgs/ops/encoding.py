@@ -11,6 +11,10 @@ from warpgs.runtime.launch import launch
 ALIGNMENT = 8
 """Rows are padded with zeros to multiples of this: tensor cores need rows of multiples of 16 bytes."""
 
+ROW_ALIGNMENT = 64
+"""In half precision the number of rows is a multiple of this, because sums over other numbers of rows may be wrong
+(docs/design/half-precision.md)."""
+
 
 def encode(
     means: Float[Tensor, "N 3"],
@@ -20,7 +24,7 @@ def encode(
     offset: int = 0,
     half: bool = False,
     raw: bool = True,
-) -> Float[Tensor, "N columns"]:
+) -> Float[Tensor, "rows columns"]:
     """[γ(p), γ(t)] of paper Eq. 6 for p = (means − center) / half_size; not differentiable.
 
     Args:
@@ -33,7 +37,8 @@ def encode(
         raw: Whether p and t themselves come first.
 
     Returns:
-        [N, offset + columns]: p if ``raw``, sin(2ᵏ π p), cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros.
+        [N, offset + columns]: p if ``raw``, sin(2ᵏ π p), cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros. In
+        half precision, copies of the last row follow up to a multiple of ``ROW_ALIGNMENT`` rows.
 
     Raises:
         ValueError: On a wrong shape, dtype or device.
@@ -43,16 +48,17 @@ def encode(
         check_tensor(name, tensor, shape, {})
     check_same_device(tensors)
     columns = aligned(encoded_size(*bands, raw))
-    encoding = means.new_empty(len(means), offset + columns, dtype=torch.float16 if half else torch.float32)
+    rows = aligned(len(means), ROW_ALIGNMENT) if half else len(means)
+    encoding = means.new_empty(rows, offset + columns, dtype=torch.float16 if half else torch.float32)
     lanes_log2 = kernels.CUDA_LANES_LOG2 if means.is_cuda else 0
     arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
-    launch(kernels.make_encode(half), 4 * len(means) << lanes_log2, *arguments)
+    launch(kernels.make_encode(half), 4 * rows << lanes_log2, *arguments)
     return encoding
 
 
-def aligned(number: int) -> int:
-    """``number`` rounded up to a multiple of ``ALIGNMENT``."""
-    return number + -number % ALIGNMENT
+def aligned(number: int, alignment: int = ALIGNMENT) -> int:
+    """``number`` rounded up to a multiple of ``alignment``."""
+    return number + -number % alignment
 
 
 def encoded_size(position_bands: int, time_bands: int, raw: bool = True) -> int:

@@ -9,6 +9,7 @@ All weights and biases are views of one tensor, and so are their gradients, so t
 launch.
 """
 
+import os
 from collections.abc import Sequence
 from itertools import chain
 from typing import Any, NamedTuple
@@ -27,6 +28,9 @@ from .encoding import ALIGNMENT
 MAX_GRADIENT = 1024.0
 """In half precision, gradients are scaled so that the largest one at the output has this magnitude: far enough below
 the largest number, 65504, and with 34 bits until a gradient underflows."""
+
+MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
+"""Variable that limits the multiprocessors of a process; what it breaks is in docs/design/half-precision.md."""
 
 MAX_CHUNKS = 4096
 """Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
@@ -61,40 +65,59 @@ def split(values: Float[Tensor, " values"], shapes: Sequence[tuple[int, int]]) -
 
 
 def perceptron(
-    inputs: Float[Tensor, "N columns"],
+    inputs: Float[Tensor, "rows columns"],
     values: Float[Tensor, " values"],
     shapes: Sequence[tuple[int, int]],
     skip: int,
     num_outputs: int,
+    num_rows: int | None = None,
 ) -> Float[Tensor, "N outputs"]:
     """Evaluates the layers; differentiable in ``values`` only.
 
     Args:
-        inputs: [N, R + E] whose last E columns are the encoding, the input of the first layer; the first R columns are
-            overwritten by the input features of layer ``skip``; R = 0 without ``skip``. If it is half precision, all
-            matrix factors are, too; sums, gradients of ``values`` and the result are single precision.
+        inputs: [rows, R + E] whose last E columns are the encoding, the input of the first layer; the first R columns
+            are overwritten by the input features of layer ``skip``; R = 0 without ``skip``. If it is half precision,
+            all matrix factors are, too; sums, gradients of ``values`` and the result are single precision.
         values: Weights and biases in the layout of ``split``.
         shapes: Of the weights: [width, E], [width, width] …; that of layer ``skip`` is [width, R + E], and the last
             one has at least ``num_outputs`` rows. In half precision all sizes must be multiples of 8, and all hidden
             layers must have the same width.
         skip: Index of the layer that reads the encoding again, after its features; 0 for none.
         num_outputs: Number of rows of the last layer to return; the others are padding.
+        num_rows: N, the number of inputs to return the outputs of; the others are padding. All by default.
 
     Returns:
         [N, num_outputs].
 
     Raises:
-        ValueError: If the sizes do not fit half precision.
+        ValueError: In half precision, if the sizes do not fit, or MPS limits the multiprocessors of this process.
     """
-    if inputs.dtype == torch.float16 and any(number % ALIGNMENT for number in chain([inputs.shape[1]], *shapes)):
-        raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(shapes)}")
-    return _Perceptron.apply(inputs, values, tuple(shapes), skip, num_outputs)
+    if inputs.dtype == torch.float16:
+        _check_half([inputs.shape[1], *chain(*shapes)])
+    return _Perceptron.apply(inputs, values, tuple(shapes), skip, num_outputs, num_rows)
+
+
+def _check_half(sizes: Sequence[int]) -> None:
+    if any(size % ALIGNMENT for size in sizes):
+        raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(sizes)}")
+    percentage = os.environ.get(MPS_LIMIT, "100").strip()
+    if percentage not in ("", "100"):
+        raise ValueError(
+            f"{MPS_LIMIT}={percentage}: with part of the multiprocessors, cuBLAS computes wrong products in half "
+            "precision; unset it, or train with --model.no-half"
+        )
 
 
 class _Perceptron(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, inputs: Tensor, values: Tensor, shapes: tuple[tuple[int, int], ...], skip: int, num_outputs: int
+        ctx: Any,
+        inputs: Tensor,
+        values: Tensor,
+        shapes: tuple[tuple[int, int], ...],
+        skip: int,
+        num_outputs: int,
+        num_rows: int | None,
     ) -> Tensor:
         copy = values.to(inputs.dtype)
         *hidden, head = split(copy, shapes)
@@ -110,7 +133,7 @@ class _Perceptron(torch.autograd.Function):
         ctx.save_for_backward(*layer_inputs, x, copy)
         ctx.shapes = shapes
         bias = split(values, shapes)[-1].bias[:num_outputs]
-        return _product(x, head.weight.t())[:, :num_outputs] + bias
+        return _product(x, head.weight.t())[:num_rows, :num_outputs] + bias
 
     @staticmethod
     @once_differentiable
@@ -120,13 +143,14 @@ class _Perceptron(torch.autograd.Function):
         is_half = copy.dtype == torch.float16
         v_values = torch.empty_like(copy, dtype=gradient.dtype)
         v_layers = split(v_values, ctx.shapes)
-        num_padding = len(layers[-1].bias) - gradient.shape[1]
-        v_head_bias = torch.nn.functional.pad(gradient.sum(0), (0, num_padding))
+        shape = len(layer_inputs[0]), len(layers[-1].bias)
+        padding = 0, shape[1] - gradient.shape[1]
+        v_head_bias = torch.nn.functional.pad(gradient.sum(0), padding)
         if is_half:
-            gradient, unscale = _scaled(gradient, len(layers[-1].bias))
+            gradient, unscale = _scaled(gradient, shape)
             sums = v_values.new_empty(len(layers) - 1, num_sums(len(gradient)), len(layers[0].bias))
         else:
-            gradient = torch.nn.functional.pad(gradient, (0, num_padding))
+            gradient = torch.nn.functional.pad(gradient, (*padding, 0, shape[0] - len(gradient)))
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0:
@@ -142,16 +166,16 @@ class _Perceptron(torch.autograd.Function):
             torch.sum(sums, 1, out=v_biases.view(sums.shape[0], sums.shape[2]))
             v_values *= unscale
         v_layers[-1].bias.copy_(v_head_bias)
-        return None, v_values, None, None, None
+        return None, v_values, None, None, None, None
 
 
-def _scaled(gradient: Tensor, columns: int) -> tuple[Tensor, Tensor]:
-    """The output's gradient in half precision, scaled and padded to ``columns``, and the inverse of the scale."""
+def _scaled(gradient: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The output's gradient in half precision, scaled and padded to a shape, and the inverse of the scale."""
     # A row of zeros is appended because the maximum of no rows is undefined.
     largest = torch.linalg.vector_norm(torch.nn.functional.pad(gradient, (0, 0, 0, 1)), torch.inf)
     largest = largest.clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
-    scaled = gradient.new_zeros(len(gradient), columns, dtype=torch.float16)
-    torch.mul(gradient, MAX_GRADIENT / largest, out=scaled[:, : gradient.shape[1]])
+    scaled = gradient.new_zeros(shape, dtype=torch.float16)
+    torch.mul(gradient, MAX_GRADIENT / largest, out=scaled[: gradient.shape[0], : gradient.shape[1]])
     return scaled, largest / MAX_GRADIENT
 
 
