@@ -248,6 +248,19 @@ def test_the_intersections_of_many_blocks_of_threads_are_all_listed():
     assert 20_000 < int(lists.num_intersections) == int(all_gaussians.num_intersections) < 10_000_000
 
 
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one CUDA device")
+def test_a_render_on_another_than_the_current_gpu_is_the_same():
+    def image_and_gradients_on(device):
+        splats = as_leaves(make_splats(200).to(device))
+        image = render(splats, make_camera().to(device)).joint.image
+        image.square().sum().backward()
+        return [t.detach().cpu() for t in (image, *gradients(splats).values())]
+
+    assert torch.cuda.current_device() == 0
+    for actual, expected in zip(image_and_gradients_on("cuda:1"), image_and_gradients_on("cuda:0"), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
 def test_a_checkpointed_render_has_the_same_gradients():
     splats, camera = make_splats(200).to("cuda"), make_camera().to("cuda")
     image = image_of(splats, camera)

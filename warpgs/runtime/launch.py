@@ -243,23 +243,31 @@ def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
     arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
     begun = profiling.begin(keys)
-    if keys.is_cuda:
-        stream = current_stream(keys.get_device())
-        context, previous = stream.device.context, stream.device.stream
-        with _warp_stream:
-            _native.wp_cuda_context_set_stream(context, stream.cuda_stream, 0)
-            try:
-                if torch.cuda.is_current_stream_capturing():
-                    # Warp has to know, so that the graph owns the scratch memory of the sort.
-                    with wp.ScopedCapture(stream=stream, external=True, force_module_load=False):
-                        _native.wp_radix_sort_pairs_int_device(*arguments)
-                else:
-                    _native.wp_radix_sort_pairs_int_device(*arguments)
-            finally:
-                _native.wp_cuda_context_set_stream(context, previous.cuda_stream, 0)
-    else:
+    if not keys.is_cuda:
         _native.wp_radix_sort_pairs_int_host(*arguments)
+    elif keys.get_device() == torch.cuda.current_device():
+        _sort_on_gpu(keys.get_device(), arguments)
+    else:
+        with torch.cuda.device(keys.get_device()):  # Warp sorts on the current one
+            _sort_on_gpu(keys.get_device(), arguments)
     profiling.end("sort_pairs", begun, keys)
+
+
+def _sort_on_gpu(index: int, arguments: tuple[int, ...]) -> None:
+    """Sorts on torch's current stream of a GPU, the current one."""
+    stream = current_stream(index)
+    context, previous = stream.device.context, stream.device.stream
+    with _warp_stream:
+        _native.wp_cuda_context_set_stream(context, stream.cuda_stream, 0)
+        try:
+            if torch.cuda.is_current_stream_capturing():
+                # Warp has to know, so that the graph owns the scratch memory of the sort.
+                with wp.ScopedCapture(stream=stream, external=True, force_module_load=False):
+                    _native.wp_radix_sort_pairs_int_device(*arguments)
+            else:
+                _native.wp_radix_sort_pairs_int_device(*arguments)
+        finally:
+            _native.wp_cuda_context_set_stream(context, previous.cuda_stream, 0)
 
 
 _native = wp.get_device("cpu").runtime.core
