@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from tests.data import captures, layouts
 from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
+from warpgs.data import loaders
 from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
@@ -86,6 +88,14 @@ def test_inverted_and_entirely_dynamic_masks_are_an_error(root, convert, text):
 def test_a_path_that_does_not_exist_is_no_capture_to_report_on(tmp_path):
     with pytest.raises(ValueError, match="nowhere does not exist"):
         check_capture(tmp_path / "nowhere")
+
+
+def test_a_built_in_capture_is_checked_by_its_name(root, monkeypatch):
+    monkeypatch.setattr(loaders, "builtin_folder", lambda name: root)
+    assert check_capture(Path("builtin:studio")).is_fit
+    monkeypatch.undo()
+    (finding,) = check_capture(Path("builtin:nothing")).findings
+    assert "there is no built-in capture builtin:nothing" in finding.text
 
 
 def test_missing_masks_are_an_error_that_says_how_to_make_them(root):

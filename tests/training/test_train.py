@@ -362,9 +362,9 @@ def test_a_damaged_evaluation_frame_leaves_a_trained_run_and_says_how_to_evaluat
     frame = data / f"rgb/1x/{name}.png"
     whole = frame.read_bytes()
     frame.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=f"{frame} is truncated") as error:
+    with pytest.raises(ValueError, match=f"{frame} is truncated"):
         warpgs.train(dataclasses.replace(config, data=data), log=lines.append)
-    assert lines[-1].endswith(f"failed ({error.value}); once that is solved, run it with warpgs eval {config.out}")
+    assert lines[-1].endswith(f"failed with the error below; once that is solved, run it with warpgs eval {config.out}")
     frame.write_bytes(whole)
     assert evaluate_run.evaluate_run(config.out, quiet=True)
 
@@ -376,7 +376,7 @@ def test_an_evaluation_that_fails_says_how_to_evaluate(config, monkeypatch, erro
     with pytest.raises(type(error)) as raised:
         warpgs.train(config, log=lines.append)
     assert raised.value is error
-    assert lines[-1].endswith(f"evaluation failed ({error}); once that is solved, run it with warpgs eval {config.out}")
+    assert lines[-1].endswith(f"failed with the error below; once that is solved, run it with warpgs eval {config.out}")
 
 
 def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):

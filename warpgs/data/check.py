@@ -15,6 +15,7 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.errors import visible
 
+from .builtin import is_builtin
 from .capture import MASKS_REMEDY, MIN_EXTENT, Capture, Frame
 from .depth_alignment import (
     DepthProblem,
@@ -113,7 +114,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
     Raises:
         ValueError: If there is no such folder.
     """
-    if not root.exists():
+    if not is_builtin(root) and not root.exists():
         raise ValueError(f"{root} does not exist")
     try:
         capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)

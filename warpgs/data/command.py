@@ -15,7 +15,7 @@ class Check:
     """Checks whether a capture is fit to train on; exit code 1 if it is not."""
 
     capture: Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional]
-    """Folder of the capture."""
+    """Folder of the capture, or a built-in one (builtin:studio)."""
     dataset: str | None = None
     """Layout: iphone, nerfds, hypernerf, nerfstudio, blender, llff, colmap, vipe or megasam; recognized from the files
     by default."""

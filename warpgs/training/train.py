@@ -11,7 +11,6 @@ from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.data.loaders import recognize
-from warpgs.errors import one_line
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
@@ -121,8 +120,8 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"training is done, evaluation stopped; {later}") from None
-    except Exception as error:  # lack of memory, too, whose advice is about training
-        log(f"training is done and saved, but evaluation failed ({one_line(error)}); once that is solved, {later}")
+    except Exception:  # lack of memory, too, whose advice is about training
+        log(f"training is done and saved, but evaluation failed with the error below; once that is solved, {later}")
         raise
     log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
 

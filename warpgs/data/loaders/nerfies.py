@@ -164,8 +164,10 @@ def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -
     """
     rgb, size = root / "rgb", f"{factor}x"
     if not (rgb / size).is_dir():
-        found = ", ".join(sorted(p.name for p in rgb.glob("*x"))) or "no size"
-        raise ValueError(f"{rgb / size} is missing: {LAYOUT}; {rgb} has {found}")
+        found = ", ".join(sorted(p.name for p in rgb.glob("*x")))
+        raise ValueError(
+            f"{rgb / size} is missing: " + (f"{rgb} has {found}, --factor chooses among them" if found else LAYOUT)
+        )
     masks = next((p for p in (root / "resized_mask", root / "mask") if p.is_dir()), None)
     if masks is not None and not (masks / size).is_dir() and not incomplete_masks:
         raise ValueError(f"{masks / size} is missing: images are read from {rgb / size}, masks must have the same size")
