@@ -65,7 +65,7 @@ def gradient_stride(num_channels: int) -> int:
 def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that writes a row; depth is an optional last channel.
 
-    It also writes the input of the depth sort, a key and the splat's own index, and that of the running sum of
+    It also writes the input of the depth sort, a key and the splat's own index, and the zeros of the prefix sum of
     intersections (see ``scan``), and returns whether the splat is not skipped.
     """
     num_channels = num_features + int(with_depth)
@@ -78,7 +78,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         rows: wp.array2d[wp.vec4],
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
-        isect_ends: wp.array[wp.int64],
+        scan_words: wp.array[wp.int64],
     ) -> bool:
         mean = splat.mean
         conic = splat.conic
@@ -111,7 +111,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         depth_keys[i] = key
         gaussian_from_rank[i] = i
         if i % SCAN_BLOCK_DIM == 0:
-            isect_ends[i / SCAN_BLOCK_DIM] = wp.int64(0)
+            scan_words[i / SCAN_BLOCK_DIM] = wp.int64(0)
         return visible
 
     return pack_splat
@@ -134,7 +134,7 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         rows: wp.array2d[wp.vec4],
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
-        isect_ends: wp.array[wp.int64],
+        scan_words: wp.array[wp.int64],
     ):
         i = first + wp.tid()
         splat = Splat()
@@ -143,7 +143,7 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         splat.depth = depths[i]
         splat.opacity = opacities[i]
         splat.radius = radii[i]
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, isect_ends):
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words):
             if splat.radius[0] != 0 or splat.radius[1] != 0:
                 radii[i] = wp.vec2i(0, 0)
 
@@ -174,11 +174,11 @@ def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         rows: wp.array2d[wp.vec4],
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
-        isect_ends: wp.array[wp.int64],
+        scan_words: wp.array[wp.int64],
     ):
         i = first + wp.tid()
         splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, isect_ends):
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words):
             splat.radius = wp.vec2i(0, 0)
         radii[i] = splat.radius
 

@@ -19,7 +19,7 @@ from .constants import CULLED_LOG2_OPACITY, LOG2_ALPHA_MIN, TILE_SIZE
 from .ellipse import ellipse_half_size, ellipse_slab
 from .lanes import lane_ballot, lane_bit_count, lane_broadcast, lane_count, lane_lowest, lane_rank, lane_sum_before
 from .rows import row_load
-from .scan import running_sum, sum_of_all
+from .scan import prefix_sums, stored_sum, wait_for_sum
 
 SLACK = wp.constant(0.01)
 """Spans are widened by this [px], well above the rounding error of float32 at 8K, so that no intersection is missed."""
@@ -114,12 +114,13 @@ def count_tiles(
     num_tiles_of_rank[rank] = wp.int64(num_tiles_of(rows, gaussian_from_rank[rank], tiles_x, tiles_y))
 
 
-@wp.kernel(enable_backward=False, grid_stride=False)  # running_sum needs a CUDA block to be a block of threads
+# With Warp's grid-stride loop the grid is one-dimensional, as the prefix sum needs it, and has a thread for each index.
+@wp.kernel(enable_backward=False, grid_stride=True)
 def emit_isects(
     first: int,
     rows: wp.array2d[wp.vec4],
     gaussian_from_rank: wp.array[int],
-    ends: wp.array[wp.int64],
+    scan_words: wp.array[wp.int64],
     is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     num_ranks: int,
@@ -136,7 +137,7 @@ def emit_isects(
     """
     thread = first + wp.tid()
     if thread >= num_ranks:
-        total = sum_of_all(ends)
+        total = wait_for_sum(scan_words)
         if thread == num_ranks:
             demand[0] = total
         for unused in range(int(wp.min(total, wp.int64(capacity))) + thread - num_ranks, capacity, NUM_FILLING):
@@ -151,9 +152,9 @@ def emit_isects(
         gaussian = make_isect(g, is_dynamic)
         if lane_count() > 1:  # on CPU, count_tiles has counted
             count = num_tiles_of(rows, g, tiles_x, tiles_y)
-    span = running_sum(count, thread, ends)
-    isect = int(wp.min(span[0], wp.int64(capacity)))
-    end = int(wp.min(span[1], wp.int64(capacity)))
+    sums = prefix_sums(count, thread, scan_words)
+    isect = int(wp.min(sums[0], wp.int64(capacity)))
+    end = int(wp.min(sums[1], wp.int64(capacity)))
     many = int(end - isect > MANY_TILES)
     if end > isect and many == 0:
         row0 = row_load(rows, g, 0)
@@ -212,7 +213,7 @@ def emit_isects(
 def tile_ranges(
     first: int,
     gaussian_from_rank: wp.array[int],
-    ends: wp.array[wp.int64],
+    scan_words: wp.array[wp.int64],
     is_dynamic: wp.array[wp.uint8],
     num_gaussians: int,
     num_tiles: int,
@@ -223,7 +224,7 @@ def tile_ranges(
 ):
     """Launched with ``max(capacity, num_tiles) + 1`` threads over the sorted intersections."""
     thread = first + wp.tid()
-    if sum_of_all(ends) > wp.int64(capacity):
+    if stored_sum(scan_words) > wp.int64(capacity):
         if thread < num_gaussians:
             gaussian_from_isect[thread] = make_isect(gaussian_from_rank[thread], is_dynamic)
         if thread < num_tiles:

@@ -21,8 +21,10 @@ from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.config import RenderSettings
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
+from warpgs.ops.projection import Geometry, View, project_fwd
+from warpgs.ops.rows import pack
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
-from warpgs.ops.tiles import reset_budgets
+from warpgs.ops.tiles import bin_splats, reset_budgets
 from warpgs.rendering import render
 from warpgs.runtime.graphs import capture, record
 from warpgs.runtime.streams import concurrently
@@ -237,15 +239,45 @@ def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
         assert torch.equal(captured.joint.image, render(splats, camera).joint.image)
 
 
-def test_the_intersections_of_many_blocks_of_threads_are_all_listed():
+def lists_of_tiles(device, num, max_intersections=None):
+    """The list of each tile, and the number of intersections."""
+    splats, camera = make_splats(20_000), make_camera(480, 270)
+    geometry = (t[:num].to(device) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
+    view = View(camera.viewmat.to(device), camera.K.to(device), *camera.size)
+    projection = project_fwd(Geometry(*geometry), view, 0.01, False)
+    rows, order = pack(projection, torch.rand(num, 3, device=device), with_depth=False)
+    tiles = bin_splats(rows, order, camera.size, max_intersections=max_intersections)
+    torch.cuda.synchronize()
+    isects = tiles.gaussian_from_isect.tolist()
+    return [isects[begin:end] for begin, end in tiles.ranges.tolist()], int(tiles.num_isects)
+
+
+# Blocks have 256 threads, a look-back reads 32 of them at once, and the buffers have room for more than all lists.
+@pytest.mark.parametrize("num", [1, 255, 256, 257, 8191, 8192, 8193, 20_000])
+def test_the_lists_of_tiles_equal_those_on_cpu(num):
+    expected, number = lists_of_tiles("cpu", num)
+    for max_intersections in (None, None, number, number + 1000):
+        lists, actual = lists_of_tiles("cuda", num, max_intersections)
+        assert sum(map(len, lists)) == actual
+        # Where an ellipse grazes a tile, rounding decides.
+        different = sum(len(set(a) ^ set(e)) for a, e in zip(lists, expected, strict=True))
+        assert max(different, abs(actual - number)) <= 1e-4 * number
+        same = [a == e for a, e in zip(lists, expected, strict=True) if set(a) == set(e)]
+        assert all(same)
+
+
+@pytest.mark.parametrize("branches", [False, True])
+def test_with_too_many_intersections_a_large_render_is_the_same(branches):
     splats, camera = make_splats(20_000).to("cuda"), make_camera(480, 270).to("cuda")
     with torch.no_grad():
-        # The first lists all Gaussians in every tile, whatever the running sum of intersections is.
-        all_gaussians, lists = (
-            render(splats, camera, settings=RenderSettings(max_intersections=number)) for number in (1, 10_000_000)
+        few, enough = (
+            render(splats, camera, settings=RenderSettings(branches=branches, max_intersections=number))
+            for number in (1, 10_000_000)
         )
-    assert torch.equal(lists.joint.image, all_gaussians.joint.image)
-    assert 20_000 < int(lists.num_intersections) == int(all_gaussians.num_intersections) < 10_000_000
+    assert torch.equal(few.joint.image, enough.joint.image)
+    if branches:
+        assert torch.equal(few.static.image, enough.static.image)
+        assert torch.equal(few.dynamic.image, enough.dynamic.image)
 
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one CUDA device")
@@ -256,8 +288,10 @@ def test_a_render_on_another_than_the_current_gpu_is_the_same():
         image.square().sum().backward()
         return [t.detach().cpu() for t in (image, *gradients(splats).values())]
 
+    torch.cuda.set_device(0)
+    on_the_other = image_and_gradients_on("cuda:1")
     assert torch.cuda.current_device() == 0
-    for actual, expected in zip(image_and_gradients_on("cuda:1"), image_and_gradients_on("cuda:0"), strict=True):
+    for actual, expected in zip(on_the_other, image_and_gradients_on("cuda:0"), strict=True):
         assert relative_error(actual, expected) < 1e-5
 
 

@@ -31,24 +31,24 @@ class Rows(NamedTuple):
 
 
 class DepthOrder(NamedTuple):
-    """What binning starts from.
+    """Input of binning, which uses it up.
 
     Attributes:
-        keys, gaussian_from_rank: Keys and values of the depth sort, [2 N] int32 in the first half.
-        isect_ends: int64, for the running sum of intersections (kernels/scan.py): a zero for each block of threads; on
+        keys, gaussian_from_rank: [2 N] int32 keys and values of the depth sort, in the first half.
+        scan_words: int64 words of the prefix sum of intersections (kernels/scan.py): [⌈N / SCAN_BLOCK_DIM⌉] zeros; on
             CPU, [N] without content.
     """
 
     keys: Tensor
     gaussian_from_rank: Tensor
-    isect_ends: Tensor
+    scan_words: Tensor
 
 
 def _new_order(radii: Tensor) -> DepthOrder:
     """Memory for the order of as many splats; it has no content."""
     N = radii.shape[0]
-    num_ends = -(-N // SCAN_BLOCK_DIM) if radii.is_cuda else N
-    return DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N), radii.new_empty(num_ends, dtype=int64))
+    num_words = -(-N // SCAN_BLOCK_DIM) if radii.is_cuda else N
+    return DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N), radii.new_empty(num_words, dtype=int64))
 
 
 def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, DepthOrder]:

@@ -98,24 +98,23 @@ def _capacity(
     Raises:
         RuntimeError: If that is unknown during a CUDA graph capture, which must not wait for the device.
     """
-    ends, N = order.isect_ends, order.keys.shape[0] // 2
+    words, N = order.scan_words, order.keys.shape[0] // 2
     if max_intersections is not None:
-        return max(max_intersections, N), ends.new_empty(1)
-    if not ends.is_cuda:
-        return max(int(ends[-1]), N), ends.new_empty(1)
-    key = ends.get_device(), size
+        return max(max_intersections, N), words.new_empty(1)
+    if not words.is_cuda:
+        return max(int(words[-1]), N), words.new_empty(1)
+    key = words.get_device(), size
     budget = _budgets.by_size.get(key)
-    if budget is None:
-        budget = _budgets.by_size.setdefault(key, _Budget())
-    if budget.recent_max is None:
+    if budget is None or budget.recent_max is None:
         if torch.cuda.is_current_stream_capturing():
             raise RuntimeError(
                 f"a CUDA graph captures the first render of {size[0]} x {size[1]} pixels on this thread: "
                 "set RenderSettings.max_intersections, or render once before"
             )
+        budget = _budgets.by_size.setdefault(key, budget or _Budget())
         count(budget.num_isects)
-        torch.cuda.current_stream(ends.device).synchronize()
-        ends.zero_()
+        torch.cuda.current_stream(words.device).synchronize()
+        words.zero_()
     return budget.capacity(N), budget.num_isects
 
 
@@ -134,7 +133,7 @@ def bin_splats(
     """Bins splats into the tiles of an image.
 
     Args:
-        splat_rows, order: The N splats, from ``pack``; they are sorted in place.
+        splat_rows, order: The N splats, from ``pack``. ``order`` is used up: pack again to bin again.
         size: (width, height) of the image [px].
         is_dynamic: [N] uint8 branches, to get the lists of each branch, too.
         max_intersections: For how many intersections to allocate buffers; with more, the lists are longer than
@@ -154,9 +153,9 @@ def bin_splats(
         none, no_isects = splats.new_empty(1, dtype=int32), splats.new_zeros(1, dtype=int64)
         return Tiles(empty, none, None if is_dynamic is None else empty, no_isects)
     sort_pairs(order.keys, order.gaussian_from_rank, N, DEPTH_BITS)
-    if not splats.is_cuda:  # there the kernel that emits intersections sums up their numbers itself, see scan.py
-        launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, order.isect_ends)
-        torch.cumsum(order.isect_ends, 0, out=order.isect_ends)
+    if not splats.is_cuda:  # on CUDA the kernel that emits intersections does that itself, see scan.py
+        launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, order.scan_words)
+        torch.cumsum(order.scan_words, 0, out=order.scan_words)
     emit = partial(_emit, splats, order, is_dynamic, grid)
     capacity, num_isects = _capacity(order, size, max_intersections, lambda number: emit(0, (None, None), number))
     new_int = order.keys.new_empty
@@ -178,7 +177,7 @@ def _emit(
     """Writes the intersections of splats in their order, up to a capacity, and how many there are."""
     N = splats.shape[0]
     num_ranks = -(-N // SCAN_BLOCK_DIM) * SCAN_BLOCK_DIM if splats.is_cuda else N
-    inputs = (splats, order.gaussian_from_rank, order.isect_ends, is_dynamic, N, num_ranks, *grid, capacity)
+    inputs = (splats, order.gaussian_from_rank, order.scan_words, is_dynamic, N, num_ranks, *grid, capacity)
     threads = num_ranks + kernels.NUM_FILLING
     launch(kernels.emit_isects, threads, *inputs, *isects, num_isects, block_dim=SCAN_BLOCK_DIM)
 
@@ -189,7 +188,7 @@ def _lists(
     """The lists of ``total`` tiles from sorted intersections."""
     N, capacity = order.keys.shape[0] // 2, isects[0].shape[0] // 2
     ranges = order.keys.new_empty(total, 2)
-    ranks = order.gaussian_from_rank, order.isect_ends, is_dynamic
+    ranks = order.gaussian_from_rank, order.scan_words, is_dynamic
     launch(kernels.tile_ranges, max(capacity, total) + 1, *ranks, N, total, capacity, *isects, ranges)
     tiles = Tiles(ranges, isects[1], None if is_dynamic is None else torch.empty_like(ranges), num_isects)
     if is_dynamic is not None:
