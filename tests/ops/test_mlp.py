@@ -66,8 +66,8 @@ def test_padding_rows_change_neither_outputs_nor_gradients(half, num, monkeypatc
     shapes = [(WIDTH, 8), (WIDTH, WIDTH + 8), (8, WIDTH)]
     values = random_values(shapes)
     results = []
-    for rows in (num, 40):
-        inputs = torch.randn(40, 8 + WIDTH, generator=generator())[:rows].to(torch.float16 if half else torch.float32)
+    for rows in (64, 128) if half else (num, 40):
+        inputs = torch.randn(128, 8 + WIDTH, generator=generator())[:rows].to(torch.float16 if half else torch.float32)
         values.grad = None
         outputs = perceptron(inputs.contiguous(), values, shapes, 1, OUTPUTS, num)
         outputs.backward(torch.randn(40, OUTPUTS, generator=generator(2))[:num])
@@ -87,13 +87,20 @@ def test_inputs_get_no_gradient():
 def test_sizes_that_do_not_fit_half_precision_are_refused():
     shapes = make_shapes(3, 0)
     with pytest.raises(ValueError, match="multiples of 8"):
-        perceptron(random_inputs(4, 0).half(), random_values(shapes), shapes, 0, OUTPUTS)
+        perceptron(random_inputs(64, 0).half(), random_values(shapes), shapes, 0, OUTPUTS)
+
+
+@pytest.mark.parametrize(("rows", "num_rows"), [(63, None), (64, 65)])
+def test_numbers_of_inputs_that_do_not_fit_half_precision_are_refused(rows, num_rows):
+    shapes = [(8, 8), (8, 8)]
+    with pytest.raises(ValueError, match="a multiple of 64 inputs"):
+        perceptron(torch.zeros(rows, 8).half(), random_values(shapes), shapes, 0, OUTPUTS, num_rows)
 
 
 def test_half_precision_on_part_of_the_multiprocessors_is_refused(monkeypatch):
     monkeypatch.setattr(mlp, "_product", single_precision_product)
     shapes = [(8, 8), (8, 8)]
-    inputs, values = torch.zeros(4, 8), random_values(shapes)
+    inputs, values = torch.zeros(64, 8), random_values(shapes)
     for percentage in ("100", ""):
         monkeypatch.setenv("CUDA_MPS_ACTIVE_THREAD_PERCENTAGE", percentage)
         perceptron(inputs.half(), values, shapes, 0, OUTPUTS)

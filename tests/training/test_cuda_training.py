@@ -12,7 +12,7 @@ from tests.training.test_motion_fit import EXTENT, TIMES, UNEVEN, fit, max_error
 from warpgs.config.presets import PRESETS
 from warpgs.model.fields import FIELDS
 from warpgs.model.trunk import Trunk
-from warpgs.ops.encoding import aligned
+from warpgs.ops.encoding import ROW_ALIGNMENT, aligned
 from warpgs.ops.mlp import num_values, perceptron, split
 from warpgs.rendering import render
 from warpgs.runs.checkpoint import Metadata
@@ -231,10 +231,9 @@ def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outp
         layer.weight[: weight.shape[0], : weight.shape[1]] = weight
         layer.bias[: len(bias)] = bias
     flat = flat.cuda().requires_grad_()
-    inputs = torch.nn.functional.pad(
-        encoding.half().cuda(), (64, 3)
-    )  # columns for the hidden units before, padding after
-    ours = perceptron(inputs, flat, padded, skip=2, num_outputs=outputs)
+    # Columns for the hidden units before, padding after; rows of padding after.
+    inputs = torch.nn.functional.pad(encoding.half().cuda(), (64, 3, 0, -num % ROW_ALIGNMENT))
+    ours = perceptron(inputs, flat, padded, skip=2, num_outputs=outputs, num_rows=num)
     ours.backward(v_outputs.cuda())
 
     assert ours.is_contiguous()

@@ -379,6 +379,17 @@ def test_an_evaluation_that_fails_says_how_to_evaluate(config, monkeypatch, erro
     assert lines[-1].endswith(f"failed with the error below; once that is solved, run it with warpgs eval {config.out}")
 
 
+def test_half_precision_on_part_of_the_multiprocessors_is_refused_before_training(config, monkeypatch):
+    warpgs.train(config)
+    monkeypatch.setenv("CUDA_MPS_ACTIVE_THREAD_PERCENTAGE", "35")
+    monkeypatch.setattr(script, "_own_device", lambda asked: "cuda")
+    for given in (dataclasses.replace(config, out=config.out.with_name("new")), TrainConfig(resume=config.out)):
+        with pytest.raises(ValueError, match="CUDA_MPS_ACTIVE_THREAD_PERCENTAGE=35: with part"):
+            warpgs.train(given)
+    assert not config.out.with_name("new").exists()
+    assert not Run.open(config.out).trained_scene().scene.appearance.trunk.uses_half
+
+
 def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
     warpgs.train(dataclasses.replace(config, as_taken=True))
     taken, evaluate = [], evaluate_run.evaluate

@@ -37,8 +37,8 @@ def encode(
         raw: Whether p and t themselves come first.
 
     Returns:
-        [N, offset + columns]: p if ``raw``, sin(2ᵏ π p), cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros. In
-        half precision, copies of the last row follow up to a multiple of ``ROW_ALIGNMENT`` rows.
+        [rows, offset + columns]: p if ``raw``, sin(2ᵏ π p), cos(2ᵏ π p) for k = 0 … L − 1; the same for t; then zeros.
+        There are N rows; in half precision, copies of the last one follow up to a multiple of ``ROW_ALIGNMENT``.
 
     Raises:
         ValueError: On a wrong shape, dtype or device.

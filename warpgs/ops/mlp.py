@@ -23,7 +23,7 @@ from warpgs.kernels import mlp as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
 from warpgs.runtime.launch import launch
 
-from .encoding import ALIGNMENT
+from .encoding import ALIGNMENT, ROW_ALIGNMENT
 
 MAX_GRADIENT = 1024.0
 """In half precision, gradients are scaled so that the largest one at the output has this magnitude: far enough below
@@ -77,7 +77,8 @@ def perceptron(
     Args:
         inputs: [rows, R + E] whose last E columns are the encoding, the input of the first layer; the first R columns
             are overwritten by the input features of layer ``skip``; R = 0 without ``skip``. If it is half precision,
-            all matrix factors are, too; sums, gradients of ``values`` and the result are single precision.
+            all matrix factors are, too, and rows must be a multiple of ``ROW_ALIGNMENT``; sums, gradients of ``values``
+            and the result are single precision.
         values: Weights and biases in the layout of ``split``.
         shapes: Of the weights: [width, E], [width, width] …; that of layer ``skip`` is [width, R + E], and the last
             one has at least ``num_outputs`` rows. In half precision all sizes must be multiples of 8, and all hidden
@@ -93,18 +94,33 @@ def perceptron(
         ValueError: In half precision, if the sizes do not fit, or MPS limits the multiprocessors of this process.
     """
     if inputs.dtype == torch.float16:
-        _check_half([inputs.shape[1], *chain(*shapes)])
+        _check_sizes(len(inputs), num_rows, [inputs.shape[1], *chain(*shapes)])
+        check_half_precision()
     return _Perceptron.apply(inputs, values, tuple(shapes), skip, num_outputs, num_rows)
 
 
-def _check_half(sizes: Sequence[int]) -> None:
-    if any(size % ALIGNMENT for size in sizes):
-        raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(sizes)}")
-    percentage = os.environ.get(MPS_LIMIT, "100").strip()
-    if percentage not in ("", "100"):
+def limit_of_multiprocessors() -> str:
+    """``VARIABLE=value`` if MPS limits the multiprocessors of this process, which may break half precision, or ""."""
+    percentage = os.environ.get(MPS_LIMIT, "").strip()
+    return "" if percentage in ("", "100") else f"{MPS_LIMIT}={percentage}"
+
+
+def check_half_precision() -> None:
+    """Raises ValueError if products in half precision may be wrong, with one line that says what to do."""
+    limit = limit_of_multiprocessors()
+    if limit:
         raise ValueError(
-            f"{MPS_LIMIT}={percentage}: with part of the multiprocessors, cuBLAS computes wrong products in half "
-            "precision; unset it, or train with --model.no-half"
+            f"{limit}: with part of the multiprocessors, cuBLAS computes wrong products in half precision; unset it, "
+            "or begin a new run with --model.no-half"
+        )
+
+
+def _check_sizes(rows: int, num_rows: int | None, columns: Sequence[int]) -> None:
+    if any(size % ALIGNMENT for size in columns):
+        raise ValueError(f"in half precision rows and columns must be multiples of {ALIGNMENT}, got {list(columns)}")
+    if rows % ROW_ALIGNMENT or rows < (num_rows or 0):
+        raise ValueError(
+            f"in half precision there must be a multiple of {ROW_ALIGNMENT} inputs, at least num_rows, got {rows}"
         )
 
 

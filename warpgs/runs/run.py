@@ -14,6 +14,8 @@ from warpgs.config import TrainConfig
 from warpgs.data.builtin import is_builtin
 from warpgs.data.capture import Capture, extent_of
 from warpgs.files import partial_path
+from warpgs.model.trunk import in_single_precision
+from warpgs.ops.mlp import limit_of_multiprocessors
 
 from . import checkpoint
 from .captures import open_capture
@@ -150,6 +152,10 @@ class Run:
             raise ValueError(f"{self.folder} has no checkpoint yet")
         loaded = checkpoint.load(path)
         scene = checkpoint.load_scene(loaded, self.config.model)
+        if (
+            limit_of_multiprocessors()
+        ):  # half precision may be wrong, and single precision has the same PSNR to 0.001 dB
+            in_single_precision(scene)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
 
     def lock(self) -> AbstractContextManager[None]:

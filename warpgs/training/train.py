@@ -15,6 +15,7 @@ from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
 from warpgs.model.poses import PoseCorrections
+from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
 from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, new_folder, open_capture
@@ -211,6 +212,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     if config.resume is not None:
         return _continued(config, config.resume, log, quiet)
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
+    _check_precision(config)
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
     _compare_ranks(config, capture)
@@ -225,6 +227,12 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
+
+
+def _check_precision(config: TrainConfig) -> None:
+    """Raises ValueError if the networks would be trained in half precision where that may be wrong."""
+    if config.model.half and config.device == "cuda":
+        check_half_precision()
 
 
 def _cpu_advice(config: TrainConfig) -> str:
@@ -246,6 +254,7 @@ def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trai
     if config.as_taken:
         saved = dataclasses.replace(saved, as_taken=True)
     run = Run(folder, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
+    _check_precision(run.config)
     locate(run.config.lpips, run.config.lpips_net)
     capture = check_capture(run.open_capture(quiet), run.config, log)
     _compare_ranks(run.config, capture)
