@@ -1,5 +1,6 @@
 """Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def import_capture(
         )
         if capture.assumption == "dynamic":
             log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
-        log(f"{target} is finished: next run warpgs check {target}")
+        log(f"{target} is finished: next run warpgs check {shlex.quote(str(target))}")
 
 
 def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: bool) -> tuple[int, int]:

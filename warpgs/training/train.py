@@ -124,7 +124,8 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     except Exception:  # lack of memory, too, whose advice is about training
         log(f"training is done and saved, but evaluation failed with the error below; once that is solved, {later}")
         raise
-    log(f"metrics.json, views.csv, images/ and time.mp4 are in {trainer.run}")
+    files = "metrics.json, views.csv, images/ and time.mp4" if capture.val else "metrics.json and time.mp4"
+    log(f"{files} are in {trainer.run}; warpgs view {shlex.quote(str(trainer.run))} shows the scene")
 
 
 def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], quiet: bool) -> None:

@@ -220,7 +220,8 @@ class Trainer:
         config, scene, views = self.config, self.scene, self.views
         mask_of = lost_pixels(scene, phase, config.render_settings)
         fraction = lost_fraction(views, mask_of)
-        count = min(self._capacity(), round(fraction * config.model.dynamic_points))
+        capacity = self._capacity()
+        count = min(capacity, round(fraction * config.model.dynamic_points))
         if fraction < config.densify.reseed or count <= 0:
             return
         generator = self._generator("reseed")
@@ -228,8 +229,9 @@ class Trainer:
         if found is not None:
             added = gaussians_that_show(found, scene, views, config, self.capture.extent)
             optim.append(self.step.optimizer, scene.dynamic, added)
-            where = f"{fraction:.0%} of the dynamic pixels, where there were none"
-            logger.log(f"iteration {self.iteration + 1}: {len(added):,} dynamic Gaussians added in {where}")
+            lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
+            limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
+            logger.log(f"iteration {self.iteration + 1}: {lost}; {len(added):,} added there{limit}")
 
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
