@@ -4,13 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from warpgs.data.check import Finding
-from warpgs.errors import ADVICE, CLOSED, is_out_of_memory, one_line, run_command, terminable
+from warpgs.errors import ADVICE, CLOSED, command, is_out_of_memory, one_line, run_command, terminable
 
 
 def failing(error):
@@ -130,6 +131,10 @@ OTHERS = [
 @pytest.mark.parametrize("message", OUT_OF_MEMORY + OTHERS)
 def test_messages_of_lack_of_memory_are_recognized(message):
     assert is_out_of_memory(RuntimeError(message)) == (message in OUT_OF_MEMORY)
+
+
+def test_a_command_in_a_message_can_be_pasted():
+    assert command("prepare", Path("my video.mp4"), "--holdout", 8) == "warpgs prepare 'my video.mp4' --holdout 8"
 
 
 def test_one_line_has_no_line_breaks():

@@ -5,6 +5,7 @@ import functools
 import io
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
@@ -157,6 +158,11 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
 def one_line(error: BaseException) -> str:
     """The message of an error without line breaks and control characters."""
     return visible(" ".join(str(error).split()))
+
+
+def command(*words: object) -> str:
+    """A command of this package in a message, quoted so that it can be pasted into a shell."""
+    return shlex.join(["warpgs", *map(str, words)])
 
 
 def visible(text: str) -> str:

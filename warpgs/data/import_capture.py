@@ -1,12 +1,12 @@
 """Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
 
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.command_line.progress import progress
+from warpgs.errors import command
 from warpgs.files import complete_or_absent
 
 from . import writer
@@ -63,7 +63,7 @@ def import_capture(
         )
         if capture.assumption == "dynamic":
             log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
-        log(f"{target} is finished: next run warpgs check {shlex.quote(str(target))}")
+        log(f"{target} is finished: next run {command('check', target)}")
 
 
 def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: bool) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from warpgs.errors import ending_at_once, terminable
+from warpgs.errors import command, ending_at_once, terminable
 
 from .options import Options
 
@@ -85,4 +85,4 @@ class Sample:
         log = None if self.quiet else partial(print, flush=True)
         write_sample(self.video, log=log)
         if log is not None:
-            log(f"{self.video} is finished: next run warpgs prepare {self.video} CAPTURE --holdout 8")
+            log(f"{self.video} is finished: next run {command('prepare', self.video, 'CAPTURE', '--holdout', 8)}")

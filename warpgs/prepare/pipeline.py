@@ -1,12 +1,12 @@
 """From a video or a folder of frames to a capture."""
 
 import json
-import shlex
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from warpgs.errors import command
 from warpgs.files import kept_if_used
 
 from .cameras import MISLED, Cameras, NoCamerasError
@@ -58,7 +58,7 @@ def prepare(
     for note in report["notes"] if was_finished else []:  # the steps have logged them otherwise
         journal.log(f"note: {note}")
     sheets = "masks.png" if options.depth_method == "none" else "masks.png and depth.png"
-    done = f"{root} is finished: look at {sheets} in it, then run warpgs check {shlex.quote(str(root))}"
+    done = f"{root} is finished: look at {sheets} in it, then run {command('check', root)}"
     journal.log(f"{root} was finished before; --force makes it again" if was_finished else done)
     return report
 

@@ -12,6 +12,7 @@ from typing import Any
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
 from warpgs.config import TrainConfig
+from warpgs.errors import command
 from warpgs.files import read_bounded, read_json, require_file
 from warpgs.runs.config_file import read_config
 
@@ -105,7 +106,7 @@ def _read_metrics(folder: Path) -> dict[str, Any]:
 def _check_evaluated(path: Path) -> None:
     """Refuses a run folder without a file that the evaluation writes."""
     if not path.exists():
-        raise ValueError(f"{path.parent} has no {path.name}: evaluate it with warpgs eval {path.parent}")
+        raise ValueError(f"{path.parent} has no {path.name}: evaluate it with {command('eval', path.parent)}")
 
 
 def _read_views(path: Path) -> list[View]:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.data.loaders import recognize
+from warpgs.errors import command
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
@@ -115,8 +115,8 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         # Without a terminal, there is no progress bar for minutes.
         log(f"evaluating {len(capture.val)} view{'s' * (len(capture.val) != 1)}")
     lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
-    command = ["warpgs", "eval", str(trainer.run), *lpips, *(["--as-taken"] if config.as_taken else [])]
-    later = f"run it with {shlex.join(command)}"
+    as_taken = ["--as-taken"] if config.as_taken else []
+    later = f"run it with {command('eval', trainer.run, *lpips, *as_taken)}"
     try:
         log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
     except KeyboardInterrupt:
@@ -125,7 +125,7 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         log(f"training is done and saved, but evaluation failed with the error below; once that is solved, {later}")
         raise
     files = "metrics.json, views.csv, images/ and time.mp4" if capture.val else "metrics.json and time.mp4"
-    log(f"{files} are in {trainer.run}; warpgs view {shlex.quote(str(trainer.run))} shows the scene")
+    log(f"{files} are in {trainer.run}; {command('view', trainer.run)} shows the scene")
 
 
 def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
@@ -180,7 +180,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
     elif num_aligned < num_views - refused:
         reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
         if not num_aligned and trainer.capture.frame(trainer.capture.train[0]).inverse_depth is None:
-            log(f"the capture has no depth, which warpgs prepare {config.data} --add depth makes{reason}")
+            log(f"the capture has no depth, which {command('prepare', config.data, '--add', 'depth')} makes{reason}")
         else:
             log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:

@@ -12,6 +12,7 @@ from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
+from warpgs.errors import command
 from warpgs.files import read_json
 
 from .blender import BlenderLoader
@@ -112,7 +113,8 @@ def require_capture(root: Path) -> None:
         raise ValueError(f"{root} is a file: give the folder of the capture")
     if (root / "config.json").exists():
         raise ValueError(
-            f"{root} is a run folder: give the capture that it was trained on; warpgs train --resume {root} trains on"
+            f"{root} is a run folder: give the capture that it was trained on; "
+            f"{command('train', '--resume', root)} trains on"
         )
     for parent in root.resolve().parents[:2]:
         if is_capture(parent):

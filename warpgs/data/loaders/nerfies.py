@@ -27,6 +27,7 @@ from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN
+from warpgs.errors import command
 from warpgs.files import first_file, read_json
 
 from .options import LoadOptions
@@ -184,7 +185,7 @@ def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -
         if masks is not None and files[name].mask is None and not incomplete_masks:
             raise ValueError(
                 f"{masks / size / name}.png.png is missing: every training frame needs its mask; "
-                f"warpgs prepare {root} --add masks makes those that are missing"
+                f"{command('prepare', root, '--add', 'masks')} makes those that are missing"
             )
     return files
 
