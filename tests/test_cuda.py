@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from tests.ops.test_tiles import binned, projected
 from tests.reference.depth_error import random_inputs
 from tests.scenes import (
     as_leaves,
@@ -21,10 +22,8 @@ from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.config import RenderSettings
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
-from warpgs.ops.projection import Geometry, View, project_fwd
-from warpgs.ops.rows import pack
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
-from warpgs.ops.tiles import bin_splats, reset_budgets
+from warpgs.ops.tiles import reset_budgets
 from warpgs.rendering import render
 from warpgs.runtime.graphs import capture, record
 from warpgs.runtime.streams import concurrently
@@ -239,25 +238,13 @@ def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
         assert torch.equal(captured.joint.image, render(splats, camera).joint.image)
 
 
-def lists_of_tiles(device, num, max_intersections=None):
-    """The list of each tile, and the number of intersections."""
-    splats, camera = make_splats(20_000), make_camera(480, 270)
-    geometry = (t[:num].to(device) for t in (splats.means, splats.quats, splats.scales, splats.opacities))
-    view = View(camera.viewmat.to(device), camera.K.to(device), *camera.size)
-    projection = project_fwd(Geometry(*geometry), view, 0.01, False)
-    rows, order = pack(projection, torch.rand(num, 3, device=device), with_depth=False)
-    tiles = bin_splats(rows, order, camera.size, max_intersections=max_intersections)
-    torch.cuda.synchronize()
-    isects = tiles.gaussian_from_isect.tolist()
-    return [isects[begin:end] for begin, end in tiles.ranges.tolist()], int(tiles.num_isects)
-
-
 # Blocks have 256 threads, a look-back reads 32 of them at once, and the buffers have room for more than all lists.
 @pytest.mark.parametrize("num", [1, 255, 256, 257, 8191, 8192, 8193, 20_000])
 def test_the_lists_of_tiles_equal_those_on_cpu(num):
-    expected, number = lists_of_tiles("cpu", num)
+    size = (480, 270)
+    expected, number = binned(projected(*size, num), *size)
     for max_intersections in (None, None, number, number + 1000):
-        lists, actual = lists_of_tiles("cuda", num, max_intersections)
+        lists, actual = binned(projected(*size, num, "cuda"), *size, max_intersections)
         assert sum(map(len, lists)) == actual
         # Where an ellipse grazes a tile, rounding decides.
         different = sum(len(set(a) ^ set(e)) for a, e in zip(lists, expected, strict=True))

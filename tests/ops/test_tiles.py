@@ -15,15 +15,15 @@ from warpgs.rendering import render
 NUM = 120
 
 
-def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
-    camera, splats = make_camera(width, height), make_splats(num)
+def projected(width=WIDTH, height=HEIGHT, num=NUM, device="cpu") -> Projection:
+    camera, splats = make_camera(width, height).to(device), make_splats(num).to(device)
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     return project(geometry, View(camera.viewmat, camera.K, *camera.size))
 
 
 def binned(splats: Projection, width=WIDTH, height=HEIGHT, max_intersections=None) -> tuple[list[list[int]], int]:
     """The list of each tile, and the number of intersections."""
-    packed = pack(splats, torch.rand(len(splats.depths), 3), with_depth=False)
+    packed = pack(splats, torch.rand(len(splats.depths), 3, device=splats.depths.device), with_depth=False)
     result = tiles.bin_splats(*packed, (width, height), max_intersections=max_intersections)
     isects = result.gaussian_from_isect.tolist()
     return [isects[begin:end] for begin, end in result.ranges.tolist()], int(result.num_isects)
