@@ -29,7 +29,7 @@ MANY_TILES = wp.constant(24)
 """A Gaussian with more intersections than this is written by a whole lane group instead of one thread."""
 
 
-NUM_FILLING = wp.constant(8192)
+NUM_FILL_THREADS = wp.constant(8192)
 """Threads that give the unused intersections their tile index."""
 
 
@@ -131,7 +131,7 @@ def emit_isects(
     gaussian_from_isect: wp.array[int],
     demand: wp.array[wp.int64],
 ):
-    """Launched with ``num_ranks`` threads, ``num_gaussians`` rounded up to whole blocks, and ``NUM_FILLING`` more.
+    """Launched with ``num_ranks`` threads, ``num_gaussians`` rounded up to whole blocks, and ``NUM_FILL_THREADS`` more.
 
     With the capacity 0 it only counts.
     """
@@ -140,7 +140,7 @@ def emit_isects(
         total = wait_for_sum(scan_words)
         if thread == num_ranks:
             demand[0] = total
-        for unused in range(int(wp.min(total, wp.int64(capacity))) + thread - num_ranks, capacity, NUM_FILLING):
+        for unused in range(int(wp.min(total, wp.int64(capacity))) + thread - num_ranks, capacity, NUM_FILL_THREADS):
             tile_from_isect[unused] = tiles_x * tiles_y
         return
     lane = thread % lane_count()

@@ -176,9 +176,9 @@ def _emit(
 ) -> None:
     """Writes the intersections of splats in their order, up to a capacity, and how many there are."""
     N = splats.shape[0]
-    num_ranks = -(-N // SCAN_BLOCK_DIM) * SCAN_BLOCK_DIM if splats.is_cuda else N
+    num_ranks = order.scan_words.shape[0] * (SCAN_BLOCK_DIM if splats.is_cuda else 1)
     inputs = (splats, order.gaussian_from_rank, order.scan_words, is_dynamic, N, num_ranks, *grid, capacity)
-    threads = num_ranks + kernels.NUM_FILLING
+    threads = num_ranks + kernels.NUM_FILL_THREADS
     launch(kernels.emit_isects, threads, *inputs, *isects, num_isects, block_dim=SCAN_BLOCK_DIM)
 
 

@@ -152,9 +152,7 @@ class Run:
             raise ValueError(f"{self.folder} has no checkpoint yet")
         loaded = checkpoint.load(path)
         scene = checkpoint.load_scene(loaded, self.config.model)
-        if (
-            limit_of_multiprocessors()
-        ):  # half precision may be wrong, and single precision has the same PSNR to 0.001 dB
+        if limit_of_multiprocessors():  # which may break half precision; PSNR is the same to 0.001 dB
             in_single_precision(scene)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
 

@@ -242,14 +242,14 @@ _warp_stream = threading.Lock()
 def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
     """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
     arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
-    begun = profiling.begin(keys)
-    if not keys.is_cuda:
+    begun, index = profiling.begin(keys), keys.get_device()
+    if index == CPU:
         _native.wp_radix_sort_pairs_int_host(*arguments)
-    elif keys.get_device() == torch.cuda.current_device():
-        _sort_on_gpu(keys.get_device(), arguments)
+    elif index == torch.cuda.current_device():
+        _sort_on_gpu(index, arguments)
     else:
-        with torch.cuda.device(keys.get_device()):  # Warp sorts on the current one
-            _sort_on_gpu(keys.get_device(), arguments)
+        with torch.cuda.device(index):  # Warp sorts on the current one
+            _sort_on_gpu(index, arguments)
     profiling.end("sort_pairs", begun, keys)
 
 
