@@ -65,8 +65,8 @@ def gradient_stride(num_channels: int) -> int:
 def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that writes a row; depth is an optional last channel.
 
-    It also writes the input of the depth sort, a key and the splat's own index, and the zeros of the prefix sum of
-    intersections (see ``scan``), and returns whether the splat is not skipped.
+    It also writes the input of the depth sort, a key and the splat's own index, and the zeros that this sort and the
+    prefix sum of intersections need (see ``scan``), and returns whether the splat is not skipped.
     """
     num_channels = num_features + int(with_depth)
 
@@ -79,6 +79,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
         scan_words: wp.array[wp.int64],
+        sort_counters: wp.array[int],
     ) -> bool:
         mean = splat.mean
         conic = splat.conic
@@ -112,6 +113,8 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         gaussian_from_rank[i] = i
         if i % SCAN_BLOCK_DIM == 0:
             scan_words[i / SCAN_BLOCK_DIM] = wp.int64(0)
+        for k in range(i, sort_counters.shape[0], rows.shape[0]):
+            sort_counters[k] = 0
         return visible
 
     return pack_splat
@@ -135,6 +138,7 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
         scan_words: wp.array[wp.int64],
+        sort_counters: wp.array[int],
     ):
         i = first + wp.tid()
         splat = Splat()
@@ -143,7 +147,7 @@ def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         splat.depth = depths[i]
         splat.opacity = opacities[i]
         splat.radius = radii[i]
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words):
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
             if splat.radius[0] != 0 or splat.radius[1] != 0:
                 radii[i] = wp.vec2i(0, 0)
 
@@ -175,10 +179,11 @@ def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
         depth_keys: wp.array[int],
         gaussian_from_rank: wp.array[int],
         scan_words: wp.array[wp.int64],
+        sort_counters: wp.array[int],
     ):
         i = first + wp.tid()
         splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words):
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
             splat.radius = wp.vec2i(0, 0)
         radii[i] = splat.radius
 

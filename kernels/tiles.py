@@ -30,7 +30,7 @@ MANY_TILES = wp.constant(24)
 
 
 NUM_FILL_THREADS = wp.constant(8192)
-"""Threads that give the unused intersections their tile index."""
+"""Threads that give the unused intersections their tile index, and write the zeros that the sort by tile needs."""
 
 
 DYNAMIC = wp.constant(1 << 30)
@@ -129,6 +129,7 @@ def emit_isects(
     capacity: int,
     tile_from_isect: wp.array[int],
     gaussian_from_isect: wp.array[int],
+    sort_counters: wp.array[int],
     demand: wp.array[wp.int64],
 ):
     """Launched with ``num_ranks`` threads, ``num_gaussians`` rounded up to whole blocks, and ``NUM_FILL_THREADS`` more.
@@ -137,6 +138,8 @@ def emit_isects(
     """
     thread = first + wp.tid()
     if thread >= num_ranks:
+        for k in range(thread - num_ranks, sort_counters.shape[0], NUM_FILL_THREADS):
+            sort_counters[k] = 0
         total = wait_for_sum(scan_words)
         if thread == num_ranks:
             demand[0] = total

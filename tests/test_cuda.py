@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from tests.ops.test_sort import CASES, random_keys, sorted_pairs
 from tests.ops.test_tiles import binned, projected
 from tests.reference.depth_error import random_inputs
 from tests.scenes import (
@@ -236,6 +237,19 @@ def test_a_replay_with_more_intersections_than_its_buffers_hold_is_complete():
         torch.cuda.synchronize()
         assert int(captured.num_intersections) > 1_000
         assert torch.equal(captured.joint.image, render(splats, camera).joint.image)
+
+
+@pytest.mark.parametrize(("num_pairs", "num_bits"), [*CASES, (300_000, 9), (1_000_003, 31), (5_000_000, 13)])
+def test_sorted_pairs_equal_a_stable_sort(num_pairs, num_bits):
+    keys = random_keys(num_pairs, num_bits).cuda()
+    expected = torch.sort(keys, stable=True)
+    for _ in range(3):
+        assert sorted_pairs(keys, num_bits) == (expected.values.tolist(), expected.indices.tolist())
+
+
+def test_a_sort_of_equal_keys_leaves_all_pairs_where_they_are():
+    keys = torch.full((100_000,), (1 << 31) - 1, dtype=torch.int32, device="cuda")
+    assert sorted_pairs(keys, 31) == (keys.tolist(), list(range(100_000)))
 
 
 # Blocks have 256 threads, a look-back reads 32 of them at once, and the buffers have room for more than all lists.

@@ -9,6 +9,7 @@ from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
 from warpgs.kernels.rows import make_pack, make_project_and_pack, make_unpack, make_unpack_and_unproject
+from warpgs.kernels.sort import make_sort_pairs
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
 from warpgs.ops.compositing import CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS
 
@@ -27,6 +28,11 @@ MODULES = ["activation", "adam", "depth_error", "mlp", "projection", "raytrace",
 @pytest.mark.parametrize("name", MODULES)
 def test_a_module_of_kernels_compiles(name, tmp_path):
     assert_compiles(importlib.import_module(f"warpgs.kernels.{name}"), tmp_path)
+
+
+@pytest.mark.parametrize(("digit_bits", "num_passes"), [(1, 2), (8, 4)])
+def test_the_sort_compiles(digit_bits, num_passes, tmp_path):
+    assert_compiles(make_sort_pairs(digit_bits, num_passes).module, tmp_path)
 
 
 @pytest.mark.parametrize("half", [False, True])

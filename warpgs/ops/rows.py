@@ -9,6 +9,10 @@ from warpgs.kernels.scan import SCAN_BLOCK_DIM
 from warpgs.runtime.launch import launch
 
 from .projection import Geometry, Projection, View, new_camera_gradients, new_geometry, sum_camera_gradients
+from .sort import new_counters
+
+DEPTH_BITS = 31
+"""Bits of a depth key: those of a positive float."""
 
 
 class Rows(NamedTuple):
@@ -37,18 +41,21 @@ class DepthOrder(NamedTuple):
         keys, gaussian_from_rank: [2 N] int32 keys and values of the depth sort, in the first half.
         scan_words: int64 words of the prefix sum of intersections (kernels/scan.py): [⌈N / SCAN_BLOCK_DIM⌉] zeros; on
             CPU, [N] without content.
+        sort_counters: int32 zeros of the depth sort (``sort.new_counters``); None on CPU.
     """
 
     keys: Tensor
     gaussian_from_rank: Tensor
     scan_words: Tensor
+    sort_counters: Tensor | None
 
 
 def _new_order(radii: Tensor) -> DepthOrder:
     """Memory for the order of as many splats; it has no content."""
     N = radii.shape[0]
     num_words = -(-N // SCAN_BLOCK_DIM) if radii.is_cuda else N
-    return DepthOrder(radii.new_empty(2 * N), radii.new_empty(2 * N), radii.new_empty(num_words, dtype=int64))
+    keys, values, words = radii.new_empty(2 * N), radii.new_empty(2 * N), radii.new_empty(num_words, dtype=int64)
+    return DepthOrder(keys, values, words, new_counters(radii, N, DEPTH_BITS))
 
 
 def pack(splats: Projection, features: Tensor, with_depth: bool) -> tuple[Rows, DepthOrder]:

@@ -12,17 +12,16 @@ from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
 from warpgs.kernels.scan import SCAN_BLOCK_DIM
-from warpgs.runtime.launch import launch, sort_pairs
+from warpgs.runtime.launch import launch
 
-from .rows import DepthOrder, Rows
+from .rows import DEPTH_BITS, DepthOrder, Rows
+from .sort import new_counters, sort_pairs
 
 HEADROOM = 1.2
 """Buffers hold the recent maximum of intersections times this."""
 
 DECAY = 0.999
 """Factor by which the recent maximum of intersections decreases per frame."""
-
-DEPTH_BITS = 31
 
 
 class Tiles(NamedTuple):
@@ -152,17 +151,17 @@ def bin_splats(
         empty = splats.new_zeros(total, 2, dtype=int32)
         none, no_isects = splats.new_empty(1, dtype=int32), splats.new_zeros(1, dtype=int64)
         return Tiles(empty, none, None if is_dynamic is None else empty, no_isects)
-    sort_pairs(order.keys, order.gaussian_from_rank, N, DEPTH_BITS)
+    sort_pairs(order.keys, order.gaussian_from_rank, order.sort_counters, DEPTH_BITS)
     if not splats.is_cuda:  # on CUDA the kernel that emits intersections does that itself, see scan.py
         launch(kernels.count_tiles, N, splats, order.gaussian_from_rank, *grid, order.scan_words)
         torch.cumsum(order.scan_words, 0, out=order.scan_words)
-    emit = partial(_emit, splats, order, is_dynamic, grid)
-    capacity, num_isects = _capacity(order, size, max_intersections, lambda number: emit(0, (None, None), number))
-    new_int = order.keys.new_empty
-    isects = new_int(2 * capacity), new_int(2 * capacity)  # tile, Gaussian
-    emit(capacity, isects, num_isects)
-    sort_pairs(*isects, capacity, total.bit_length())
-    return _lists(order, is_dynamic, total, isects, num_isects)
+    emit, num_bits = partial(_emit, splats, order, is_dynamic, grid), total.bit_length()
+    capacity, num_isects = _capacity(order, size, max_intersections, lambda number: emit(0, (None,) * 3, number))
+    new = order.keys.new_empty
+    pairs = new(2 * capacity), new(2 * capacity), new_counters(order.keys, capacity, num_bits)
+    emit(capacity, pairs, num_isects)
+    sort_pairs(*pairs, num_bits)
+    return _lists(order, is_dynamic, total, pairs[:2], num_isects)
 
 
 def _emit(
@@ -171,15 +170,18 @@ def _emit(
     is_dynamic: Tensor | None,
     grid: tuple[int, int],
     capacity: int,
-    isects: tuple[Tensor | None, Tensor | None],
+    pairs: tuple[Tensor | None, Tensor | None, Tensor | None],
     num_isects: Tensor,
 ) -> None:
-    """Writes the intersections of splats in their order, up to a capacity, and how many there are."""
+    """Writes the intersections of splats in their order, up to a capacity, and how many there are.
+
+    ``pairs`` are the arguments of their sort: tiles, Gaussians and counters.
+    """
     N = splats.shape[0]
     num_ranks = order.scan_words.shape[0] * (SCAN_BLOCK_DIM if splats.is_cuda else 1)
     inputs = (splats, order.gaussian_from_rank, order.scan_words, is_dynamic, N, num_ranks, *grid, capacity)
     threads = num_ranks + kernels.NUM_FILL_THREADS
-    launch(kernels.emit_isects, threads, *inputs, *isects, num_isects, block_dim=SCAN_BLOCK_DIM)
+    launch(kernels.emit_isects, threads, *inputs, *pairs, num_isects, block_dim=SCAN_BLOCK_DIM)
 
 
 def _lists(

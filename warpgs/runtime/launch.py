@@ -1,4 +1,4 @@
-"""Launching Warp kernels, and its radix sort, on torch tensors.
+"""Launching Warp kernels on torch tensors.
 
 Kernels run on torch's current stream. A launch is recorded once per thread and kernel, and its arguments are
 overwritten in place afterwards, which costs the host less than ``wp.launch``. On CPU a launch is cut into shards for
@@ -233,42 +233,3 @@ def command_for(kernel: wp.Kernel, index: int, block_dim: int) -> Command:
         with _load_lock:  # two threads that load the same module at once would unload each other's code
             command = _commands.cache[kernel, index, block_dim] = Command(kernel, device, block_dim)
     return command
-
-
-_warp_stream = threading.Lock()
-"""Held while Warp's current stream, which all threads share, is changed: Warp sorts on that stream."""
-
-
-def sort_pairs(keys: Tensor, values: Tensor, count: int, num_bits: int) -> None:
-    """Sorts the first ``count`` int32 pairs by the low bits of the keys, stably; buffers hold twice that many."""
-    arguments = keys.data_ptr(), values.data_ptr(), count, 0, num_bits, values.element_size()
-    begun, index = profiling.begin(keys), keys.get_device()
-    if index == CPU:
-        _native.wp_radix_sort_pairs_int_host(*arguments)
-    elif index == torch.cuda.current_device():
-        _sort_on_gpu(index, arguments)
-    else:
-        with torch.cuda.device(index):  # Warp sorts on the current one
-            _sort_on_gpu(index, arguments)
-    profiling.end("sort_pairs", begun, keys)
-
-
-def _sort_on_gpu(index: int, arguments: tuple[int, ...]) -> None:
-    """Sorts on torch's current stream of a GPU, the current one."""
-    stream = current_stream(index)
-    context, previous = stream.device.context, stream.device.stream
-    with _warp_stream:
-        _native.wp_cuda_context_set_stream(context, stream.cuda_stream, 0)
-        try:
-            if torch.cuda.is_current_stream_capturing():
-                # Warp has to know, so that the graph owns the scratch memory of the sort.
-                with wp.ScopedCapture(stream=stream, external=True, force_module_load=False):
-                    _native.wp_radix_sort_pairs_int_device(*arguments)
-            else:
-                _native.wp_radix_sort_pairs_int_device(*arguments)
-        finally:
-            _native.wp_cuda_context_set_stream(context, previous.cuda_stream, 0)
-
-
-_native = wp.get_device("cpu").runtime.core
-"""Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which cost the host as much as the sort."""

@@ -1,0 +1,57 @@
+"""Stable radix sort of pairs (kernels/sort.py; on CPU that of Warp)."""
+
+import warp as wp
+from torch import Tensor
+
+from warpgs.kernels import sort as kernels
+from warpgs.runtime import profiling
+from warpgs.runtime.launch import launch
+
+MAX_BLOCKS = 512
+"""Blocks of a sort: as many as a GPU runs at once."""
+
+MAX_CHUNKS = 256
+"""Chunks in which digits are counted: enough to saturate memory, few enough to be added up quickly."""
+
+
+def num_passes(num_bits: int) -> int:
+    """Number of passes on CUDA; it is even, so that the last one writes to the first half of the buffers."""
+    return 2 if num_bits <= 2 * kernels.MAX_DIGIT_BITS else kernels.MAX_PASSES
+
+
+def new_counters(like: Tensor, num_pairs: int, num_bits: int) -> Tensor | None:
+    """Memory without content for the counters of a sort, which must be zeros when it begins; None on CPU."""
+    if not like.is_cuda:
+        return None
+    num_tiles = -(-num_pairs // kernels.PAIRS_PER_TILE)
+    return like.new_empty(kernels.HEADER + num_passes(num_bits) * num_tiles * kernels.DIGITS)
+
+
+def sort_pairs(keys: Tensor, values: Tensor, counters: Tensor | None, num_bits: int) -> None:
+    """Sorts pairs of a key and a value by their keys; equal keys keep their order.
+
+    Args:
+        keys: [2 n] int32, in the first half n keys ≥ 0 and < 2 ** ``num_bits``; the second half is scratch memory.
+        values: [2 n] int32, likewise.
+        counters: Zeros from ``new_counters``, which are used up.
+        num_bits: At most 31.
+
+    Raises:
+        ValueError: If there are too many pairs.
+    """
+    n = keys.shape[0] // 2
+    if counters is None:
+        begun = profiling.begin(keys)
+        _native.wp_radix_sort_pairs_int_host(keys.data_ptr(), values.data_ptr(), n, 0, num_bits, values.element_size())
+        profiling.end("sort_pairs", begun, keys)
+        return
+    if n >= kernels.MAX_PAIRS:
+        raise ValueError(f"fewer than {kernels.MAX_PAIRS} pairs can be sorted, got {n}")
+    num_tiles, passes = -(-n // kernels.PAIRS_PER_TILE), num_passes(num_bits)
+    kernel, block_dim = kernels.make_sort_pairs(-(-num_bits // passes), passes), kernels.SORT_BLOCK_DIM
+    threads, tiles_per_chunk = min(num_tiles, MAX_BLOCKS) * block_dim, -(-num_tiles // MAX_CHUNKS)
+    launch(kernel, threads, keys, values, counters, n, tiles_per_chunk, block_dim=block_dim)
+
+
+_native = wp.get_device("cpu").runtime.core
+"""Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which cost the host as much as the sort."""
