@@ -66,7 +66,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that writes a row; depth is an optional last channel.
 
     It also writes the input of the depth sort, a key and the splat's own index, and the zeros that this sort and the
-    prefix sum of intersections need (see ``scan``), and returns whether the splat is not skipped.
+    prefix sum of intersections need (see ``sort`` and ``scan``), and returns whether the splat is not skipped.
     """
     num_channels = num_features + int(with_depth)
 

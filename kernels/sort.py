@@ -1,16 +1,16 @@
 """Stable radix sort of pairs on CUDA in a single kernel: "onesweep".
 
 A. Adinets and D. Merrill, "Onesweep: A Faster Least Significant Digit Radix Sort for GPUs", arXiv 2206.01784. First all
-digits of all keys are counted. Then each pass sorts by one digit, from the lowest to the highest: a block sorts a tile
-of pairs in shared memory, and learns by decoupled look-back (see ``scan``) how many pairs of each digit the preceding
-tiles have.
+digits of all keys are counted. Then each pass sorts by one digit, from the lowest to the highest: a block sorts a
+segment of the pairs in shared memory, and learns by decoupled look-back (see ``scan``) how many pairs of each digit the
+preceding segments have.
 
-All of that is one list of jobs, which blocks take in turn: to count a chunk of keys, or to sort a tile in a pass, which
-begins after all jobs of the preceding step. Whatever a block waits for was taken by another one earlier, so that other
-one is running: no two blocks wait for each other, however many of them the GPU runs at once.
+All of that is one list of jobs, which blocks take in turn: to count the digits of a chunk of keys, or to sort a segment
+in a pass, which begins after all jobs before that pass. Whatever a block waits for was taken by another one earlier, so
+that other one is running: no two blocks wait for each other, however many of them the GPU runs at once.
 
-The words of the look-back hold a number of pairs in the low 30 bits and a state in the two bits above: 0 before a tile
-has published anything, 1 with its own number, 2 with that of all tiles up to it.
+The words of the look-back hold a number of pairs in the low 30 bits and a state in the two bits above: 0 before a
+segment has published anything, 1 with its own number, 2 with that of all segments up to it.
 """
 
 import functools
@@ -19,24 +19,26 @@ import warp as wp
 
 from .lanes import native
 
-MAX_DIGIT_BITS = 8
-"""Maximum number of bits of a digit."""
+DIGIT_BITS = 8
+
+DIGITS = 1 << DIGIT_BITS
 
 MAX_PASSES = 4
 """Enough for 32 bits."""
 
-DIGITS = 1 << MAX_DIGIT_BITS
-"""Counters of a pass; with fewer bits some are not used."""
+COUNTS = 8
+"""Counters before the number of pairs of each digit of each pass: jobs taken, and jobs done in each round, which is the
+counting or a pass."""
 
-HEADER = 8 + MAX_PASSES * DIGITS
-"""Counters before the words of the look-back: the number of jobs taken, those done of each step, and the digits."""
+WORDS = COUNTS + MAX_PASSES * DIGITS
+"""Counters before the words of the look-back, one for each digit of each segment in each pass."""
 
 SORT_BLOCK_DIM = 512
 """Threads of a CUDA block of a sort."""
 
 PAIRS_PER_THREAD = 8
 
-PAIRS_PER_TILE = SORT_BLOCK_DIM * PAIRS_PER_THREAD
+PAIRS_PER_SEGMENT = SORT_BLOCK_DIM * PAIRS_PER_THREAD
 
 MAX_PAIRS = 1 << 30
 """There must be fewer pairs than this."""
@@ -46,41 +48,41 @@ LOOK_BACK = 4
 
 _CONSTANTS = f"""
 constexpr int threads = {SORT_BLOCK_DIM}, num_warps = threads / 32, per_thread = {PAIRS_PER_THREAD};
-constexpr int per_tile = threads * per_thread, digits = {DIGITS}, max_passes = {MAX_PASSES}, look_back = {LOOK_BACK};
-constexpr unsigned all = 0xffffffffu, mask = (1u << digit_bits) - 1u, max_pairs = {MAX_PAIRS}, own_only = 1u << 30,
-    inclusive = 2u << 30;
+constexpr int per_segment = threads * per_thread, look_back = {LOOK_BACK}, max_pairs = {MAX_PAIRS};
+constexpr int digit_bits = {DIGIT_BITS}, digits = {DIGITS};
+constexpr unsigned all = 0xffffffffu, mask = digits - 1, own_only = 1u << 30, inclusive = 2u << 30;
+int* const num_taken = counters.data;
+int* const num_done = counters.data + 1;
+int* const counts = counters.data + {COUNTS};
+volatile unsigned* const all_words = (volatile unsigned*)counters.data + {WORDS};
 """
 
-# What other blocks wrote in an earlier step is read by __ldcg, because caches of level 1 are not coherent.
+# What other blocks wrote in an earlier round is read by __ldcg, because caches of level 1 are not coherent.
 _SORT = """
-__shared__ int positions[num_warps][digits];  // in the tile, of the next pair of a warp that has this digit
-__shared__ int staged[per_tile];
-__shared__ int shifts[digits];  // from a position in the tile to that in the output
+__shared__ int positions[num_warps][digits];  // in the segment, of the next pair of a warp that has this digit
+__shared__ int staged[per_segment];
+__shared__ int shifts[digits];  // from a position in the segment to that in the output
 __shared__ long long warp_sums[digits / 32];
 __shared__ int job;
 const int tid = threadIdx.x, lane = tid & 31, warp = tid >> 5;
-const int num_tiles = (num_pairs - 1) / per_tile + 1;
-const int num_chunks = (num_pairs - 1) / (tiles_per_chunk * per_tile) + 1;
-int* const num_taken = counters.data;
-int* const num_done = counters.data + 1;
-int* const counts = counters.data + 8;
-volatile unsigned* const all_words = (volatile unsigned*)counters.data + 8 + max_passes * digits;
+const int num_segments = (num_pairs - 1) / per_segment + 1;
+const int num_chunks = (num_pairs - 1) / (segments_per_chunk * per_segment) + 1;
 
 while (true) {
     if (tid == 0) job = atomicAdd(num_taken, 1);
     __syncthreads();
-    const int step = job < num_chunks ? 0 : (job - num_chunks) / num_tiles + 1;
-    const int index = step == 0 ? job : (job - num_chunks) % num_tiles;
-    if (step > num_passes) return;
+    const int round = job < num_chunks ? 0 : (job - num_chunks) / num_segments + 1;
+    const int index = round == 0 ? job : (job - num_chunks) % num_segments;
+    if (round > num_passes) return;
 
-    if (step == 0) {
+    if (round == 0) {
         // Four copies of each number, because lanes that add to the same one take turns.
         static_assert(num_passes * 4 <= num_warps, "");
         int* const copies = &positions[0][0];
         for (int k = tid; k < num_passes * digits * 4; k += threads) copies[k] = 0;
         __syncthreads();
-        const int end = min(num_pairs, (index + 1) * tiles_per_chunk * per_tile);
-        for (int k = index * tiles_per_chunk * per_tile + tid; k < end; k += per_tile) {
+        const int end = min(num_pairs, (index + 1) * segments_per_chunk * per_segment);
+        for (int k = index * segments_per_chunk * per_segment + tid; k < end; k += per_segment) {
             unsigned key[per_thread];
             #pragma unroll
             for (int i = 0; i < per_thread; ++i) if (k + i * threads < end) key[i] = keys.data[k + i * threads];
@@ -96,13 +98,13 @@ while (true) {
             if (sum > 0) atomicAdd(counts + k, sum);
         }
     } else {
-        const int num_jobs = step == 1 ? num_chunks : num_tiles;  // of the preceding step
-        if (tid == 0) while (((volatile int*)num_done)[step - 1] < num_jobs) __nanosleep(32);
+        const int num_jobs = round == 1 ? num_chunks : num_segments;  // of the preceding round
+        if (tid == 0) while (((volatile int*)num_done)[round - 1] < num_jobs) __nanosleep(32);
         __threadfence();
         __syncthreads();
-        const int pass = step - 1, shift = pass * digit_bits;
+        const int pass = round - 1, shift = pass * digit_bits;
         const int source = pass & 1 ? num_pairs : 0, target = num_pairs - source;
-        const int begin = index * per_tile, length = min(num_pairs - begin, per_tile);
+        const int begin = index * per_segment, length = min(num_pairs - begin, per_segment);
         const int first = warp * 32 * per_thread + lane;  // a thread's pairs are 32 apart
         const unsigned* const in_keys = (unsigned*)keys.data + source + begin + first;
         const int* const in_values = values.data + source + begin + first;
@@ -134,8 +136,8 @@ while (true) {
         }
         __syncthreads();
 
-        // A thread for each digit. One sum over the digits is two: of all pairs in the high half, of the tile's below.
-        volatile unsigned* const words = all_words + (long long)pass * num_tiles * digits + tid;
+        // A thread for each digit. One prefix sum is two: of all pairs in the high half, of the segment's in the low.
+        volatile unsigned* const words = all_words + (long long)pass * num_segments * digits + tid;
         int num_here = 0;
         long long numbers = 0, sum = 0;
         if (tid < digits) {
@@ -160,7 +162,7 @@ while (true) {
             const int local = (int)sum;
             for (int w = 0; w < num_warps; ++w) positions[w][tid] += local;
             int num_before = 0;
-            bool complete = index == 0 || tid > mask;
+            bool complete = index == 0;
             for (int last = index - 1; !complete;) {
                 unsigned word[look_back];
                 #pragma unroll
@@ -178,20 +180,20 @@ while (true) {
         }
         __syncthreads();
 
-        // Through shared memory, so that neighbouring threads write to neighbouring places.
+        // Through shared memory, so that adjacent threads write to adjacent addresses.
         #pragma unroll
         for (int k = 0; k < per_thread; ++k) {
             own_position[k] += positions[warp][own[k] >> shift & mask];
             staged[own_position[k]] = own[k];
         }
         __syncthreads();
-        int places[per_thread];
+        int outputs[per_thread];
         #pragma unroll
         for (int k = 0; k < per_thread; ++k) {
             const int position = k * threads + tid;
             const unsigned key = staged[position];
-            places[k] = target + shifts[key >> shift & mask] + position;
-            if (position < length) keys.data[places[k]] = key;
+            outputs[k] = target + shifts[key >> shift & mask] + position;
+            if (position < length) keys.data[outputs[k]] = key;
         }
         __syncthreads();
         #pragma unroll
@@ -200,32 +202,31 @@ while (true) {
         #pragma unroll
         for (int k = 0; k < per_thread; ++k) {
             const int position = k * threads + tid;
-            if (position < length) values.data[places[k]] = staged[position];
+            if (position < length) values.data[outputs[k]] = staged[position];
         }
     }
     __threadfence();
     __syncthreads();
-    if (tid == 0) atomicAdd(num_done + step, 1);
+    if (tid == 0) atomicAdd(num_done + round, 1);
 }
 """
 
 
 @functools.cache
-def make_sort_pairs(digit_bits: int, num_passes: int) -> wp.Kernel:
-    """Kernel that sorts pairs by the lowest ``digit_bits * num_passes`` bits of their keys.
+def make_sort_pairs(num_passes: int) -> wp.Kernel:
+    """Kernel that sorts pairs by the lowest ``DIGIT_BITS * num_passes`` bits of their keys.
 
     Even passes read the first half of the buffers and write to the second half, odd passes vice versa. It is launched
     in blocks of ``SORT_BLOCK_DIM`` threads, any number of them.
     """
-    constants = f"constexpr int digit_bits = {digit_bits}, num_passes = {num_passes};"
 
-    @wp.func_native(native(constants + _CONSTANTS + _SORT, ""))
+    @wp.func_native(native(f"constexpr int num_passes = {num_passes};{_CONSTANTS}{_SORT}", ""))
     def run_jobs(
         keys: wp.array[int],
         values: wp.array[int],
         counters: wp.array[int],
         num_pairs: int,
-        tiles_per_chunk: int,
+        segments_per_chunk: int,
     ): ...
 
     @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(SORT_BLOCK_DIM, 2), module="unique")
@@ -235,8 +236,8 @@ def make_sort_pairs(digit_bits: int, num_passes: int) -> wp.Kernel:
         values: wp.array[int],
         counters: wp.array[int],
         num_pairs: int,
-        tiles_per_chunk: int,
+        segments_per_chunk: int,
     ):
-        run_jobs(keys, values, counters, num_pairs, tiles_per_chunk)
+        run_jobs(keys, values, counters, num_pairs, segments_per_chunk)
 
     return sort_pairs

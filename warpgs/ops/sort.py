@@ -8,7 +8,7 @@ from warpgs.runtime import profiling
 from warpgs.runtime.launch import launch
 
 MAX_BLOCKS = 512
-"""Blocks of a sort: as many as a GPU runs at once."""
+"""Maximum number of blocks: about as many as a large GPU runs at once; more would find no job."""
 
 MAX_CHUNKS = 256
 """Chunks in which digits are counted: enough to saturate memory, few enough to be added up quickly."""
@@ -16,15 +16,15 @@ MAX_CHUNKS = 256
 
 def num_passes(num_bits: int) -> int:
     """Number of passes on CUDA; it is even, so that the last one writes to the first half of the buffers."""
-    return 2 if num_bits <= 2 * kernels.MAX_DIGIT_BITS else kernels.MAX_PASSES
+    return 2 if num_bits <= 2 * kernels.DIGIT_BITS else kernels.MAX_PASSES
 
 
 def new_counters(like: Tensor, num_pairs: int, num_bits: int) -> Tensor | None:
     """Memory without content for the counters of a sort, which must be zeros when it begins; None on CPU."""
     if not like.is_cuda:
         return None
-    num_tiles = -(-num_pairs // kernels.PAIRS_PER_TILE)
-    return like.new_empty(kernels.HEADER + num_passes(num_bits) * num_tiles * kernels.DIGITS)
+    num_segments = -(-num_pairs // kernels.PAIRS_PER_SEGMENT)
+    return like.new_empty(kernels.WORDS + num_passes(num_bits) * num_segments * kernels.DIGITS)
 
 
 def sort_pairs(keys: Tensor, values: Tensor, counters: Tensor | None, num_bits: int) -> None:
@@ -47,11 +47,11 @@ def sort_pairs(keys: Tensor, values: Tensor, counters: Tensor | None, num_bits: 
         return
     if n >= kernels.MAX_PAIRS:
         raise ValueError(f"fewer than {kernels.MAX_PAIRS} pairs can be sorted, got {n}")
-    num_tiles, passes = -(-n // kernels.PAIRS_PER_TILE), num_passes(num_bits)
-    kernel, block_dim = kernels.make_sort_pairs(-(-num_bits // passes), passes), kernels.SORT_BLOCK_DIM
-    threads, tiles_per_chunk = min(num_tiles, MAX_BLOCKS) * block_dim, -(-num_tiles // MAX_CHUNKS)
-    launch(kernel, threads, keys, values, counters, n, tiles_per_chunk, block_dim=block_dim)
+    num_segments, block_dim = -(-n // kernels.PAIRS_PER_SEGMENT), kernels.SORT_BLOCK_DIM
+    kernel, inputs = kernels.make_sort_pairs(num_passes(num_bits)), (keys, values, counters, n)
+    threads, segments_per_chunk = min(num_segments, MAX_BLOCKS) * block_dim, -(-num_segments // MAX_CHUNKS)
+    launch(kernel, threads, *inputs, segments_per_chunk, block_dim=block_dim)
 
 
 _native = wp.get_device("cpu").runtime.core
-"""Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which cost the host as much as the sort."""
+"""Warp's library: ``wp.utils.radix_sort_pairs`` takes Warp's arrays, which take longer to make than a small sort."""

@@ -12,6 +12,7 @@ from warpgs.kernels import tiles as kernels
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_SIZE
 from warpgs.kernels.scan import SCAN_BLOCK_DIM
+from warpgs.kernels.sort import MAX_PAIRS
 from warpgs.runtime.launch import launch
 
 from .rows import DEPTH_BITS, DepthOrder, Rows
@@ -66,7 +67,7 @@ class _Budget:
         self.recent_max = max(float(self._number[0]), (self.recent_max or 0.0) * DECAY)
         wanted = max(int(self.recent_max * HEADROOM), num_gaussians, 1024)
         step = 1 << max(wanted.bit_length() - 4, 0)
-        return -(-wanted // step) * step
+        return min(-(-wanted // step) * step, MAX_PAIRS - 1)
 
 
 class _Budgets(threading.local):
@@ -140,7 +141,7 @@ def bin_splats(
             for the device.
 
     Raises:
-        ValueError: If there are too many splats with branches.
+        ValueError: If there are too many splats with branches, or too many splats or ``max_intersections`` to sort.
         RuntimeError: If the first frame of a size is captured in a CUDA graph without ``max_intersections``.
     """
     splats, grid = splat_rows.packed, num_tiles(*size)
@@ -157,11 +158,11 @@ def bin_splats(
         torch.cumsum(order.scan_words, 0, out=order.scan_words)
     emit, num_bits = partial(_emit, splats, order, is_dynamic, grid), total.bit_length()
     capacity, num_isects = _capacity(order, size, max_intersections, lambda number: emit(0, (None,) * 3, number))
-    new = order.keys.new_empty
-    pairs = new(2 * capacity), new(2 * capacity), new_counters(order.keys, capacity, num_bits)
-    emit(capacity, pairs, num_isects)
-    sort_pairs(*pairs, num_bits)
-    return _lists(order, is_dynamic, total, pairs[:2], num_isects)
+    isects = order.keys.new_empty(2 * capacity), order.keys.new_empty(2 * capacity)  # tile, Gaussian
+    counters = new_counters(order.keys, capacity, num_bits)
+    emit(capacity, (*isects, counters), num_isects)
+    sort_pairs(*isects, counters, num_bits)
+    return _lists(order, is_dynamic, total, isects, num_isects)
 
 
 def _emit(
@@ -170,18 +171,18 @@ def _emit(
     is_dynamic: Tensor | None,
     grid: tuple[int, int],
     capacity: int,
-    pairs: tuple[Tensor | None, Tensor | None, Tensor | None],
+    sort_input: tuple[Tensor | None, Tensor | None, Tensor | None],
     num_isects: Tensor,
 ) -> None:
     """Writes the intersections of splats in their order, up to a capacity, and how many there are.
 
-    ``pairs`` are the arguments of their sort: tiles, Gaussians and counters.
+    ``sort_input`` is what it writes for the sort of intersections by tile: tiles, Gaussians and the zeros of counters.
     """
     N = splats.shape[0]
     num_ranks = order.scan_words.shape[0] * (SCAN_BLOCK_DIM if splats.is_cuda else 1)
     inputs = (splats, order.gaussian_from_rank, order.scan_words, is_dynamic, N, num_ranks, *grid, capacity)
     threads = num_ranks + kernels.NUM_FILL_THREADS
-    launch(kernels.emit_isects, threads, *inputs, *pairs, num_isects, block_dim=SCAN_BLOCK_DIM)
+    launch(kernels.emit_isects, threads, *inputs, *sort_input, num_isects, block_dim=SCAN_BLOCK_DIM)
 
 
 def _lists(
