@@ -12,6 +12,7 @@ import torch
 from tests import tiny
 from warpgs.cameras import Camera
 from warpgs.config import LossConfig
+from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
 from warpgs.training import object_depth as module
@@ -464,7 +465,7 @@ def test_metric_depth_of_objects_is_kept():
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 def test_static_pixels_keep_their_depth_where_objects_are_found_in_smaller_masks(monkeypatch, resident_bytes):
-    monkeypatch.setattr(objects, "MAX_SIDE", 40)
+    monkeypatch.setattr(dynamic_regions, "MAX_SIDE", 40)
     count, _, views = filled(misplaced(MASKS), 0.15, resident_bytes)
     assert count == NUM
     for view in views:

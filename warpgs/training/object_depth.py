@@ -26,10 +26,11 @@ from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import metric_depth, typical_error
+from warpgs.data.dynamic_regions import scaled_size
 from warpgs.data.masks import nearest_pixels
 
 from .dynamic_points import is_depth_known
-from .objects import MovingObject, find_objects, scaled_size
+from .objects import MovingObject, find_objects
 from .point_cloud import front_of_ball
 from .views import View, Views
 

@@ -1,6 +1,5 @@
 """Dynamic objects as connected regions of the masks, followed from frame to frame."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -8,16 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.masks import connected_regions
+from warpgs.data.dynamic_regions import dynamic_regions, is_cut, scaled_size
 from warpgs.data.motion_check import MIN_SIDE, flow_between, grey_at
-
-MAX_SIDE = 512
-"""Regions are found in masks that are scaled down to this longer side [px]."""
-
-MIN_AREA = 0.002
-"""Minimum size of a region, as a fraction of the image."""
 
 MIN_OVERLAP = 0.3
 """Overlap of regions of consecutive frames, relative to the smaller one, from which on they show the same object."""
@@ -45,12 +37,6 @@ class MovingObject:
     pixels: dict[int, Int[np.ndarray, " P"]] = field(default_factory=dict)
     whole: list[int] = field(default_factory=list)
     is_mixture: bool = False
-
-
-def scaled_size(camera: Camera) -> tuple[int, int]:
-    """(width, height) of the scaled mask of a camera's frame."""
-    factor = min(1.0, MAX_SIDE / max(camera.size))
-    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
 def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
@@ -83,7 +69,7 @@ class _Follower:
 
     def add(self, index: int, frame: Frame) -> None:
         """Goes on to the training frame of an index."""
-        regions = _regions(frame)
+        regions = dynamic_regions(frame)
         labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
@@ -91,7 +77,7 @@ class _Follower:
             else:
                 label = candidates[0] if len(candidates) == 1 else self._new(is_mixture=len(candidates) > 1)
                 labels[region] = label
-                if not _is_cut(region):
+                if not is_cut(region):
                     self.objects[label].whole.append(index)
         for label in np.unique(labels[labels != NOTHING]):
             self.objects[label].pixels[index] = np.flatnonzero(labels == label).astype(np.int32)
@@ -133,20 +119,6 @@ class _Follower:
         item = self.objects[label]
         last = item.whole[-1] if item.whole else next(iter(item.pixels))
         return area < MIN_VISIBLE * len(item.pixels[last])
-
-
-def _regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
-    """The connected regions of a frame's scaled mask that are large enough."""
-    if frame.static_mask is None:
-        return []
-    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
-    dynamic = cv2.resize(dynamic, scaled_size(frame.camera), interpolation=cv2.INTER_NEAREST_EXACT)
-    return connected_regions(dynamic > 0, math.ceil(MIN_AREA * dynamic.size))
-
-
-def _is_cut(region: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a region touches the image border."""
-    return bool(region[[0, -1]].any() or region[:, [0, -1]].any())
 
 
 def _carried(labels: Int[np.ndarray, "h w"], before: Frame, frame: Frame) -> Int[np.ndarray, "h w"]:

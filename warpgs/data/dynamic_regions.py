@@ -1,0 +1,38 @@
+"""Connected regions of what moves, in masks that are scaled down."""
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Bool
+
+from warpgs.cameras import Camera
+
+from .capture import Frame
+from .masks import connected_regions
+
+MAX_SIDE = 512
+"""Regions are found in masks that are scaled down to this longer side [px]."""
+
+MIN_AREA = 0.002
+"""Minimum size of a region, as a fraction of the image."""
+
+
+def scaled_size(camera: Camera) -> tuple[int, int]:
+    """(width, height) of the scaled mask of a camera's frame."""
+    factor = min(1.0, MAX_SIDE / max(camera.size))
+    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+
+
+def dynamic_regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
+    """The connected regions of a frame's scaled mask that are large enough; none without a mask."""
+    if frame.static_mask is None:
+        return []
+    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
+    dynamic = cv2.resize(dynamic, scaled_size(frame.camera), interpolation=cv2.INTER_NEAREST_EXACT)
+    return connected_regions(dynamic > 0, math.ceil(MIN_AREA * dynamic.size))
+
+
+def is_cut(region: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a region touches the image border."""
+    return bool(region[[0, -1]].any() or region[:, [0, -1]].any())
