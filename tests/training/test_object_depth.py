@@ -209,6 +209,14 @@ def test_frames_without_masks_show_no_objects():
     assert find_objects(capture, range(NUM)) == []
 
 
+def test_an_object_is_cut_off_in_the_frames_that_show_it_at_the_border():
+    masks = [ellipse(4 * k, 60, (18.0, 18.0)) for k in range(NUM)]
+    (item,) = find_objects(capture_of(masks), range(NUM))
+    assert item.cut == [k for k, mask in enumerate(masks) if mask[:, 0].any() or mask[:, -1].any()]
+    assert sorted([*item.cut, *item.whole]) == list(range(NUM))
+    assert 0 < len(item.cut) < NUM
+
+
 # Several objects ------------------------------------------------------------------------------------------------------
 
 

@@ -326,7 +326,7 @@ def _sizes(item: MovingObject, seen: dict[int, "_ObjectView"], points_of: Callab
     known = np.isfinite(bounds).any()
     found = []
     for measure in (_ObjectView.diameter, _ObjectView.area):
-        sizes = {index: measure(view) for index, view in seen.items() if index in item.whole or not view.is_cut}
+        sizes = {index: measure(view) for index, view in seen.items() if index not in item.cut}
         factors = bounds * [sizes[index] for index in item.whole]
         found.append(_Sizes(sizes, float(np.nanquantile(factors, TIGHTEST)) if known else math.nan))
     return found
@@ -340,17 +340,14 @@ class _ObjectView:
         camera: The camera of the frame.
 
     Attributes:
-        is_cut: Whether it touches the image border.
         time: Time of the frame in [0, 1].
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
         self._camera = camera.resized(*scaled_size(camera))
         self.time = camera.time
-        width, height = self._camera.size
-        rows, columns = np.divmod(pixels, width)
+        rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
-        self.is_cut = bool(((rows == 0) | (rows == height - 1) | (columns == 0) | (columns == width - 1)).any())
         viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4))
         self._slopes = viewed.unproject(self._rows, self._columns, torch.ones(len(pixels)))[:, :2].contiguous().numpy()
 

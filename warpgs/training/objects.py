@@ -31,11 +31,13 @@ class MovingObject:
     Attributes:
         pixels: By index of the training frame, flat indices of its pixels in the scaled mask.
         whole: The frames in which it is a region by itself and not cut off by the image border.
+        cut: The frames in which the image border cuts it off.
         is_mixture: Whether it is several objects that cannot be told apart.
     """
 
     pixels: dict[int, Int[np.ndarray, " P"]] = field(default_factory=dict)
     whole: list[int] = field(default_factory=list)
+    cut: list[int] = field(default_factory=list)
     is_mixture: bool = False
 
 
@@ -80,7 +82,10 @@ class _Follower:
                 if not is_cut(region):
                     self.objects[label].whole.append(index)
         for label in np.unique(labels[labels != NOTHING]):
-            self.objects[label].pixels[index] = np.flatnonzero(labels == label).astype(np.int32)
+            item, shown = self.objects[label], labels == label
+            item.pixels[index] = np.flatnonzero(shown).astype(np.int32)
+            if is_cut(shown):
+                item.cut.append(index)
         self._before, self._labels = frame, labels
 
     def _new(self, is_mixture: bool = False) -> int:
