@@ -14,10 +14,11 @@ from warpgs.cameras import Camera
 from warpgs.config import LossConfig
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import load_capture
 from warpgs.training import object_depth as module
 from warpgs.training import objects
-from warpgs.training.object_depth import SIZE_ERROR, fill_object_depth, object_depth, without_rims
+from warpgs.training.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth, without_rims
 from warpgs.training.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
@@ -76,6 +77,10 @@ def changed(capture: Capture, change: Callable[[Frame], Frame]) -> Capture:
     read = capture._cached
     capture._cached = lambda name: change(read(name))
     return capture
+
+
+def object_depth(capture: Capture) -> dict[int, torch.Tensor]:
+    return module.object_depth(capture, module.find_all_objects(capture))
 
 
 def depths_at(capture: Capture, masks) -> np.ndarray:
@@ -200,7 +205,7 @@ def test_depth_by_size_is_used_where_an_object_is_known_both_whole_and_cut_off(m
     mask = ball(1.0)
     pixels = dict.fromkeys(range(NUM), np.flatnonzero(mask).astype(np.int32))
     items = [objects.MovingObject(pixels, whole) for whole in ([], list(range(NUM)))]
-    monkeypatch.setattr(module, "find_objects", lambda capture, order: items)
+    monkeypatch.setattr(module, "find_all_objects", lambda capture: items)
     assert np.ptp(object_depth(capture_of([mask] * NUM))[0].numpy()[mask]) > 0.05  # round, not flat
 
 
@@ -296,7 +301,7 @@ NO_ERRORS = torch.zeros(NUM)
 def test_views_without_depth_get_that_of_objects(resident_bytes):
     capture, alignments = capture_of(MASKS), no_alignments()
     views = views_of(capture, resident_bytes)
-    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS) == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == NUM
     assert alignments.tolist() == [[1.0, 0.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -307,7 +312,7 @@ def test_views_without_depth_get_that_of_objects(resident_bytes):
 def test_static_depth_stays_and_objects_follow_its_alignment():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
     views, alignments = views_of(capture), torch.tensor([[0.5, -1.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS) == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == NUM
     assert alignments.tolist() == [[0.5, -1.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -319,10 +324,10 @@ def test_static_depth_stays_and_objects_follow_its_alignment():
 
 def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
-    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments(), NO_ERRORS) == 0
+    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments(), NO_ERRORS).num_views == 0
 
 
-@pytest.mark.parametrize(
+NOT_ASKED_FOR = pytest.mark.parametrize(
     ("config", "change"),
     [
         (tiny.CONFIG, lambda capture: capture),
@@ -332,15 +337,18 @@ def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
     ],
     ids=["off", "no depth", "all dynamic", "all static"],
 )
+
+
+@NOT_ASKED_FOR
 def test_objects_get_no_depth_where_it_is_not_asked_for(config, change):
     capture = change(capture_of(MASKS))
-    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS) == 0
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS).num_views == 0
 
 
 def test_known_depth_of_what_moves_is_kept():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.ones(static.shape))
-    views = views_of(capture)
-    assert fill_object_depth(CONFIG, capture, views, torch.tensor([[1.0, 0.0]]).repeat(NUM, 1), NO_ERRORS) == 0
+    views, alignments = views_of(capture), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == 0
     assert (views[0].inverse_depth == 1.0).all()
 
 
@@ -364,7 +372,7 @@ def filled(capture: Capture, error: float, resident_bytes: int = 1 << 30) -> tup
     views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
     errors = torch.full((NUM,), error)
     errors[3] = torch.inf  # a view with too few points
-    count = fill_object_depth(CONFIG, capture, views, alignments, errors)
+    count = fill_object_depth(CONFIG, capture, views, alignments, errors).num_views
     return count, np.array([float((1.0 / v.inverse_depth[~v.static_mask]).mean()) for v in views]), views
 
 
@@ -484,7 +492,7 @@ def test_views_that_are_not_aligned_keep_their_depth(blurred):
     alignments = torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
     alignments[1] = torch.nan
     views = views_of(blurred)
-    assert fill_object_depth(CONFIG, blurred, views, alignments, torch.full((NUM,), 0.05)) == NUM - 1
+    assert fill_object_depth(CONFIG, blurred, views, alignments, torch.full((NUM,), 0.05)).num_views == NUM - 1
     assert torch.allclose(views[1].inverse_depth, blurred.frame("001").inverse_depth, rtol=1e-3)
 
 
@@ -520,7 +528,7 @@ def test_objects_that_few_frames_show_apart_from_others_keep_their_depth(monkeyp
     both = (MASKS, [BESIDE] * NUM)
     pixels = [{k: np.flatnonzero(mask).astype(np.int32) for k, mask in enumerate(masks)} for masks in both]
     items = [objects.MovingObject(pixels[0], list(range(11))), objects.MovingObject(pixels[1], list(range(NUM)))]
-    monkeypatch.setattr(module, "find_objects", lambda capture, order: items)
+    monkeypatch.setattr(module, "find_all_objects", lambda capture: items)
     count, _, views = filled(misplaced([mask | BESIDE for mask in MASKS]), 0.15)
     assert count == NUM
     found = [float((1.0 / view.inverse_depth[mask]).mean()) for view, mask in zip(views, MASKS, strict=True)]
@@ -552,3 +560,64 @@ def test_training_says_that_size_gives_depth(tmp_path):
     _describe(Trainer(CONFIG, capture_of(MASKS), tmp_path), lines.append)
     assert f"the size of dynamic objects gives or corrects their depth in {NUM} of {NUM} views" in lines
     assert not any("training without depth" in line for line in lines)
+
+
+# Where nothing tells the depth of objects -----------------------------------------------------------------------------
+
+
+def with_cut_off(num_whole: int) -> list[np.ndarray]:
+    """Masks of a ball that the lower border cuts off, in all frames but these."""
+    return [ball(1.0) if k < num_whole else ellipse(80, 110, (30.0, 30.0)) for k in range(NUM)]
+
+
+def warnings_before(capture: Capture, folder) -> list[str]:
+    """The warnings of a training before its first iteration."""
+    lines: list[str] = []
+    _describe(Trainer(CONFIG, capture, folder), lines.append)
+    return [line for line in lines if line.startswith("warning:")]
+
+
+@pytest.mark.parametrize(("num_whole", "warned"), [(0, True), (11, True), (12, False)])
+def test_training_warns_if_the_border_cuts_the_only_object_off_in_too_many_frames(tmp_path, num_whole, warned):
+    found = warnings_before(capture_of(with_cut_off(num_whole)), tmp_path)
+    expected = f"warning: {unknown_depth(NUM - num_whole, NUM)}"
+    assert found == ([expected] if warned else [])
+
+
+def test_frames_in_which_the_border_cuts_one_of_several_objects_off_are_counted_once(tmp_path):
+    masks = [ellipse(30, 110, (20.0, 20.0)) | ellipse(120, 60 if k < 10 else 110, (20.0, 20.0)) for k in range(NUM)]
+    masks[0] = ellipse(120, 60, (20.0, 20.0))
+    assert Trainer(CONFIG, capture_of(masks), tmp_path).num_cut == NUM - 1
+
+
+def test_training_warns_if_too_few_frames_show_an_object(tmp_path):
+    assert warnings_before(capture_of([ball(1.0)] * 11), tmp_path) == [f"warning: {unknown_depth(0, 11)}"]
+
+
+@NOT_ASKED_FOR
+def test_unknown_depth_of_objects_is_no_warning_where_it_is_not_asked_for(config, change):
+    capture = change(capture_of(with_cut_off(0)))
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS).num_cut is None
+
+
+@pytest.mark.parametrize("error", [0.0, 0.15])
+def test_known_depth_of_objects_that_the_border_cuts_off_is_no_warning(error):
+    capture = misplaced(with_cut_off(0))
+    alignments = torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    found = fill_object_depth(CONFIG, capture, views_of(capture), alignments, torch.full((NUM,), error))
+    assert found == ObjectDepth(0)
+
+
+def test_depth_of_static_surfaces_alone_leaves_that_of_objects_unknown():
+    static_depth = {"inverse_depth": lambda static: torch.where(static, 1.0 / WALL, torch.nan)}
+    capture, alignments = capture_of(with_cut_off(0), **static_depth), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
+    assert fill_object_depth(CONFIG, capture, views_of(capture), alignments, NO_ERRORS) == ObjectDepth(0, NUM)
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [[BESIDE | mask for mask in with_cut_off(0)], [np.zeros((HEIGHT, WIDTH), bool)] * NUM],
+    ids=["another object has a size", "nothing moves"],
+)
+def test_there_is_no_warning_where_size_gives_depth_or_nothing_moves(tmp_path, masks):
+    assert warnings_before(capture_of(masks), tmp_path) == []

@@ -17,6 +17,9 @@ MAX_SIDE = 512
 MIN_AREA = 0.002
 """Minimum size of a region, as a fraction of the image."""
 
+MIN_FRAMES = 12
+"""Minimum number of frames that show an object whole, for its size to tell its depth."""
+
 
 def scaled_size(camera: Camera) -> tuple[int, int]:
     """(width, height) of the scaled mask of a camera's frame."""
@@ -36,3 +39,18 @@ def dynamic_regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
 def is_cut(region: Bool[np.ndarray, "h w"]) -> bool:
     """Whether a region touches the image border."""
     return bool(region[[0, -1]].any() or region[:, [0, -1]].any())
+
+
+def unknown_depth(num_cut: int, num_frames: int) -> str:
+    """What to say where dynamic objects have neither depth nor a size that tells it.
+
+    Args:
+        num_cut: Number of training frames in which the image border cuts one off.
+        num_frames: Number of training frames.
+    """
+    border = f", but the image border cuts them off in {num_cut} of {num_frames} training frames" if num_cut else ""
+    return (
+        "the depth of dynamic objects is unknown, so they may be blurred and partly in the static image: their size "
+        f"tells it only if one can be followed and is whole in {MIN_FRAMES} frames{border}; record so that one stays "
+        f"whole in at least {MIN_FRAMES} frames, or run warpgs prepare with --depth anything"
+    )

@@ -12,7 +12,7 @@ with time. Both depths are averaged then.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -26,16 +26,13 @@ from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import metric_depth, typical_error
-from warpgs.data.dynamic_regions import scaled_size
+from warpgs.data.dynamic_regions import MIN_FRAMES, scaled_size
 from warpgs.data.masks import nearest_pixels
 
 from .dynamic_points import is_depth_known
-from .objects import MovingObject, find_objects
+from .objects import MovingObject, find_all_objects
 from .point_cloud import front_of_ball
 from .views import View, Views
-
-MIN_FRAMES = 12
-"""Minimum number of frames that show an object whole."""
 
 AROUND = 0.015
 """Width of the rim around an object where static points bound its depth, as a fraction of the image's longer side."""
@@ -68,13 +65,26 @@ Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
 
 
+class ObjectDepth(NamedTuple):
+    """What is known about the depth of dynamic objects by their size.
+
+    Attributes:
+        num_views: Number of views in which objects were given a depth or moved.
+        num_cut: Number of views in which the image border cuts objects off, if nothing tells the depth of any, because
+            too few views show one whole; None otherwise.
+    """
+
+    num_views: int
+    num_cut: int | None = None
+
+
 def fill_object_depth(
     config: TrainConfig,
     capture: Capture,
     views: Views,
     alignments: Float[Tensor, "T 2"],
     errors: Float[Tensor, " T"],
-) -> int:
+) -> ObjectDepth:
     """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
 
     Captures without masks get none. Where the depth of what moves is known but neither metric nor certain, it is
@@ -87,26 +97,29 @@ def fill_object_depth(
         alignments: [T, 2] scale and offset of each view's inverse depth; set to 1 and 0 for views that had none.
         errors: [T] relative error of each view's depth at the sparse points, aligned by a scale and an offset alone;
             infinite if not aligned.
-
-    Returns:
-        The number of views in which objects were given a depth or moved.
     """
     if not (config.loss.object_depth and config.depth and capture.assumption == "masks"):
-        return 0
-    if is_depth_known(views, alignments):
-        if capture.metric_depth:
-            return 0
-        error = float(typical_error(errors))
-        weight = 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)
-        return _average_depths(capture, views, alignments, weight) if error > MIN_ERROR else 0
-    count = 0
-    for index, depth in object_depth(capture).items():
+        return ObjectDepth(0)
+    if not is_depth_known(views, alignments):
+        return _set_depths(capture, views, alignments)
+    error = float(typical_error(errors))
+    if capture.metric_depth or error <= MIN_ERROR:
+        return ObjectDepth(0)
+    return ObjectDepth(_average_depths(capture, views, alignments, 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)))
+
+
+def _set_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> ObjectDepth:
+    """Gives objects their depth by size; the arguments are those of ``fill_object_depth``."""
+    objects, count = find_all_objects(capture), 0
+    if objects and all(_is_mostly_cut(item) for item in objects if not item.is_mixture):
+        return ObjectDepth(0, len({index for item in objects for index in item.cut}))
+    for index, depth in object_depth(capture, objects).items():
         if capture.frame(capture.train[index]).inverse_depth is None:
             alignments[index] = alignments.new_tensor([1.0, 0.0])
         if bool(alignments[index].isfinite().all()):
             views.set_object_depth(index, alignments[index], depth)
             count += 1
-    return count
+    return ObjectDepth(count)
 
 
 def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], weight: float) -> int:
@@ -139,7 +152,11 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
         return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
 
-    found = {index: factor for index, factor in _by_object(capture, factors).items() if index in aligned}
+    found = {
+        index: factor
+        for index, factor in _by_object(capture, find_all_objects(capture), factors).items()
+        if index in aligned
+    }
     for index, factor in found.items():
         static = views[index].static_mask.cpu()
         resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
@@ -210,21 +227,23 @@ def _corrections(
     return {index: math.exp(np.interp(time, at, logs)) for index, time in times.items()}
 
 
-def object_depth(capture: Capture) -> dict[int, Float[Tensor, "h w"]]:
+def object_depth(capture: Capture, objects: Sequence[MovingObject]) -> dict[int, Float[Tensor, "h w"]]:
     """Depth of the objects in a capture's training frames, if it has some that keep their size.
 
     Args:
         capture: The capture, with masks and static points.
+        objects: All of its objects.
 
     Returns:
         By index of the frame, [h, w] depth in its scaled mask [scene units], NaN elsewhere: that of round objects, or,
         of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
-    return _by_object(capture, _depths, _depths_around)
+    return _by_object(capture, objects, _depths, _depths_around)
 
 
 def _by_object(
     capture: Capture,
+    objects: Sequence[MovingObject],
     values_of: Callable[..., dict[int, Float[Tensor, " P"]]],
     values_of_cut: Callable[..., dict[int, Float[Tensor, " P"]]] = lambda *_: {},
 ) -> dict[int, Float[Tensor, "h w"]]:
@@ -234,17 +253,15 @@ def _by_object(
 
     Args:
         capture: The capture, with masks and static points.
+        objects: All of its objects.
         values_of: Given an object, how each frame sees it, and the static points that a frame shows: the values of its
             pixels by index of the frame.
         values_of_cut: The same for objects that too few frames show whole. It is asked last, if others have values, and
             fills pixels without one; by default it has none.
     """
-    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
     points_of = cache(partial(_static_points, capture))
     images: dict[int, Tensor] = {}
-    # By time first; backward, what parts later can be told apart before.
-    objects = [item for frames in (order, order[::-1]) for item in find_objects(capture, frames) if not item.is_mixture]
-    for item in sorted(objects, key=_is_mostly_cut):
+    for item in sorted((item for item in objects if not item.is_mixture), key=_is_mostly_cut):
         if _is_mostly_cut(item) and not images:
             break  # without any depth, dynamic Gaussians start in front of the points around them
         seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}

@@ -57,6 +57,12 @@ def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
     return follower.objects
 
 
+def find_all_objects(capture: Capture) -> list[MovingObject]:
+    """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
+    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
+    return [item for frames in (order, order[::-1]) for item in find_objects(capture, frames)]
+
+
 class _Follower:
     """Follows objects from one frame to the next.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
+from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import recognize
 from warpgs.errors import command
 from warpgs.evaluation.evaluate_run import evaluate_run
@@ -186,6 +187,8 @@ def _describe(trainer: Trainer, log: Log) -> None:
     if trainer.num_with_objects:
         changed = f"{trainer.num_with_objects} of {num_views} views"
         log(f"the size of dynamic objects gives or corrects their depth in {changed}")
+    if trainer.num_cut is not None:
+        log(f"warning: {unknown_depth(trainer.num_cut, num_views)}")
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:

@@ -62,6 +62,7 @@ class Trainer:
         gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
+        num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
         depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
         depth_trust: [T] how much each view's depth is trusted.
         seconds: Training time of earlier sessions of this run [s].
@@ -94,7 +95,9 @@ class Trainer:
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss)
         self.alignments = torch.where(self.depth_trust.weight[:, None] > 0, found.alignments, torch.nan)
         self.num_aligned = int(self.alignments.isfinite().all(1).sum())
-        self.num_with_objects = fill_object_depth(config, self.capture, self.views, self.alignments, found.plain_errors)
+        self.num_with_objects, self.num_cut = fill_object_depth(
+            config, self.capture, self.views, self.alignments, found.plain_errors
+        )
         fits = initialize.fits_motion(config, self.capture, self.views, self.alignments)
         self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, self.num_aligned > 0, fits)
         self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
