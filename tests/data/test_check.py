@@ -16,6 +16,7 @@ from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
 from warpgs.data import loaders
 from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
+from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
 
@@ -83,6 +84,29 @@ def test_inverted_and_entirely_dynamic_masks_are_an_error(root, convert, text):
     report = check_capture(root)
     assert not report.is_fit
     assert text in texts(report, "error")
+
+
+def write_masks(root, is_cut):
+    """A box that moves in every frame; the lower border cuts it off in these."""
+    for k, path in enumerate(sorted((root / "resized_mask/1x").iterdir())):
+        mask = np.full((192, 256), 255, np.uint8)
+        mask[110 : 192 if is_cut(k) else 170, 90:140] = 0
+        cv2.imwrite(str(path), mask)
+
+
+@pytest.mark.parametrize(("num_cut", "warned"), [(4, False), (5, True), (16, True)])
+def test_unknown_depth_of_objects_that_the_border_cuts_off_in_too_many_frames_is_a_warning(root, num_cut, warned):
+    write_masks(root, lambda k: k < num_cut)
+    assert (unknown_depth(num_cut, 16) in texts(check_capture(root), "warning")) == warned
+
+
+@pytest.mark.parametrize("is_known", [False, True])
+def test_objects_that_the_border_cuts_off_are_no_warning_if_their_depth_is_known(root, is_known):
+    write_masks(root, lambda k: True)
+    columns = np.arange(256)
+    is_dynamic = (columns >= 90) & (columns < 140)
+    write_depth(root, lambda depth: np.where(is_dynamic & (not is_known), np.nan, 1.0 / depth))
+    assert (unknown_depth(16, 16) in texts(check_capture(root), "warning")) == (not is_known)
 
 
 def test_a_path_that_does_not_exist_is_no_capture_to_report_on(tmp_path):

@@ -26,6 +26,7 @@ from .depth_alignment import (
     relative_errors,
     sample_points,
 )
+from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
 from .loaders import load_capture, recognize
 from .motion_check import are_comparable, motion_between
 from .sampling import evenly_spaced_indices
@@ -167,7 +168,7 @@ def _counts(capture: Capture) -> Iterator[Finding]:
 
 def _files(capture: Capture) -> Iterator[Finding]:
     """Reads every frame; counts and checks masks and depth."""
-    dynamic, num_read, num_depths = [], 0, 0
+    dynamic, trained, num_read, num_depths = [], [], 0, 0
     for name in (*capture.train, *capture.val):
         try:
             frame = capture.frame(name)
@@ -178,6 +179,8 @@ def _files(capture: Capture) -> Iterator[Finding]:
         num_depths += frame.inverse_depth is not None
         if frame.static_mask is not None and capture.assumption == "masks":
             dynamic.append(1.0 - float(frame.static_mask.float().mean()))
+            if name in capture.train:
+                trained.append(_dynamic_counts(frame))
     frames = "frames" if num_read == len(capture.train) + len(capture.val) else "readable frames"
     yield Finding("note", "files", f"{len(dynamic)} of {num_read} {frames} have masks, {num_depths} have depth")
     if capture.assumption == "dynamic":
@@ -192,6 +195,23 @@ def _files(capture: Capture) -> Iterator[Finding]:
         mean = float(np.mean(dynamic))
         text = f"the masks mark {mean:.1%} of the pixels as dynamic on average, {max(dynamic):.1%} at most"
         yield Finding("warning" if mean > MAX_DYNAMIC_FRACTION else "note", "masks", text)
+        yield from _dynamic_depth(trained)
+
+
+def _dynamic_counts(frame: Frame) -> tuple[int, int, int, int]:
+    """Numbers of dynamic regions, of those that the border cuts off, of dynamic pixels and of those with depth."""
+    assert frame.static_mask is not None
+    regions, is_dynamic = dynamic_regions(frame), ~frame.static_mask
+    known = 0 if frame.inverse_depth is None else int((frame.inverse_depth.isfinite() & is_dynamic).sum())
+    return len(regions), sum(map(is_cut, regions)), int(is_dynamic.sum()), known
+
+
+def _dynamic_depth(counts: list[tuple[int, int, int, int]]) -> Iterator[Finding]:
+    """Whether something tells the depth of what moves; ``counts`` are those of each training frame."""
+    regions, cut, pixels, known = np.array(counts).reshape(-1, 4).T
+    is_known = known.sum() >= MIN_KNOWN_FRACTION * pixels.sum()
+    if regions.any() and (cut < regions).sum() < MIN_FRAMES and not is_known:
+        yield Finding("warning", "depth", unknown_depth(int((cut > 0).sum()), len(counts)))
 
 
 def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:

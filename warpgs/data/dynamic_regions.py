@@ -20,6 +20,10 @@ MIN_AREA = 0.002
 MIN_FRAMES = 12
 """Minimum number of frames that show an object whole, for its size to tell its depth."""
 
+MIN_KNOWN_FRACTION = 0.1
+"""Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
+known only where nothing moves."""
+
 
 def scaled_size(camera: Camera) -> tuple[int, int]:
     """(width, height) of the scaled mask of a camera's frame."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
+from warpgs.data.dynamic_regions import MIN_KNOWN_FRACTION
 from warpgs.data.sampling import evenly_spaced_indices
 
 from .point_cloud import subsample, unproject
@@ -18,10 +19,6 @@ from .views import View, Views
 
 MAX_PIXELS_PER_GAUSSIAN = 8
 """Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
-
-MIN_KNOWN_FRACTION = 0.1
-"""Minimum fraction of the dynamic pixels whose depth must be known for it to be used; depth from multi-view stereo is
-known only where nothing moves."""
 
 NUM_CHECKED = 8
 """Number of views in which the known depth of what moves is looked for."""
