@@ -1,7 +1,7 @@
 """Tile binning: the list of Gaussians that each tile composites, front to back.
 
 Gaussians are sorted by depth once (N keys of 32 bits); in that order each writes one intersection per tile that its
-ellipse exactly intersects; a stable sort by tile index (M keys, only the bits that a tile index needs) then leaves the
+ellipse exactly intersects; a stable sort by tile index (M keys, as few passes as a tile index needs) then leaves the
 intersections of every tile in depth order.
 
 The buffers hold ``capacity`` intersections. The actual number M is only known on the device, and the host does not wait
