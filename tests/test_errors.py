@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from warpgs.data.check import Finding
-from warpgs.errors import ADVICE, CLOSED, command, is_out_of_memory, one_line, run_command, terminable
+from warpgs.errors import ADVICE, CLOSED, command, is_out_of_memory, missing, one_line, run_command, terminable
 
 
 def failing(error):
@@ -135,6 +135,13 @@ def test_messages_of_lack_of_memory_are_recognized(message):
 
 def test_a_command_in_a_message_can_be_pasted():
     assert command("prepare", Path("my video.mp4"), "--holdout", 8) == "warpgs prepare 'my video.mp4' --holdout 8"
+
+
+def test_a_missing_path_is_told_what_is_similar_beside_it(tmp_path):
+    (tmp_path / "hand").mkdir()
+    assert missing(tmp_path / "hnd") == f"{tmp_path / 'hnd'} does not exist; did you mean {tmp_path / 'hand'}?"
+    for path in (tmp_path / "studio", tmp_path / "nowhere/hand"):
+        assert missing(path) == f"{path} does not exist"
 
 
 def test_one_line_has_no_line_breaks():

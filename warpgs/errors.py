@@ -1,6 +1,7 @@
 """Errors of commands: one line on stderr and an exit code."""
 
 import contextlib
+import difflib
 import functools
 import io
 import os
@@ -10,6 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
 from typing import ParamSpec
 
@@ -163,6 +165,15 @@ def one_line(error: BaseException) -> str:
 def command(*words: object) -> str:
     """A command of this package in a message, quoted so that it can be pasted into a shell."""
     return shlex.join(["warpgs", *map(str, words)])
+
+
+def missing(path: Path) -> str:
+    """Message that a path does not exist, and what in its folder has a similar name."""
+    try:
+        close = difflib.get_close_matches(path.name, sorted(os.listdir(path.parent)), 1)
+    except OSError:  # no such folder
+        close = []
+    return f"{path} does not exist" + (f"; did you mean {path.parent / close[0]}?" if close else "")
 
 
 def visible(text: str) -> str:

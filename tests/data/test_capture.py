@@ -30,6 +30,10 @@ def test_opening_a_capture_reads_no_frame():
     assert make_capture()[1] == []
 
 
+def test_a_capture_is_shown_in_one_line():
+    assert repr(make_capture()[0]) == "<Capture c: 3 frames to train on, 0 to evaluate on, 0 points>"
+
+
 def test_a_frame_is_read_once():
     capture, read = make_capture()
     assert capture.frame("f1") is capture.frame("f1")

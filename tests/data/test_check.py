@@ -115,7 +115,7 @@ def test_a_path_that_does_not_exist_is_no_capture_to_report_on(tmp_path):
 
 
 def test_a_built_in_capture_is_checked_by_its_name(root, monkeypatch):
-    monkeypatch.setattr(loaders, "builtin_folder", lambda name: root)
+    monkeypatch.setattr(loaders, "builtin_folder", lambda name, **_: root)
     assert check_capture(Path("builtin:studio")).is_fit
     monkeypatch.undo()
     (finding,) = check_capture(Path("builtin:nothing")).findings

@@ -1,6 +1,7 @@
 """Invalid captures are refused in one line that names the file and what was expected."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from tests.data.captures import edit_json, refused, write_array, write_json
 from warpgs.config import MaskPerturbation
 from warpgs.data.loaders import load_capture
+from warpgs.data.writer import REPORT, WORK
 
 
 def test_the_given_dataset_overrides_recognition(root):
@@ -90,6 +92,17 @@ def test_a_missing_mask_of_a_training_frame_is_refused_on_opening(root):
 )
 def test_what_has_no_part_of_a_capture_is_refused(root, folder, message):
     refused(root / folder, message)
+
+
+def test_a_misspelt_capture_is_told_the_name_that_is_similar(root):
+    refused(root.with_name(root.name + "s"), rf"does not exist; did you mean {re.escape(str(root))}\?$")
+
+
+def test_a_capture_that_prepare_has_not_finished_is_refused(root):
+    (root / WORK).mkdir()
+    refused(root, r"is not finished: run the same warpgs prepare again, or remove .*\.prepare")
+    (root / REPORT).write_text("{}")
+    assert load_capture(root).train
 
 
 def test_a_run_folder_is_not_taken_for_a_capture(tmp_path):

@@ -129,6 +129,12 @@ def test_an_unknown_name_lists_those_that_are(name):
         load_capture(f"builtin:{name}")
 
 
+def test_a_size_that_no_built_in_capture_has_is_refused_before_it_is_made(monkeypatch):
+    monkeypatch.setattr(studio, "write_studio", lambda *_: pytest.fail("made"))
+    with pytest.raises(ValueError, match="builtin:studio has images of one size: omit --factor 3"):
+        load_capture("builtin:studio", factor=3)
+
+
 def test_a_single_frame_is_refused(tmp_path):
     with pytest.raises(ValueError, match="at least 2 frames, got 1"):
         studio_capture("exact", tmp_path, StudioSize(num_frames=1), quiet=True)

@@ -27,19 +27,22 @@ def parse_builtin(data: Path | str) -> tuple[str, str]:
     return name, query.removeprefix("depth=") or "exact"
 
 
-def builtin_folder(data: Path | str, quiet: bool = False) -> Path:
+def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = None) -> Path:
     """The folder of a built-in capture, which is created on the first call.
 
     Args:
         data: Its name.
         quiet: Whether to hide the progress bar.
+        factor: Downscaling factor that is wanted; there is only 1.
 
     Raises:
-        ValueError: If there is no such capture.
+        ValueError: If there is no such capture, or it lacks the factor.
         OSError: If it cannot be written.
     """
     depth: Any
     name, depth = parse_builtin(data)
+    if factor not in (None, 1):
+        raise ValueError(f"{data} has images of one size: omit --factor {factor}")
     if name == "room":
         from .synthetic import builtin_capture  # imports torch
 

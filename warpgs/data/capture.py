@@ -97,7 +97,7 @@ class TakenFrame:
     positions: Float[Tensor, "H W 2"]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Capture:
     """A capture in scene units: a position p of the files is (p − center) · scale.
 
@@ -153,6 +153,10 @@ class Capture:
         largest = max(camera.width * camera.height for camera in self.cameras.values())
         fitting = max(1, MAX_CACHE_BYTES // (FRAME_BYTES_PER_PIXEL * largest))
         self._cached = lru_cache(maxsize=min(self.cache_frames, fitting))(self.read)
+
+    def __repr__(self) -> str:
+        frames = f"{len(self.train)} frames to train on, {len(self.val)} to evaluate on"
+        return f"<Capture {self.name}: {frames}, {len(self.points)} points>"
 
     @property
     def uses_estimated_masks(self) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.errors import visible
+from warpgs.errors import missing, visible
 
 from .builtin import is_builtin
 from .capture import MASKS_REMEDY, MIN_EXTENT, Capture, Frame
@@ -116,7 +116,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
         ValueError: If there is no such folder.
     """
     if not is_builtin(root) and not root.exists():
-        raise ValueError(f"{root} does not exist")
+        raise ValueError(missing(root))
     try:
         capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)
     except ValueError as error:

@@ -19,6 +19,9 @@ from .units import SceneUnits
 LAYOUT = "nerfds"
 """Loader of what is written here, which dataset.json names."""
 
+WORK, REPORT = ".prepare", "prepare.json"
+"""Folder of the intermediate files of ``warpgs prepare`` in its captures, and the report that it writes last."""
+
 GIVEN, ESTIMATED = "given", "estimated"
 """What dataset.json says of the masks, see ``Capture.estimated_masks``."""
 

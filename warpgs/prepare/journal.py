@@ -8,10 +8,8 @@ from errno import ENOSPC
 from pathlib import Path
 from typing import Any, TypeVar
 
+from warpgs.data.writer import REPORT, WORK
 from warpgs.files import read_json, write_json
-
-REPORT = "prepare.json"
-"""Report in the finished capture: options, result and seconds of every step, notes."""
 
 OUTPUTS = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "point_colors.npy", "scene.json", "metadata.json",
@@ -53,7 +51,7 @@ class Journal:
         Raises:
             ValueError: If the folder holds something else, or a capture made with other options, and not ``force``.
         """
-        self.root, self.work = root, root / ".prepare"
+        self.root, self.work = root, root / WORK
         self.quiet, self.log = log is None, log or (lambda text: None)
         self._options = options
         self._done: dict[str, Any] = {}

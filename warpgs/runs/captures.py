@@ -17,7 +17,7 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         OSError: If the built-in scene cannot be written.
     """
     if config.data is not None and is_builtin(config.data):
-        root = builtin_folder(config.data, quiet)
+        root = builtin_folder(config.data, quiet, config.factor)
     else:
         root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     capture = load_capture(

@@ -10,6 +10,7 @@ from typing import Any
 
 from warpgs.config import TrainConfig, validate
 from warpgs.data.builtin import is_builtin
+from warpgs.errors import missing
 from warpgs.files import read_json, write_text
 
 NAME = "config.json"
@@ -44,7 +45,7 @@ def read_config(folder: Path) -> TrainConfig:
     """
     path = folder / NAME
     if not folder.exists():
-        raise ValueError(f"{folder} does not exist")
+        raise ValueError(missing(folder))
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
     values = _with_old_meaning(read_json(path, max_bytes=MAX_BYTES))

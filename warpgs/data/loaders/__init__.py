@@ -12,7 +12,8 @@ from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
-from warpgs.errors import command
+from warpgs.data.writer import REPORT, WORK
+from warpgs.errors import command, missing
 from warpgs.files import read_json
 
 from .blender import BlenderLoader
@@ -89,7 +90,7 @@ def load_capture(
         raise ValueError(f"factor must be at least 1, got {factor}")
     perturbation = perturbation or MaskPerturbation()
     check_perturbation(perturbation)
-    root = builtin_folder(root) if is_builtin(root) else Path(root)
+    root = builtin_folder(root, factor=factor) if is_builtin(root) else Path(root)
     if dataset is None:
         require_capture(root)
     loader = LOADERS[dataset or recognize(root)]
@@ -105,10 +106,14 @@ def is_capture(root: Path) -> bool:
 
 def require_capture(root: Path) -> None:
     """Raises ValueError if a path has no part of a capture; if it has some, the loader says what is missing."""
+    if (root / WORK).exists() and not (root / REPORT).exists():
+        raise ValueError(
+            f"{root} is not finished: run the same warpgs prepare again, or remove {root / WORK} to use what is there"
+        )
     if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
         return
     if not root.exists():
-        raise ValueError(f"{root} does not exist")
+        raise ValueError(missing(root))
     if root.is_file():
         raise ValueError(f"{root} is a file: give the folder of the capture")
     if (root / "config.json").exists():
