@@ -110,6 +110,9 @@ def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_
     )
     for package in ("numpy", "torch"):
         (tmp_path / f"{package}.py").write_text(swallow)
+    # Background jobs and their children ignore SIGINT: restore the handler of a terminal.
+    restore = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    (tmp_path / "sitecustomize.py").write_text(restore)
     path = os.pathsep.join([str(tmp_path), str(Path(warpgs.__file__).parents[1])])
     program = [sys.executable, "-m", "warpgs", *command.split()]
     ended = subprocess.run(program, capture_output=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
