@@ -3,6 +3,7 @@
 import hashlib
 import itertools
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -110,14 +111,16 @@ def test_variants_differ_in_depth_only(cache):
     assert load_capture(folders["none"]).frame("left_000000").inverse_depth is None
 
 
-def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch):
+def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(studio, "StudioSize", lambda: SMALL)
     capture = load_capture("builtin:studio?depth=none")
     assert len(capture.train) == 4
+    assert re.search(r"making the built-in capture .*studio, once: this can take a minute\n", capsys.readouterr().err)
     assert recognize(Path("builtin:studio")) == "nerfds"
     monkeypatch.setattr(studio, "write_studio", lambda *_: pytest.fail("made again"))
     assert builtin_folder("builtin:studio").name == "studio"
+    assert capsys.readouterr().err == ""
     assert load_capture("builtin:studio?depth=network").frame("left_000000").inverse_depth is not None
 
 

@@ -129,4 +129,4 @@ def balls_capture(cache_dir: Path | None = None, size: BallsSize | None = None, 
     """The folder of the capture, which is created on the first call; see ``builtin_capture`` of synthetic.py."""
     size = size or BallsSize()
     folder = content_folder(cache_dir, ["balls", VERSION, asdict(size)]) / "balls"
-    return cached(folder, lambda partial: write_balls(partial, size, quiet))
+    return cached(folder, lambda partial: write_balls(partial, size, quiet), quiet)

@@ -32,7 +32,7 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
 
     Args:
         data: Its name.
-        quiet: Whether to hide the progress bar.
+        quiet: Whether to hide that it is made.
         factor: Downscaling factor that is wanted; there is only 1.
 
     Raises:

@@ -14,13 +14,15 @@ from typing import Any
 from warpgs.files import complete_or_absent
 
 
-def cached(folder: Path, write: Callable[[Path], None]) -> Path:
-    """The folder, which ``write`` fills on the first call.
+def cached(folder: Path, write: Callable[[Path], None], quiet: bool) -> Path:
+    """The folder, which ``write`` fills on the first call; one line on stderr says so unless ``quiet``.
 
     Raises:
         OSError: If it cannot be written; the message names the file or folder.
     """
     if not folder.is_dir():
+        if not quiet:
+            sys.stderr.write(f"warpgs: making the built-in capture {folder}, once: this can take a minute\n")
         with complete_or_absent(folder, keep_existing=True) as partial:
             write(partial)
     return folder

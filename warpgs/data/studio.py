@@ -202,10 +202,11 @@ def studio_capture(
     """The folder of the capture with exact depth, with the errors of a network, or without; see ``builtin_capture``."""
     size = size or StudioSize()
     root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
-    exact = cached(root / "studio", lambda partial: write_studio(partial, size, quiet))
+    exact = cached(root / "studio", lambda partial: write_studio(partial, size, quiet), quiet)
     if depth == "exact":
         return exact
-    return cached(root / f"studio-depth-{depth}", lambda partial: _copy(exact, partial, depth == "network"))
+    copy = root / f"studio-depth-{depth}"
+    return cached(copy, lambda partial: _copy(exact, partial, depth == "network"), quiet)
 
 
 def _copy(exact: Path, folder: Path, with_depth: bool) -> None:

@@ -176,7 +176,7 @@ def builtin_capture(
             that cannot be written.
         scene: Size of the capture; the default size if None.
         device: Device to trace on; the CPU if None.
-        quiet: Whether to hide the progress bar, which is shown only if stdout is a terminal.
+        quiet: Whether to hide the line that it is made, and the progress bar, which needs a terminal.
 
     Raises:
         ValueError: If there are fewer than two frames.
@@ -184,4 +184,5 @@ def builtin_capture(
     """
     scene = scene or BuiltinScene()
     folder = content_folder(cache_dir, [VERSION, asdict(scene)]) / "builtin"
-    return cached(folder, lambda partial: write_builtin_capture(partial, scene, device or torch.device("cpu"), quiet))
+    device = device or torch.device("cpu")
+    return cached(folder, lambda partial: write_builtin_capture(partial, scene, device, quiet), quiet)
