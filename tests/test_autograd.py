@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -41,6 +42,22 @@ def test_a_second_backward_pass_adds_the_same_gradients():
     loss.backward()
     for name, gradient in gradients(splats).items():
         assert torch.equal(gradient, 2 * once[name])
+
+
+def test_two_threads_may_run_the_backward_pass_of_one_render_at_once():
+    splats = as_leaves(make_splats(200))
+    image = render(splats, make_camera()).joint.image
+    parameters = (splats.means, splats.opacities)
+    v_images = [torch.rand_like(image) for _ in range(2)]
+
+    def passes(v_image, count=50):
+        return [torch.autograd.grad(image, parameters, v_image, retain_graph=True) for _ in range(count)]
+
+    expected = [passes(v_image, 1)[0] for v_image in v_images]
+    with ThreadPoolExecutor(2) as threads:
+        for results, wanted in zip(threads.map(passes, v_images), expected, strict=True):
+            for actual in results:
+                assert all(torch.allclose(a, w, rtol=1e-4, atol=1e-7) for a, w in zip(actual, wanted, strict=True))
 
 
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh"])

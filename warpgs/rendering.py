@@ -1,5 +1,6 @@
 """Differentiable rendering: splats, camera, background → images."""
 
+import threading
 from functools import partial
 from typing import Any, NamedTuple, TypeGuard
 
@@ -246,12 +247,13 @@ def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor |
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
     """composite → unproject: plays the tape in reverse."""
     num_saved = len(_Saved._fields)
-    back.saved, back.layers, back.v = _Saved._make(saved[:num_saved]), saved[num_saved:], {"layers": v_layers}
-    try:
-        tape.backward()
-        return [back.v.get(name) for name in _Inputs._fields]
-    finally:
-        del back.saved, back.layers, back.v  # outputs among them would keep their own node alive
+    with back.lock:
+        back.saved, back.layers, back.v = _Saved._make(saved[:num_saved]), saved[num_saved:], {"layers": v_layers}
+        try:
+            tape.backward()
+            return [back.v.get(name) for name in _Inputs._fields]
+        finally:
+            del back.saved, back.layers, back.v  # outputs among them would keep their own node alive
 
 
 class _Backward:
@@ -263,6 +265,7 @@ class _Backward:
         request: Of the render.
         with_offsets: Whether ``screen_offsets`` get a gradient.
         imagegrad: Whether it is that of the images alone.
+        lock: Held during the backward pass: threads may run it on one graph at once.
         traversal: Of the forward pass.
         saved: What autograd saved; during the backward pass only, as all that follows.
         layers: The depths, which torch checks for changes, and the alphas if the background requires a gradient.
@@ -275,7 +278,7 @@ class _Backward:
     v: dict[str, Any]
 
     def __init__(self, request: _Request, with_offsets: bool) -> None:
-        self.request, self.with_offsets = request, with_offsets
+        self.request, self.with_offsets, self.lock = request, with_offsets, threading.Lock()
         self.imagegrad = request.settings.imagegrad and with_offsets
 
     def composite(self) -> None:
