@@ -367,6 +367,13 @@ def test_an_unfinished_capture_may_be_continued_with_other_options(shots, tmp_pa
         assert len(list((tmp_path / "made/.prepare/frames").glob("*.png"))) == count
 
 
+def test_a_capture_is_not_a_folder_of_images(tmp_path):
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made/dataset.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"made is a capture: warpgs train --data .*made trains on it"):
+        prepare(tmp_path / "made", tmp_path / "again")
+
+
 def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
     monkeypatch.setattr("warpgs.prepare.checks.find_weights", lambda *arguments: None)
     (inside := tmp_path / "resized_mask/1x").mkdir(parents=True)

@@ -3,7 +3,9 @@
 import math
 from pathlib import Path
 
+from warpgs.data.loaders import is_capture
 from warpgs.data.writer import check_holdout, held_out
+from warpgs.errors import command
 
 from .depth import DEPTHS
 from .frames import check_selection
@@ -17,10 +19,10 @@ MIN_FOR_MOTION = 10
 
 
 def check_options(source: Path, root: Path, options: Options) -> None:
-    """Checks the options, and that the capture's folder does not contain what is read.
+    """Checks the options, that the source is no capture, and that the capture's folder does not contain what is read.
 
     Raises:
-        ValueError: If a value is invalid, or a folder or the weights of a network are missing.
+        ValueError: If a value is invalid, the source is a capture, or a folder or the weights of a network are missing.
         ImportError: If the package of a network is missing.
     """
     check_selection(options.selection)
@@ -45,6 +47,15 @@ def check_options(source: Path, root: Path, options: Options) -> None:
             "anything (a network) or none"
         )
     _check_networks(options)
+    _check_paths(source, root, options)
+
+
+def _check_paths(source: Path, root: Path, options: Options) -> None:
+    if source.is_dir() and is_capture(source):
+        raise ValueError(
+            f"{source} is a capture: {command('train', '--data', source)} trains on it; prepare needs a video or a "
+            "folder of images alone"
+        )
     inputs = [("source", source)]
     inputs += [("masks", Path(options.masks))] if options.masks not in MASKERS else []
     inputs += [("intrinsics", options.intrinsics)] if options.intrinsics is not None else []
