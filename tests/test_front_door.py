@@ -63,7 +63,7 @@ def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
 
 def test_an_extra_comes_from_the_checkout_or_from_the_index(monkeypatch, tmp_path):
     checkout = Path(version.__file__).parents[2]
-    assert version.install_command("viewer") == f"pip install -e '{checkout}[viewer]'"
+    assert version.install_command("viewer") == f"pip install -c {checkout}/constraints.txt -e '{checkout}[viewer]'"
     monkeypatch.setattr(version, "__file__", str(tmp_path / "warpgs" / "command_line" / "version.py"))
     assert version.install_command("viewer") == "pip install 'warpgs[viewer]'"
 

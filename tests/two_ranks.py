@@ -175,7 +175,7 @@ def try_masks(folder: Path, config: TrainConfig) -> None:
     """Each rank finds another quality without masks, above and below that with them, and writes what it assumes."""
     without = 31.0 if os.environ["RANK"] == "0" else 29.0
     mask_trial.MIN_RELATIVE_LENGTH = 0.0
-    mask_trial.held_out_psnr = lambda _, __, assume, ___: 30.0 if assume == "masks" else without
+    mask_trial.held_out_psnr = lambda _, __, assume, *___: 30.0 if assume == "masks" else without
     with ranks.joined():
         trainer = script.make_trainer(config)
         write_json(folder / f"rank{ranks.rank()}.json", {"assume": trainer.config.assume})

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -96,6 +97,11 @@ def test_what_has_no_part_of_a_capture_is_refused(root, folder, message):
 
 def test_a_misspelt_capture_is_told_the_name_that_is_similar(root):
     refused(root.with_name(root.name + "s"), rf"does not exist; did you mean {re.escape(str(root))}\?$")
+
+
+@pytest.mark.parametrize("name", ["builtin", "studio"])
+def test_a_built_in_capture_without_its_prefix_is_told_the_names(name):
+    refused(Path(name), f"{name} does not exist; built-in captures are builtin:room, ")
 
 
 def test_a_capture_that_prepare_has_not_finished_is_refused(root):

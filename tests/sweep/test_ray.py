@@ -340,7 +340,7 @@ def test_ctrl_c_saves_the_running_cells_and_the_next_start_goes_on(cluster, tmp_
     assert process.returncode == 130, output
     assert "stopped; the same command continues" in output
     logs = "".join(log.read_text() for log in tmp_path.glob("out/logs/*.log"))
-    assert logs.count("; continue with --resume") == 2
+    assert logs.count("; continue with warpgs train --resume") == 2
     with sweeping(cluster, tmp_path) as process:
         output, _ = process.communicate(timeout=400)
     assert process.returncode == 0, output

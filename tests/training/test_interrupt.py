@@ -99,7 +99,7 @@ def test_the_command_reports_an_interrupted_training_with_exit_code_130(config, 
     monkeypatch.setattr(command, "parse", lambda *_: config)
     assert command.main([]) == 130
     stderr = capsys.readouterr().err
-    assert f"stopped after iteration 5 of {tiny.LENGTH}; continue with --resume {config.out}" in stderr
+    assert f"stopped after iteration 5 of {tiny.LENGTH}; continue with warpgs train --resume {config.out}" in stderr
 
 
 def test_a_second_ctrl_c_stops_at_once_and_leaves_whole_checkpoints(config, monkeypatch):

@@ -56,6 +56,14 @@ def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(
     assert f"{later} left" in second
 
 
+def test_the_remaining_time_follows_the_mean_speed_of_several_reports(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 1000, 0) as log:
+        for seconds, iteration in ((99.0, 100), (10.0, 200), (50.0, 300), (12.0, 400)):
+            clock[0] += seconds
+            log.report(status(iteration))
+    assert "8.3 it/s  144 s left" in capsys.readouterr().out.splitlines()[-1]  # 600 iterations at 300 in 72 s
+
+
 def test_after_a_return_to_a_checkpoint_the_speed_is_that_of_the_iterations_since(tmp_path, capsys, clock):
     with TrainingLogger(tmp_path, 500, 0) as log:
         for seconds, iteration in {20.0: 100, 40.0: 200}.items():

@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
 def qualities(monkeypatch):
     """PSNR with and without the masks, instead of trainings."""
     found = {"masks": 30.0, "dynamic": 30.0}
-    monkeypatch.setattr(mask_trial, "held_out_psnr", lambda config, capture, assume, quiet: found[assume])
+    monkeypatch.setattr(mask_trial, "held_out_psnr", lambda config, capture, assume, *_: found[assume])
     return found
 
 
@@ -60,8 +60,8 @@ def decide(folder, config=CONFIG):
 def test_both_trainings_are_made_and_the_better_one_is_followed(folder, monkeypatch):
     measured = []
 
-    def measure(config, capture, assume, quiet):
-        measured.append((assume, held_out_psnr(config, capture, assume, quiet)))
+    def measure(config, capture, assume, *arguments):
+        measured.append((assume, held_out_psnr(config, capture, assume, *arguments)))
         return measured[-1][1]
 
     monkeypatch.setattr(mask_trial, "held_out_psnr", measure)
@@ -80,6 +80,26 @@ def test_masks_are_used_unless_none_are_clearly_better(folder, qualities, withou
     found, lines = decide(folder)
     assert found == assume
     assert f"30.0 dB with the masks and {without:.1f} dB without" in lines[-1]
+
+
+def test_unknown_depth_of_objects_is_reported_before_the_trial_is_over(folder, qualities, monkeypatch):
+    class Cut(mask_trial.Trainer):
+        def __init__(self, config, capture, run):
+            super().__init__(config, capture, run)
+            self.num_cut = 3 if config.assume == "masks" else None
+
+        def train(self, logger, interrupt):
+            raise ValueError("far enough")
+
+    monkeypatch.setattr(mask_trial, "Trainer", Cut)
+    monkeypatch.setattr(mask_trial, "held_out_psnr", held_out_psnr)
+    lines = decide(folder)[1]
+    assert lines[0].startswith("the masks are estimates: two trainings of ")
+    assert (
+        lines[1] == f"trial 1 of 2 before the {CONFIG.schedule.num_iterations} iterations of the run, with the masks:"
+    )
+    assert lines[2].startswith("warning: the depth of dynamic objects is unknown")
+    assert "cuts them off in 3 of " in lines[2]
 
 
 @pytest.mark.parametrize("changes", [{"assume": "static"}, {"try_masks": False}])
@@ -105,7 +125,7 @@ def test_runs_that_are_hardly_longer_are_not_tried(folder, qualities, monkeypatc
 
 
 def test_a_trial_that_fails_leaves_the_masks_in_use(folder, monkeypatch):
-    def fail(config, capture, assume, quiet):
+    def fail(*_):
         raise ValueError("the loss is not finite")
 
     monkeypatch.setattr(mask_trial, "held_out_psnr", fail)
@@ -123,7 +143,7 @@ def test_a_signal_ends_the_trial_and_leaves_nothing_behind(folder, monkeypatch, 
 
     monkeypatch.setattr(mask_trial, "Trainer", Interrupted)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with pytest.raises(KeyboardInterrupt, match="the run has not begun: give the same command again"):
+    with pytest.raises(KeyboardInterrupt, match="no run has begun: give the same command again"):
         decide(folder)
     assert list(tmp_path.iterdir()) == []
 
@@ -131,7 +151,7 @@ def test_a_signal_ends_the_trial_and_leaves_nothing_behind(folder, monkeypatch, 
 def test_the_trial_sees_small_images(folder, monkeypatch):
     sizes = set()
 
-    def psnr(config, capture, assume, quiet):
+    def psnr(config, capture, *_):
         sizes.add(capture.frame(capture.train[0]).image.shape)
         return 30.0
 

@@ -122,7 +122,9 @@ def test_a_signal_to_one_rank_stops_all_with_a_checkpoint_from_which_they_contin
     assert [rank["iteration"] for rank in results(folder)] == [15, 15]
     assert checkpoint.list_checkpoints(folder / "run")[-1] == checkpoint.path_of(folder / "run", 15)
     lines = two_ranks.errors(folder, 0) + two_ranks.errors(folder, 1)
-    assert lines == [f"warpgs: stopped after iteration 15 of {tiny.LENGTH}; continue with --resume {folder / 'run'}"]
+    assert lines == [
+        f"warpgs: stopped after iteration 15 of {tiny.LENGTH}; continue with warpgs train --resume {folder / 'run'}"
+    ]
 
     assert two_ranks.start(folder, two_ranks.train, TrainConfig(resume=folder / "run")) == [0, 0]
     assert tiny.differences(tiny.state(folder / "run"), tiny.state(whole / "run")) == []

@@ -257,9 +257,9 @@ def test_progress_is_hidden_only_if_quiet(run, tmp_path, monkeypatch, quiet):
     [
         ({"path": "fixed", "frames": 0}, "--frames must be between 1 and"),
         ({"frames": 3}, "--frames is for .* not for views"),
-        ({"view": "a"}, "--view is for fixed and spiral and bullet, not for views"),
+        ({"view": "a"}, "--view is for fixed, spiral, bullet, not for views"),
         ({"path": "frozen", "view": "a"}, "--view is for .* not for frozen"),
-        ({"path": "fixed", "time": 0.0}, "--time is for frozen and spiral and bullet, not for fixed"),
+        ({"path": "fixed", "time": 0.0}, "--time is for frozen, spiral, bullet, not for fixed"),
         ({"path": "moving", "time": 0.5}, "--time is for .* not for moving"),
         ({"keyframes": Path("a.json"), "time": 0.5}, "--time is for .* not for keyframes"),
         ({"keyframes": Path("a.json"), "view": "a"}, "--view is for .* not for keyframes"),

@@ -1,5 +1,6 @@
 """How the package is installed: its version, and where its extras come from."""
 
+import shlex
 from pathlib import Path
 
 
@@ -17,5 +18,7 @@ def install_command(extra: str) -> str:
     """How to install an extra of the package: from the checkout that it runs from, or else from the package index."""
     checkout = Path(__file__).parents[2]
     if (checkout / "pyproject.toml").exists():
-        return f"pip install -e '{checkout}[{extra}]'"
+        constraints = checkout / "constraints.txt"
+        versions = f"-c {shlex.quote(str(constraints))} " if constraints.exists() else ""
+        return f"pip install {versions}-e {shlex.quote(f'{checkout}[{extra}]')}"
     return f"pip install 'warpgs[{extra}]'"

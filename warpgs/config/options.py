@@ -26,7 +26,7 @@ class TrainConfig:
     """Trains SplitGaussian on a capture, or on the built-in scene if no capture is given."""
 
     data: Path | None = None
-    """Folder of the capture, or builtin:studio (docs/cluster.md) or builtin:balls; the built-in scene if omitted."""
+    """Folder of the capture, or builtin:studio (docs/cluster.md) or builtin:balls; builtin:room if omitted."""
     dataset: str | None = None
     """Layout of the capture: nerfds, hypernerf, iphone, nerfstudio, blender (D-NeRF), llff (NVIDIA), colmap, vipe or
     megasam; recognized from its files if omitted."""

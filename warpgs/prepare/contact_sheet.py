@@ -34,9 +34,9 @@ def choose_evenly(count: int) -> list[int]:
 
 
 def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """[H, W, 3] the image with the dynamic region in red under a bright outline."""
-    red = np.array([255, 40, 40])
-    painted = np.where(dynamic[..., None], 0.55 * image + 0.45 * red, image).astype(np.uint8)
+    """[H, W, 3] the image with a bright outline around the dynamic region, and dark grey where it is static."""
+    grey = 0.6 * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None]
+    painted = np.where(dynamic[..., None], image, grey).astype(np.uint8)
     edges = cv2.morphologyEx(dynamic.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     painted[edges > 0] = (255, 230, 80)
     return painted

@@ -164,7 +164,9 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     images = (p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     paths = sorted(images, key=lambda path: natural_order(path.name))
     if not paths:
-        raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images")
+        inside = next((p.parent for p in sorted(source.glob("*/*")) if p.suffix.lower() in SUFFIXES), None)
+        advice = "" if inside is None else f", but {inside} does"
+        raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images{advice}")
     count = min(selection.count or len(paths), len(paths))
     if count > MAX_FRAMES:
         raise ValueError(f"{source} holds {count} images, the maximum is {MAX_FRAMES}: choose with --count")

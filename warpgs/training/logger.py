@@ -3,6 +3,7 @@
 import re
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,9 @@ from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch.utils.tensorboard.writer import SummaryWriter
+
+NUM_RECENT = 20
+"""Number of reports whose mean speed gives the remaining time: some include pruning or a checkpoint."""
 
 LINE_EVERY = 10.0
 """Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
@@ -97,8 +101,10 @@ class TrainingLogger:
         """Shows the status and adds it to the events."""
         last_iteration, last_time = self._last
         now = time.monotonic()
-        rate = (status.iteration - last_iteration) / max(now - last_time, 1e-9)
-        self._last = (status.iteration, now)
+        done, seconds = status.iteration - last_iteration, max(now - last_time, 1e-9)
+        rate, self._last = done / seconds, (status.iteration, now)
+        if last_iteration > self._first:  # the first interval includes the compilation of kernels
+            self._recent.append((done, seconds))
         text = (
             f"loss {status.loss:.4f}  train PSNR {status.psnr:.2f}  "
             f"static {status.num_static:,}  dynamic {status.num_dynamic:,}  {rate:.1f} it/s"
@@ -111,8 +117,9 @@ class TrainingLogger:
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
             remaining = ""
-            if last_iteration > self._first:  # the first interval includes the compilation of kernels
-                remaining = f"  {(self._total - status.iteration) / max(rate, 1e-9):.0f} s left"
+            if self._recent:
+                done, seconds = map(sum, zip(*self._recent, strict=True))
+                remaining = f"  {(self._total - status.iteration) * seconds / max(done, 1):.0f} s left"
             self.log(f"{status.iteration}/{self._total} {status.stage}  {text}{remaining}")
         self._write(status, rate)
 
@@ -130,6 +137,7 @@ class TrainingLogger:
         """Measures the speed from this iteration on, as when a training begins or returns to a checkpoint."""
         self._first = iteration
         self._last = (iteration, time.monotonic())
+        self._recent: deque[tuple[int, float]] = deque(maxlen=NUM_RECENT)
 
     def skip(self, seconds: float) -> None:
         """Leaves out time in which nothing was trained [s]."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Assumption, Capture
+from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
 
@@ -56,14 +57,14 @@ def with_trusted_masks(
     """
     if not _is_wanted(config, capture):
         return config, {}
-    start = time.perf_counter()
-    length, small = TRIAL.schedule.num_iterations, reduced_capture(capture, MAX_SIDE)
+    start, small = time.perf_counter(), reduced_capture(capture, MAX_SIDE)
+    length, of_run = TRIAL.schedule.num_iterations, config.schedule.num_iterations
     log(f"the masks are estimates: two trainings of {length} iterations try them out (--no-try-masks omits them)")
     try:
-        log("trial with the masks:")
-        following = held_out_psnr(config, small, "masks", quiet)
-        log("trial without the masks:")
-        ignoring = held_out_psnr(config, small, "dynamic", quiet)
+        log(f"trial 1 of 2 before the {of_run} iterations of the run, with the masks:")
+        following = held_out_psnr(config, small, "masks", log, quiet)
+        log("trial 2 of 2, without the masks:")
+        ignoring = held_out_psnr(config, small, "dynamic", log, quiet)
     except (ValueError, OSError) as error:
         if ranks.num_ranks() > 1:
             raise  # the others would wait for this one
@@ -71,9 +72,7 @@ def with_trusted_masks(
         return config, {}
     trial = {"mask_trial_psnr_with": following, "mask_trial_psnr_without": ignoring}
     trial["mask_trial_seconds"] = time.perf_counter() - start
-    found = (
-        f"training frames held out of the trial have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
-    )
+    found = f"frames held out of the trial have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
     if not ranks.text_of_first("worse" if ignoring > following + MIN_GAIN else ""):
         log(f"{found}: the masks are used")
         return config, trial
@@ -88,13 +87,16 @@ def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
     return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 
-def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, quiet: bool = True) -> float:
+def held_out_psnr(
+    config: TrainConfig, capture: Capture, assume: Assumption, log: Callable[[str], None] = ignore, quiet: bool = True
+) -> float:
     """PSNR of held-out training frames after a short training, mean [dB].
 
     Args:
         config: Config of the run, with the device chosen; the trial has its switches.
         capture: Its capture.
         assume: What is taken as dynamic.
+        log: Receives a warning if the depth of dynamic objects is unknown: the training itself warns after the trial.
         quiet: Whether to show no progress.
 
     Raises:
@@ -109,8 +111,7 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
     capture = capture.split([name for name in capture.train if name not in held_out], held_out)
     values: list[float] = []
 
-    def compare(progress: Progress) -> None:
-        """Compares the held-out frames once training is done."""
+    def compare(progress: Progress) -> None:  # once training is done
         if progress.status.iteration == progress.num_iterations:
             frames = map(progress.capture.frame, held_out)
             values.extend(render_and_compare(progress.scene, frame)[1] for frame in frames)
@@ -118,11 +119,11 @@ def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, qui
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
         trainer = Trainer(fitted(config, capture, ignore), capture, Path(folder))
         trainer.callbacks = [compare]
+        if trainer.num_cut is not None:
+            log(f"warning: {unknown_depth(trainer.num_cut, len(trainer.views))}")
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet) as logger:
             finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()
     if not finished:
-        raise KeyboardInterrupt(
-            "stopped while the masks were tried out; the run has not begun: give the same command again"
-        )
+        raise KeyboardInterrupt("stopped while the masks were tried out; no run has begun: give the same command again")
     return sum(values) / len(values)

@@ -60,7 +60,8 @@ class TrainingInterrupted(KeyboardInterrupt):
     """
 
     def __init__(self, folder: Path, iteration: int, num_iterations: int) -> None:
-        super().__init__(f"stopped after iteration {iteration} of {num_iterations}; continue with --resume {folder}")
+        goes_on = command("train", "--resume", folder)
+        super().__init__(f"stopped after iteration {iteration} of {num_iterations}; continue with {goes_on}")
         self.folder, self.iteration, self.num_iterations = folder, iteration, num_iterations
 
 

@@ -64,7 +64,7 @@ def _check(options: Render) -> None:
     for name, paths in PATHS_OF_OPTION.items():
         value = getattr(options, name)
         if value is not None and value is not False and options.path_name not in paths:
-            raise ValueError(f"--{name} is for {' and '.join(paths)}, not for {options.path_name}")
+            raise ValueError(f"--{name} is for {', '.join(paths)}, not for {options.path_name}")
     if options.frames is not None and not 1 <= options.frames <= camera_paths.MAX_FRAMES:
         raise ValueError(f"--frames must be between 1 and {camera_paths.MAX_FRAMES:,}, got {options.frames}")
     if not 1 <= options.supersample <= MAX_SUPERSAMPLING:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from warpgs.config import MaskPerturbation
-from warpgs.data.builtin import builtin_folder, is_builtin
+from warpgs.data.builtin import NAMES, PREFIX, builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
@@ -113,7 +113,8 @@ def require_capture(root: Path) -> None:
     if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
         return
     if not root.exists():
-        raise ValueError(missing(root))
+        is_name = f"{PREFIX}{root}" in NAMES or str(root) == "builtin"
+        raise ValueError(f"{missing(root)}; built-in captures are {', '.join(NAMES)}" if is_name else missing(root))
     if root.is_file():
         raise ValueError(f"{root} is a file: give the folder of the capture")
     if (root / "config.json").exists():
