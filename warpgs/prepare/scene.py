@@ -32,6 +32,11 @@ NO_PARALLAX = (
     "(unless a network estimates depth), and views from elsewhere are guesses"
 )
 
+NOTHING_MOVES = (
+    "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
+    "(--masks sam2)"
+)
+
 DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
 
@@ -72,6 +77,8 @@ def write_capture(
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
     if fraction > DOUBTFUL_FRACTION:
         notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
+    if masks.estimated and fraction == 0.0:
+        notes.append(NOTHING_MOVES)
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
     write_contact_sheet(root / "masks.png", painted, cameras.names)
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
