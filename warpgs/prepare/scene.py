@@ -74,14 +74,17 @@ def write_capture(
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
     write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, masks.estimated)
-    fraction = float(np.mean([mask.mean() for mask in dynamic]))
-    if fraction > DOUBTFUL_FRACTION:
-        notes.append(f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png")
-    if masks.estimated and fraction == 0.0:
-        notes.append(NOTHING_MOVES)
+    notes += _doubts(float(np.mean([mask.mean() for mask in dynamic])), masks.estimated)
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
     write_contact_sheet(root / "masks.png", painted, cameras.names)
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
+
+
+def _doubts(fraction: float, estimated: bool) -> list[str]:
+    """What to say of masks that mark a fraction of the pixels as dynamic."""
+    if fraction > DOUBTFUL_FRACTION:
+        return [f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png"]
+    return [NOTHING_MOVES] if estimated and fraction == 0.0 else []
 
 
 def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], notes: list[str]) -> Cameras:
