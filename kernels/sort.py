@@ -26,12 +26,12 @@ DIGITS = 1 << DIGIT_BITS
 MAX_PASSES = 4
 """Enough for 32 bits."""
 
-COUNTS = 8
-"""Counters before the number of pairs of each digit of each pass: jobs taken, and jobs done in each round, which is the
-counting or a pass."""
+COUNTS_BEGIN = 8
+"""Index of the first counter of pairs, one for each digit of each pass. Before it are those of the jobs taken, and of
+the jobs done in each round, which is the counting or a pass."""
 
-WORDS = COUNTS + MAX_PASSES * DIGITS
-"""Counters before the words of the look-back, one for each digit of each segment in each pass."""
+WORDS_BEGIN = COUNTS_BEGIN + MAX_PASSES * DIGITS
+"""Index of the first word of the look-back, one for each digit of each segment in each pass."""
 
 SORT_BLOCK_DIM = 512
 """Threads of a CUDA block of a sort."""
@@ -53,8 +53,8 @@ constexpr int digit_bits = {DIGIT_BITS}, digits = {DIGITS};
 constexpr unsigned all = 0xffffffffu, mask = digits - 1, own_only = 1u << 30, inclusive = 2u << 30;
 int* const num_taken = counters.data;
 int* const num_done = counters.data + 1;
-int* const counts = counters.data + {COUNTS};
-volatile unsigned* const all_words = (volatile unsigned*)counters.data + {WORDS};
+int* const counts = counters.data + {COUNTS_BEGIN};
+volatile unsigned* const all_words = (volatile unsigned*)counters.data + {WORDS_BEGIN};
 """
 
 # What other blocks wrote in an earlier round is read by __ldcg, because caches of level 1 are not coherent.

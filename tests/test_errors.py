@@ -140,7 +140,8 @@ def test_a_command_in_a_message_can_be_pasted():
 def test_a_missing_path_is_told_what_is_similar_beside_it(tmp_path):
     (tmp_path / "hand").mkdir()
     assert missing(tmp_path / "hnd") == f"{tmp_path / 'hnd'} does not exist; did you mean {tmp_path / 'hand'}?"
-    for path in (tmp_path / "studio", tmp_path / "nowhere/hand"):
+    (tmp_path / "loose").symlink_to(tmp_path / "gone")
+    for path in (tmp_path / "studio", tmp_path / "nowhere/hand", tmp_path / "loose"):
         assert missing(path) == f"{path} does not exist"
 
 

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -63,7 +64,9 @@ def test_a_checkout_that_is_not_installed_has_a_version(monkeypatch):
 
 def test_an_extra_comes_from_the_checkout_or_from_the_index(monkeypatch, tmp_path):
     checkout = Path(version.__file__).parents[2]
-    assert version.install_command("viewer") == f"pip install -c {checkout}/constraints.txt -e '{checkout}[viewer]'"
+    assert version.install_command("viewer") == shlex.join(
+        ["pip", "install", "-c", f"{checkout}/constraints.txt", "-e", f"{checkout}[viewer]"]
+    )
     monkeypatch.setattr(version, "__file__", str(tmp_path / "warpgs" / "command_line" / "version.py"))
     assert version.install_command("viewer") == "pip install 'warpgs[viewer]'"
 

@@ -170,7 +170,7 @@ def command(*words: object) -> str:
 def missing(path: Path) -> str:
     """Message that a path does not exist, and what in its folder has a similar name."""
     try:
-        close = difflib.get_close_matches(path.name, sorted(os.listdir(path.parent)), 1)
+        close = difflib.get_close_matches(path.name, sorted({*os.listdir(path.parent)} - {path.name}), 1)
     except OSError:  # no such folder
         close = []
     return f"{path} does not exist" + (f"; did you mean {path.parent / close[0]}?" if close else "")

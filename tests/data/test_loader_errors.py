@@ -11,7 +11,7 @@ import pytest
 from tests.data.captures import edit_json, refused, write_array, write_json
 from warpgs.config import MaskPerturbation
 from warpgs.data.loaders import load_capture
-from warpgs.data.writer import REPORT, WORK
+from warpgs.data.writer import FINISHED, STATE, WORK
 
 
 def test_the_given_dataset_overrides_recognition(root):
@@ -105,9 +105,10 @@ def test_a_built_in_capture_without_its_prefix_is_told_the_names(name):
 
 
 def test_a_capture_that_prepare_has_not_finished_is_refused(root):
-    (root / WORK).mkdir()
-    refused(root, r"is not finished: run the same warpgs prepare again, or remove .*\.prepare")
-    (root / REPORT).write_text("{}")
+    write_json(root / WORK / STATE, {"done": {"capture": {}}})
+    for dataset in (None, "nerfds"):
+        refused(root, r"is not finished: run the same warpgs prepare again, or remove .*\.prepare", dataset=dataset)
+    write_json(root / WORK / STATE, {"done": {"capture": {}, FINISHED: {}}})
     assert load_capture(root).train
 
 

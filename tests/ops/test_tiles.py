@@ -7,6 +7,7 @@ from tests.ops.alone import composite, project
 from tests.reference.tiles import ALPHA_MIN, max_alphas
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
 from warpgs.kernels import tiles as kernels
+from warpgs.kernels.sort import MAX_PAIRS
 from warpgs.ops import tiles
 from warpgs.ops.projection import Geometry, Projection, View
 from warpgs.ops.rows import pack
@@ -181,3 +182,9 @@ def test_the_lists_of_tiles_are_split_by_branch_in_order(fraction):
         both = result.gaussian_from_isect[result.half + begin : result.half + end]
         assert torch.equal(both[:num_static], listed[~dynamic])
         assert torch.equal(both.flip(0)[:num_dynamic], listed[dynamic])
+
+
+def test_learned_buffers_are_no_larger_than_what_can_be_sorted():
+    budget = tiles._Budget()
+    budget._number[0] = MAX_PAIRS
+    assert budget.capacity(1) == MAX_PAIRS - 1

@@ -16,6 +16,7 @@ from warpgs.cli import main
 from warpgs.data import images
 from warpgs.data.images import decode, read_depth
 from warpgs.data.loaders import load_capture, recognize
+from warpgs.data.writer import STATE, WORK
 from warpgs.prepare import add, masks
 from warpgs.prepare.add import AddOptions, add_parts
 from warpgs.prepare.flow import Flows
@@ -133,6 +134,14 @@ def test_depth_is_not_added_beside_incomplete_masks(root):
     write_mask(root, NAMES[2])
     with pytest.raises(ValueError, match="every training frame needs its mask"):
         add_parts(root, AddOptions(["depth"]))
+
+
+def test_nothing_is_added_to_a_capture_that_is_not_finished(root):
+    (root / WORK).mkdir()
+    (root / WORK / STATE).write_text('{"done": {}}')
+    with pytest.raises(ValueError, match="is not finished: run the same warpgs prepare again"):
+        add_parts(root, AddOptions(["masks"], masks="red"))
+    assert not (root / "resized_mask").exists()
 
 
 def test_masks_are_not_split_over_two_folders(root):

@@ -98,6 +98,7 @@ UNSUITABLE = {
     "device": (lambda path, images: path.symlink_to("/dev/zero"), r"source\.mp4 is not a file"),
     "one frame": (lambda path, images: write_video(path, images[:1]), "gives 1 frame, at least"),
     "empty folder": (lambda path, images: path.mkdir(), r"holds no \.png, .* images$"),
+    "hidden images": (lambda path, images: write_folder(path / ".thumbs", images), r"holds no \.png, .* images$"),
     "folder of a folder": (lambda path, images: write_folder(path / "shots", images), r"but .*source\.mp4.shots does$"),
 }
 

@@ -11,6 +11,7 @@ import pytest
 from tests.data import layouts
 from warpgs.config import LossConfig, TrainConfig
 from warpgs.config.presets import PRESETS
+from warpgs.data.writer import STATE, WORK
 from warpgs.sweep.cells import (
     arguments,
     as_evaluated_before,
@@ -173,6 +174,16 @@ def test_what_is_no_capture_is_refused_as_training_does(name, tmp_path):
     for path, problem in (("nowhere", "does not exist"), ("empty", "has no dataset.json and the files of no other")):
         with pytest.raises(ValueError, match=f"{path} {problem}"):
             find_scenes([f"{name}{tmp_path / path}"])
+
+
+@pytest.mark.parametrize("path", ["scenes", "scenes/b"])
+def test_a_capture_that_prepare_has_not_finished_is_refused_before_anything_is_trained(path, tmp_path):
+    for name, done in (("a", '{"finished": {}}'), ("b", "{}")):
+        (tmp_path / "scenes" / name / WORK).mkdir(parents=True)
+        (tmp_path / "scenes" / name / "dataset.json").write_text("{}")
+        (tmp_path / "scenes" / name / WORK / STATE).write_text(f'{{"done": {done}}}')
+    with pytest.raises(ValueError, match=r"scenes.b is not finished"):
+        find_scenes([str(tmp_path / path)])
 
 
 def test_a_sweep_without_captures_is_refused():

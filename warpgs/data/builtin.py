@@ -27,6 +27,12 @@ def parse_builtin(data: Path | str) -> tuple[str, str]:
     return name, query.removeprefix("depth=") or "exact"
 
 
+def require_factor(data: Path | str, factor: int | None) -> None:
+    """Raises ValueError if a downscaling factor is wanted that built-in captures lack."""
+    if factor not in (None, 1):
+        raise ValueError(f"{data} has images of one size: omit --factor {factor}")
+
+
 def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = None) -> Path:
     """The folder of a built-in capture, which is created on the first call.
 
@@ -41,8 +47,7 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
     """
     depth: Any
     name, depth = parse_builtin(data)
-    if factor not in (None, 1):
-        raise ValueError(f"{data} has images of one size: omit --factor {factor}")
+    require_factor(data, factor)
     if name == "room":
         from .synthetic import builtin_capture  # imports torch
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from warpgs.cameras import Camera
-from warpgs.errors import missing, visible
+from warpgs.errors import visible
 
 from .builtin import is_builtin
 from .capture import MASKS_REMEDY, MIN_EXTENT, Capture, Frame
@@ -27,7 +27,7 @@ from .depth_alignment import (
     sample_points,
 )
 from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
-from .loaders import load_capture, recognize
+from .loaders import load_capture, missing_capture, recognize
 from .motion_check import are_comparable, motion_between
 from .sampling import evenly_spaced_indices
 from .turning_check import turning_of
@@ -116,7 +116,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
         ValueError: If there is no such folder.
     """
     if not is_builtin(root) and not root.exists():
-        raise ValueError(missing(root))
+        raise ValueError(missing_capture(root))
     try:
         capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)
     except ValueError as error:

@@ -52,7 +52,8 @@ def unknown_depth(num_cut: int, num_frames: int) -> str:
         num_cut: Number of training frames in which the image border cuts one off.
         num_frames: Number of training frames.
     """
-    border = f", but the image border cuts them off in {num_cut} of {num_frames} training frames" if num_cut else ""
+    is_cause = num_frames - num_cut < MIN_FRAMES <= num_frames
+    border = f", but the image border cuts them off in {num_cut} of {num_frames} training frames" if is_cause else ""
     return (
         "the depth of dynamic objects is unknown, so they may be blurred and partly in the static image: their size "
         f"tells it only if one can be followed and is whole in {MIN_FRAMES} frames{border}; record so that one stays "

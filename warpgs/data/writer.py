@@ -19,8 +19,9 @@ from .units import SceneUnits
 LAYOUT = "nerfds"
 """Loader of what is written here, which dataset.json names."""
 
-WORK, REPORT = ".prepare", "prepare.json"
-"""Folder of the intermediate files of ``warpgs prepare`` in its captures, and the report that it writes last."""
+WORK, STATE, FINISHED = ".prepare", "state.json", "finished"
+"""Folder in a capture for the intermediate files of ``warpgs prepare``, file in it with the steps done, and the last of
+these steps."""
 
 GIVEN, ESTIMATED = "given", "estimated"
 """What dataset.json says of the masks, see ``Capture.estimated_masks``."""

@@ -8,7 +8,7 @@ from warpgs.runtime import profiling
 from warpgs.runtime.launch import launch
 
 MAX_BLOCKS = 512
-"""Maximum number of blocks: about as many as a large GPU runs at once; more would find no job."""
+"""Maximum number of blocks: more than a large GPU runs at once; those that begin late find no job."""
 
 MAX_CHUNKS = 256
 """Chunks in which digits are counted: enough to saturate memory, few enough to be added up quickly."""
@@ -24,7 +24,7 @@ def new_counters(like: Tensor, num_pairs: int, num_bits: int) -> Tensor | None:
     if not like.is_cuda:
         return None
     num_segments = -(-num_pairs // kernels.PAIRS_PER_SEGMENT)
-    return like.new_empty(kernels.WORDS + num_passes(num_bits) * num_segments * kernels.DIGITS)
+    return like.new_empty(kernels.WORDS_BEGIN + num_passes(num_bits) * num_segments * kernels.DIGITS)
 
 
 def sort_pairs(keys: Tensor, values: Tensor, counters: Tensor | None, num_bits: int) -> None:

@@ -161,10 +161,9 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
         raise ValueError("--fps is for videos: a folder has no frame rate, use --count")
     if selection.start or selection.end is not None:
         raise ValueError("--start and --end are for videos: a folder has no times")
-    images = (p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
-    paths = sorted(images, key=lambda path: natural_order(path.name))
+    paths = sorted(filter(_is_image, source.iterdir()), key=lambda path: natural_order(path.name))
     if not paths:
-        inside = next((p.parent for p in sorted(source.glob("*/*")) if p.suffix.lower() in SUFFIXES), None)
+        inside = next((p.parent for p in sorted(source.glob("[!.]*/*")) if _is_image(p)), None)
         advice = "" if inside is None else f", but {inside} does"
         raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images{advice}")
     count = min(selection.count or len(paths), len(paths))
@@ -174,6 +173,10 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
         yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1], max(best[1].shape[:2]))
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
 
 
 def _read(path: Path) -> UInt8[np.ndarray, "H W 3"]:

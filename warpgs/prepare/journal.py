@@ -8,8 +8,11 @@ from errno import ENOSPC
 from pathlib import Path
 from typing import Any, TypeVar
 
-from warpgs.data.writer import REPORT, WORK
+from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.files import read_json, write_json
+
+REPORT = "prepare.json"
+"""Report in the finished capture: options, result and seconds of every step, notes."""
 
 OUTPUTS = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "point_colors.npy", "scene.json", "metadata.json",
@@ -19,9 +22,6 @@ OUTPUTS = (
 
 VERSION = 4
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
-
-STATE = "state.json"
-"""File in the work folder with the options, the finished steps, and the notes."""
 
 ADVICE = "free some disk space and run the same command again"
 
@@ -73,7 +73,7 @@ class Journal:
                 f"{self.root} exists and was not made by prepare: choose another folder, or replace the capture in it "
                 "with --force"
             ) from error
-        if state.get("version") != VERSION and "finished" not in done:
+        if state.get("version") != VERSION and FINISHED not in done:
             return {}, []  # the intermediate files of an earlier version differ
         begun = {"camera": "moving", **begun}  # the only one before there was the option
         before, now = _flat(begun), _flat(self._options)
@@ -88,7 +88,7 @@ class Journal:
     @property
     def is_finished(self) -> bool:
         """Whether all steps are finished."""
-        return "finished" in self._done
+        return FINISHED in self._done
 
     def step(self, name: str, work: Callable[[], str]) -> None:
         """Runs ``work``, which returns a summary of its result, unless the step of this name is finished.
@@ -166,7 +166,7 @@ class Journal:
         steps = {name: entry["result"] for name, entry in self._done.items()}
         seconds = {name: entry["seconds"] for name, entry in self._done.items()}
         write_json(self.root / REPORT, {**self._options, "steps": steps, "seconds": seconds, "notes": self.notes})
-        self._done["finished"] = {"seconds": 0.0, "result": ""}
+        self._done[FINISHED] = {"seconds": 0.0, "result": ""}
         self._save()
         for path in self.work.iterdir():
             if path.name != STATE:

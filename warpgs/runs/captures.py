@@ -3,7 +3,7 @@
 import torch
 
 from warpgs.config import TrainConfig
-from warpgs.data.builtin import builtin_folder, is_builtin
+from warpgs.data.builtin import builtin_folder, is_builtin, require_factor
 from warpgs.data.capture import Background, Capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
@@ -18,8 +18,11 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     """
     if config.data is not None and is_builtin(config.data):
         root = builtin_folder(config.data, quiet, config.factor)
+    elif config.data is not None:
+        root = config.data
     else:
-        root = config.data or builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
+        require_factor("builtin:room", config.factor)
+        root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     capture = load_capture(
         root,
         config.dataset,

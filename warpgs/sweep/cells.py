@@ -93,14 +93,15 @@ def _named(text: str, log: Callable[[str], object]) -> Iterator[tuple[str, str]]
         yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
     else:
         root = Path(text).resolve()
-        yield from ((path.name, str(path)) for path in _captures_in(root, log) or [_capture(root)])
+        yield from ((path.name, str(_capture(path))) for path in _captures_in(root, log) or [root])
 
 
 def _capture(root: Path) -> Path:
     """The folder; raises ValueError if it is no capture, as training would."""
-    from warpgs.data.loaders import require_capture  # imports torch
+    from warpgs.data.loaders import require_capture, require_finished  # imports torch
 
     require_capture(root)
+    require_finished(root)
     return root
 
 

@@ -18,6 +18,7 @@ from .callbacks import Progress, render_and_compare
 from .fitting import fitted
 from .interrupt import Interrupt
 from .logger import TrainingLogger, ignore
+from .objects import find_all_objects, num_cut_off
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]
@@ -87,6 +88,13 @@ def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
     return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 
+def _warn_of_unknown_depth(capture: Capture, log: Callable[[str], None]) -> None:
+    """Warns if an object is not whole in enough of all frames either: the trial has held some out."""
+    num_cut = num_cut_off(find_all_objects(capture))
+    if num_cut is not None:
+        log(f"warning: {unknown_depth(num_cut, len(capture.train))}")
+
+
 def held_out_psnr(
     config: TrainConfig, capture: Capture, assume: Assumption, log: Callable[[str], None] = ignore, quiet: bool = True
 ) -> float:
@@ -108,7 +116,7 @@ def held_out_psnr(
     # Held-out frames keep their exposure, so those that train must do so, too.
     config = dataclasses.replace(config, **parts, iterations=None, exposure=False, assume=assume)
     held_out = capture.train[HELD_OUT // 2 :: HELD_OUT]
-    capture = capture.split([name for name in capture.train if name not in held_out], held_out)
+    whole, capture = capture, capture.split([name for name in capture.train if name not in held_out], held_out)
     values: list[float] = []
 
     def compare(progress: Progress) -> None:  # once training is done
@@ -120,7 +128,7 @@ def held_out_psnr(
         trainer = Trainer(fitted(config, capture, ignore), capture, Path(folder))
         trainer.callbacks = [compare]
         if trainer.num_cut is not None:
-            log(f"warning: {unknown_depth(trainer.num_cut, len(trainer.views))}")
+            _warn_of_unknown_depth(whole, log)
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet) as logger:
             finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from operator import attrgetter
 from typing import NamedTuple
 
 import cv2
@@ -30,7 +31,7 @@ from warpgs.data.dynamic_regions import MIN_FRAMES, scaled_size
 from warpgs.data.masks import nearest_pixels
 
 from .dynamic_points import is_depth_known
-from .objects import MovingObject, find_all_objects
+from .objects import MovingObject, find_all_objects, num_cut_off
 from .point_cloud import front_of_ball
 from .views import View, Views
 
@@ -111,8 +112,8 @@ def fill_object_depth(
 def _set_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> ObjectDepth:
     """Gives objects their depth by size; the arguments are those of ``fill_object_depth``."""
     objects, count = find_all_objects(capture), 0
-    if objects and all(_is_mostly_cut(item) for item in objects if not item.is_mixture):
-        return ObjectDepth(0, len({index for item in objects for index in item.cut}))
+    if (num_cut := num_cut_off(objects)) is not None:
+        return ObjectDepth(0, num_cut)
     for index, depth in object_depth(capture, objects).items():
         if capture.frame(capture.train[index]).inverse_depth is None:
             alignments[index] = alignments.new_tensor([1.0, 0.0])
@@ -261,22 +262,17 @@ def _by_object(
     """
     points_of = cache(partial(_static_points, capture))
     images: dict[int, Tensor] = {}
-    for item in sorted((item for item in objects if not item.is_mixture), key=_is_mostly_cut):
-        if _is_mostly_cut(item) and not images:
+    for item in sorted((item for item in objects if not item.is_mixture), key=attrgetter("is_mostly_cut")):
+        if item.is_mostly_cut and not images:
             break  # without any depth, dynamic Gaussians start in front of the points around them
         seen = {k: _ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
-        choose = values_of_cut if _is_mostly_cut(item) else values_of
+        choose = values_of_cut if item.is_mostly_cut else values_of
         for index, found in choose(item, seen, points_of).items():
             size = scaled_size(capture.cameras[capture.train[index]])
             values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
             pixels = torch.from_numpy(item.pixels[index]).long()
             values[pixels] = torch.where(values[pixels].isnan(), found, values[pixels])
     return images
-
-
-def _is_mostly_cut(item: MovingObject) -> bool:
-    """Whether too few frames show an object whole for its size to be known."""
-    return len(item.whole) < MIN_FRAMES
 
 
 def _static_points(capture: Capture, index: int) -> Points:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.dynamic_regions import dynamic_regions, is_cut, scaled_size
+from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
 from warpgs.data.motion_check import MIN_SIDE, flow_between, grey_at
 
 MIN_OVERLAP = 0.3
@@ -40,6 +40,11 @@ class MovingObject:
     cut: list[int] = field(default_factory=list)
     is_mixture: bool = False
 
+    @property
+    def is_mostly_cut(self) -> bool:
+        """Whether too few frames show the object whole for its size to be known."""
+        return len(self.whole) < MIN_FRAMES
+
 
 def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
     """The objects that the masks of training frames show.
@@ -55,6 +60,13 @@ def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
     for index, frame in zip(order, capture.frames([capture.train[index] for index in order]), strict=True):
         follower.add(index, frame)
     return follower.objects
+
+
+def num_cut_off(objects: Sequence[MovingObject]) -> int | None:
+    """Number of frames in which the image border cuts objects off, if the size of none is known; None otherwise."""
+    if not objects or not all(item.is_mostly_cut for item in objects if not item.is_mixture):
+        return None
+    return len({index for item in objects for index in item.cut})
 
 
 def find_all_objects(capture: Capture) -> list[MovingObject]:

@@ -12,7 +12,7 @@ from warpgs.data.builtin import NAMES, PREFIX, builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
-from warpgs.data.writer import REPORT, WORK
+from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.errors import command, missing
 from warpgs.files import read_json
 
@@ -93,6 +93,7 @@ def load_capture(
     root = builtin_folder(root, factor=factor) if is_builtin(root) else Path(root)
     if dataset is None:
         require_capture(root)
+    require_finished(root)
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
         factor = vrig_factor
@@ -104,17 +105,18 @@ def is_capture(root: Path) -> bool:
     return (root / "dataset.json").exists() or any(loader.recognizes(root) for loader in LOADERS.values())
 
 
+def missing_capture(root: Path) -> str:
+    """Message that a folder does not exist, and what was meant."""
+    is_name = f"{PREFIX}{root}" in NAMES or str(root) == "builtin"
+    return f"{missing(root)}; built-in captures are {', '.join(NAMES)}" if is_name else missing(root)
+
+
 def require_capture(root: Path) -> None:
     """Raises ValueError if a path has no part of a capture; if it has some, the loader says what is missing."""
-    if (root / WORK).exists() and not (root / REPORT).exists():
-        raise ValueError(
-            f"{root} is not finished: run the same warpgs prepare again, or remove {root / WORK} to use what is there"
-        )
     if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
         return
     if not root.exists():
-        is_name = f"{PREFIX}{root}" in NAMES or str(root) == "builtin"
-        raise ValueError(f"{missing(root)}; built-in captures are {', '.join(NAMES)}" if is_name else missing(root))
+        raise ValueError(missing_capture(root))
     if root.is_file():
         raise ValueError(f"{root} is a file: give the folder of the capture")
     if (root / "config.json").exists():
@@ -131,6 +133,18 @@ def require_capture(root: Path) -> None:
         f"{root} has no dataset.json and the files of no other layout ({', '.join(LOADERS)}); warpgs prepare makes a "
         "capture of a video or a folder of frames"
     )
+
+
+def require_finished(root: Path) -> None:
+    """Raises ValueError if ``warpgs prepare`` has not finished a capture."""
+    try:
+        is_finished = FINISHED in read_json(root / WORK / STATE)["done"]
+    except (ValueError, KeyError, TypeError):  # no such file, or none of its own
+        return
+    if not is_finished:
+        raise ValueError(
+            f"{root} is not finished: run the same warpgs prepare again, or remove {root / WORK} to use what is there"
+        )
 
 
 def recognize(root: Path) -> str:
