@@ -211,7 +211,9 @@ def test_a_folder_with_files_is_not_trained_into(tmp_path, capture):
 
 def test_a_run_folder_that_exists_can_be_resumed(tmp_path, capture):
     folder = create(dataclasses.replace(tiny.CONFIG, out=tmp_path / "run"), capture)
-    with pytest.raises(ValueError, match=rf"{folder} exists and is not empty: continue it with --resume {folder}, or"):
+    with pytest.raises(
+        ValueError, match=rf"{folder} exists and is not empty: continue it with warpgs train --resume {folder}, or"
+    ):
         new_folder(TrainConfig(out=folder), capture)
 
 

@@ -13,6 +13,7 @@ from filelock import FileLock, Timeout
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import is_builtin
 from warpgs.data.capture import Capture, extent_of
+from warpgs.errors import command
 from warpgs.files import partial_path
 from warpgs.model.trunk import in_single_precision
 from warpgs.ops.mlp import limit_of_multiprocessors
@@ -53,7 +54,7 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
         stem = Path("runs") / "-".join(filter(None, (capture.name, config.preset)))
         folder = next(p for k in range(1, 10_000) if not (p := stem if k == 1 else Path(f"{stem}-{k}")).exists())
     elif folder.exists() and (not folder.is_dir() or not _is_empty(folder)):
-        advice = f"continue it with --resume {folder}, or " if (folder / NAME).exists() else ""
+        advice = f"continue it with {command('train', '--resume', folder)}, or " if (folder / NAME).exists() else ""
         raise ValueError(f"{folder} exists and is not empty: {advice}choose another --out")
     return folder
 
