@@ -190,7 +190,9 @@ def test_metric_depth_is_compared_as_it_is(root):
     assert "metric depth is 0.0% off" in texts(check_metric(root, lambda depth: depth), "note")
     report = check_metric(root, lambda depth: 2.0 * depth)  # a scale would hide it
     assert "metric depth is 50.0% off" in texts(report, "note")
-    assert "12 of 12 frames is hardly better than a constant" in texts(report, "warning")
+    assert "12 of 12 frames is hardly better than a constant: presets other than paper do not use it" in texts(
+        report, "warning"
+    )
 
 
 def test_metric_depth_without_points_to_compare_with_is_fit(root):

@@ -307,7 +307,8 @@ def _depth(capture: Capture) -> Iterator[Finding]:
         kind = "metric" if capture.metric_depth else "aligned"
         yield Finding("note", "depth", f"{kind} depth is {median:.1%} off at the points (median)")
     if unusable := int(is_unusable(errors).sum()):
-        yield Finding("warning", "depth", f"the depth of {unusable} of {count} frames is hardly better than a constant")
+        which = f"the depth of {unusable} of {count} frames is hardly better than a constant"
+        yield Finding("warning", "depth", f"{which}: presets other than paper do not use it")
 
 
 def _depth_at_points(capture: Capture) -> Iterator[PointSamples]:
