@@ -22,6 +22,16 @@ def native(cuda: str, cpu: str) -> str:
     return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
 
 
+def warp_prefix_sum(value_type: str, name: str) -> str:
+    """CUDA code that turns a variable of each lane into its inclusive prefix sum over the warp; it reads ``lane``."""
+    return f"""
+        for (int o = 1; o < 32; o <<= 1) {{
+            const {value_type} below = __shfl_up_sync(0xffffffffu, {name}, o);
+            if (lane >= o) {name} += below;
+        }}
+        """
+
+
 @wp.func_native(native("return 32;", "return 1;"))
 def lane_count() -> int: ...
 
@@ -82,19 +92,7 @@ def lane_broadcast(x: int, lane: int) -> int:
     ...
 
 
-@wp.func_native(
-    native(
-        """
-        int sum = x;
-        for (int o = 1; o < 32; o <<= 1) {
-            const int below = __shfl_up_sync(0xffffffffu, sum, o);
-            if (lane >= o) sum += below;
-        }
-        return sum - x;
-        """,
-        "return 0;",
-    )
-)
+@wp.func_native(native(f"int sum = x; {warp_prefix_sum('int', 'sum')} return sum - x;", "return 0;"))
 def lane_sum_before(x: int, lane: int) -> int:
     """Sum of ``x`` over the lanes below ``lane``."""
     ...

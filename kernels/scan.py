@@ -15,7 +15,7 @@ before the launch.
 
 import warp as wp
 
-from .lanes import native
+from .lanes import native, warp_prefix_sum
 
 SCAN_BLOCK_DIM = wp.constant(256)
 """Threads of a CUDA block of a kernel that calls ``prefix_sums``."""
@@ -33,10 +33,7 @@ PrefixSums = wp.types.vector(length=2, dtype=wp.int64)
         volatile long long* const all_words = words.data;
         const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, block = thread / {SCAN_BLOCK_DIM};
         long long sum = x;
-        for (int o = 1; o < 32; o <<= 1) {{
-            const long long below = __shfl_up_sync(0xffffffffu, sum, o);
-            if (lane >= o) sum += below;
-        }}
+        {warp_prefix_sum("long long", "sum")}
         if (lane == 31) warp_sums[warp] = sum;
         __syncthreads();
         long long exclusive = sum - x, aggregate = 0;

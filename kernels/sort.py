@@ -17,7 +17,7 @@ import functools
 
 import warp as wp
 
-from .lanes import native
+from .lanes import native, warp_prefix_sum
 
 DIGIT_BITS = 8
 
@@ -58,7 +58,8 @@ volatile unsigned* const all_words = (volatile unsigned*)counters.data + {WORDS_
 """
 
 # What other blocks wrote in an earlier round is read by __ldcg, because caches of level 1 are not coherent.
-_SORT = """
+_SORT = (
+    """
 __shared__ int positions[num_warps][digits];  // in the segment, of the next pair of a warp that has this digit
 __shared__ int staged[per_segment];
 __shared__ int shifts[digits];  // from a position in the segment to that in the output
@@ -149,10 +150,9 @@ while (true) {
             words[index * digits] = (index > 0 ? own_only : inclusive) | num_here;
             numbers = (long long)__ldcg(counts + pass * digits + tid) << 32 | num_here;
             sum = numbers;
-            for (int o = 1; o < 32; o <<= 1) {
-                const long long below = __shfl_up_sync(all, sum, o);
-                if (lane >= o) sum += below;
-            }
+"""
+    + warp_prefix_sum("long long", "sum")
+    + """
             if (lane == 31) warp_sums[warp] = sum;
         }
         __syncthreads();
@@ -210,6 +210,7 @@ while (true) {
     if (tid == 0) atomicAdd(num_done + round, 1);
 }
 """
+)
 
 
 @functools.cache
