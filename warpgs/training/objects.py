@@ -89,7 +89,7 @@ class _Follower:
 
     def add(self, index: int, frame: Frame) -> None:
         """Goes on to the training frame of an index."""
-        regions = dynamic_regions(frame)
+        regions, alone = dynamic_regions(frame), set()
         labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
@@ -97,13 +97,14 @@ class _Follower:
             else:
                 label = candidates[0] if len(candidates) == 1 else self._new(is_mixture=len(candidates) > 1)
                 labels[region] = label
-                if not is_cut(region):
-                    self.objects[label].whole.append(index)
+                alone.add(label)
         for label in np.unique(labels[labels != NOTHING]):
             item, shown = self.objects[label], labels == label
             item.pixels[index] = np.flatnonzero(shown).astype(np.int32)
             if is_cut(shown):
                 item.cut.append(index)
+            elif label in alone:
+                item.whole.append(index)
         self._before, self._labels = frame, labels
 
     def _new(self, is_mixture: bool = False) -> int:
