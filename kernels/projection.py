@@ -22,12 +22,14 @@ ALPHA_MIN, has an opacity of at most 1 before compensation, touches the image an
 covariance. Every test is phrased so that NaN fails it.
 """
 
+import functools
 import math
 
 import warp as wp
 
 from .constants import ALPHA_MIN, FAR, FIELD_OF_VIEW_MARGIN, LOW_PASS
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd, scaled_rotation
+from .rows import Splat, is_culled, make_pack_splat, make_unpack_splat
 
 CAMERA_GRADIENTS = 16
 """Length of a row of ``v_cameras``: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
@@ -89,17 +91,6 @@ def store_camera_gradients(
         v_cameras[i, 9 + row] = v_t[row]
     for part in range(4):
         v_cameras[i, 12 + part] = v_intrinsics[part]
-
-
-@wp.struct
-class Splat:
-    """A Gaussian as a camera sees it; all values of a culled one are zero."""
-
-    mean: wp.vec2
-    conic: wp.vec3
-    depth: float
-    opacity: float
-    radius: wp.vec2i
 
 
 @wp.func
@@ -170,36 +161,6 @@ def project(
     return splat
 
 
-@wp.kernel(enable_backward=False)
-def project_fwd(
-    first: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    viewmat: wp.array2d[float],
-    K: wp.array2d[float],
-    width: int,
-    height: int,
-    near: float,
-    compensate: int,
-    screen_offsets: wp.array[wp.vec2],
-    means2d: wp.array[wp.vec2],
-    conics: wp.array[wp.vec3],
-    depths: wp.array[float],
-    splat_opacities: wp.array[float],
-    radii: wp.array[wp.vec2i],
-):
-    """Writes one splat per thread."""
-    i = first + wp.tid()
-    splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
-    means2d[i] = splat.mean
-    conics[i] = splat.conic
-    depths[i] = splat.depth
-    splat_opacities[i] = splat.opacity
-    radii[i] = splat.radius
-
-
 @wp.func
 def unproject(
     i: int,
@@ -212,20 +173,16 @@ def unproject(
     width: int,
     height: int,
     compensate: int,
-    radii: wp.array[wp.vec2i],
+    rows: wp.array2d[wp.vec4],
     v_splat: Splat,
     v_means: wp.array[wp.vec3],
     v_quats: wp.array[wp.vec4],
     v_scales: wp.array[wp.vec3],
     v_opacities: wp.array[float],
     v_cameras: wp.array2d[float],
-    v_means_of_colors: wp.array[wp.vec3],
 ):
-    """Writes the gradients of Gaussian i from those of its splat.
-
-    ``v_means_of_colors`` is added to ``v_means``; both may be the same array, and it may be missing.
-    """
-    if radii[i][0] <= 0:
+    """Writes the gradients of Gaussian i from those of its splat."""
+    if is_culled(rows, i):
         for part in range(v_cameras.shape[1]):
             v_cameras[i, part] = 0.0
         v_means[i] = wp.vec3(0.0)
@@ -310,10 +267,7 @@ def unproject(
     )
     v_z += v_splat.depth
     v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
-    v_mean = wp.transpose(rotation) * v_t
-    if v_means_of_colors.shape[0] > 0:
-        v_mean = v_means_of_colors[i] + v_mean
-    v_means[i] = v_mean
+    v_means[i] = wp.transpose(rotation) * v_t
     if v_cameras.shape[1] > 0:
         v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
         v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])
@@ -330,59 +284,90 @@ def unproject(
         store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))
 
 
-@wp.kernel(enable_backward=False)
-def project_bwd(
-    first: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    viewmat: wp.array2d[float],
-    K: wp.array2d[float],
-    width: int,
-    height: int,
-    compensate: int,
-    radii: wp.array[wp.vec2i],
-    v_means2d: wp.array[wp.vec2],
-    v_conics: wp.array[wp.vec3],
-    v_depths: wp.array[float],
-    v_splat_opacities: wp.array[float],
-    v_means: wp.array[wp.vec3],
-    v_quats: wp.array[wp.vec4],
-    v_scales: wp.array[wp.vec3],
-    v_opacities: wp.array[float],
-    v_cameras: wp.array2d[float],
-    v_means_of_colors: wp.array[wp.vec3],
-):
-    """Gradients of one Gaussian per thread; missing gradients of splats (empty arrays) are zero."""
-    i = first + wp.tid()
-    v_splat = Splat()
-    if radii[i][0] > 0:
-        if v_means2d.shape[0] > 0:
-            v_splat.mean = v_means2d[i]
-        if v_conics.shape[0] > 0:
-            v_splat.conic = v_conics[i]
-        if v_depths.shape[0] > 0:
-            v_splat.depth = v_depths[i]
-        if v_splat_opacities.shape[0] > 0:
-            v_splat.opacity = v_splat_opacities[i]
-    unproject(
-        i,
-        means,
-        quats,
-        scales,
-        opacities,
-        viewmat,
-        K,
-        width,
-        height,
-        compensate,
-        radii,
-        v_splat,
-        v_means,
-        v_quats,
-        v_scales,
-        v_opacities,
-        v_cameras,
-        v_means_of_colors,
-    )
+@functools.cache
+def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that projects Gaussians and packs them, one thread for each."""
+    pack_splat = make_pack_splat(num_features, with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def project_fwd(
+        first: int,
+        means: wp.array[wp.vec3],
+        quats: wp.array[wp.vec4],
+        scales: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        viewmat: wp.array2d[float],
+        K: wp.array2d[float],
+        width: int,
+        height: int,
+        near: float,
+        compensate: int,
+        screen_offsets: wp.array[wp.vec2],
+        features: wp.array2d[float],
+        radii: wp.array[wp.vec2i],
+        rows: wp.array2d[wp.vec4],
+        depth_keys: wp.array[int],
+        gaussian_from_rank: wp.array[int],
+        scan_words: wp.array[wp.int64],
+        sort_counters: wp.array[int],
+    ):
+        i = first + wp.tid()
+        splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
+        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
+            splat.radius = wp.vec2i(0, 0)
+        radii[i] = splat.radius
+
+    return project_fwd
+
+
+@functools.cache
+def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
+    """Kernel that turns gradient rows into the gradients of the Gaussians, one thread for each."""
+    unpack_splat = make_unpack_splat(num_features, with_depth)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def project_bwd(
+        first: int,
+        means: wp.array[wp.vec3],
+        quats: wp.array[wp.vec4],
+        scales: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        viewmat: wp.array2d[float],
+        K: wp.array2d[float],
+        width: int,
+        height: int,
+        compensate: int,
+        rows: wp.array2d[wp.vec4],
+        gradients: wp.array3d[float],
+        imagegrad: int,
+        v_features: wp.array2d[float],
+        v_screen_offsets: wp.array[wp.vec2],
+        v_means: wp.array[wp.vec3],
+        v_quats: wp.array[wp.vec4],
+        v_scales: wp.array[wp.vec3],
+        v_opacities: wp.array[float],
+        v_cameras: wp.array2d[float],
+    ):
+        i = first + wp.tid()
+        v_splat = unpack_splat(i, rows, gradients, width, height, imagegrad, v_features, v_screen_offsets)
+        unproject(
+            i,
+            means,
+            quats,
+            scales,
+            opacities,
+            viewmat,
+            K,
+            width,
+            height,
+            compensate,
+            rows,
+            v_splat,
+            v_means,
+            v_quats,
+            v_scales,
+            v_opacities,
+            v_cameras,
+        )
+
+    return project_bwd

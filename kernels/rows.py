@@ -6,8 +6,8 @@ with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so 
 log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, with a value that is not finite,
 or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY, and its radii become 0.
 
-``unpack`` is the backward pass: for each Gaussian, the backward pass of compositing leaves the gradients of its
-features and the moments of s = alpha v_alpha over its pixels, and
+For each Gaussian, the backward pass of compositing leaves the gradients of its features and the moments of
+s = alpha v_alpha over its pixels, and
 
     v_mean2d  = -conic Σ s d,                v_opacity = Σ s / opacity,
     v_conic_xx = -½ Σ s dx²,  v_conic_xy = -Σ s dx dy,  v_conic_yy = -½ Σ s dy².
@@ -17,9 +17,8 @@ import functools
 
 import warp as wp
 
-from .constants import ALPHA_MIN, CULLED_DEPTH, CULLED_LOG2_OPACITY, LN_2, LOG2_E
+from .constants import CULLED_DEPTH, CULLED_LOG2_OPACITY, LN_2, LOG2_E
 from .lanes import exp2, native
-from .projection import Splat, project, unproject
 from .scan import SCAN_BLOCK_DIM
 
 GEOMETRY_PARTS = wp.constant(2)
@@ -30,6 +29,17 @@ NUM_MOMENTS = 6
 
 NUM_OFFSET_SUMS = 2
 """Σ s' (conic d)_x and Σ s' (conic d)_y, with s' of the images alone, without depth."""
+
+
+@wp.struct
+class Splat:
+    """A Gaussian as a camera sees it; all values of a culled one are zero."""
+
+    mean: wp.vec2
+    conic: wp.vec3
+    depth: float
+    opacity: float
+    radius: wp.vec2i
 
 
 # Warp's vec4 is aligned to 4 bytes, so a load or store takes four instructions; rows are aligned to 16: one is enough.
@@ -49,6 +59,11 @@ def row_load(rows: wp.array2d[wp.vec4], i: int, part: int) -> wp.vec4: ...
     )
 )
 def row_store(rows: wp.array2d[wp.vec4], i: int, part: int, value: wp.vec4): ...
+
+
+@wp.func
+def is_culled(rows: wp.array2d[wp.vec4], i: int) -> bool:
+    return row_load(rows, i, 1)[1] == CULLED_LOG2_OPACITY
 
 
 def row_parts(num_channels: int) -> int:
@@ -83,8 +98,6 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
     ) -> bool:
         mean = splat.mean
         conic = splat.conic
-        opacity = splat.opacity
-        radius = splat.radius
         depth = splat.depth
         # A sum is finite only if all of its terms are, and a comparison with NaN fails.
         total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
@@ -97,16 +110,15 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
                     value[k] = depth
             total += value[0] + value[1] + value[2] + value[3]
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
-        visible = radius[0] > 0 and radius[1] > 0 and opacity >= wp.static(ALPHA_MIN) and opacity <= 1.0 and depth > 0.0
+        visible = splat.radius[0] > 0 and wp.isfinite(total)
         visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
-        visible = visible and wp.isfinite(total)
         key = CULLED_DEPTH
         row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
         row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
         if visible:
             key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
             row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])
-            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(opacity), 0.0, 0.0)
+            row1 = wp.vec4(0.5 * LOG2_E * conic[2], wp.log2(splat.opacity), 0.0, 0.0)
         row_store(rows, i, 0, row0)
         row_store(rows, i, 1, row1)
         depth_keys[i] = key
@@ -118,76 +130,6 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         return visible
 
     return pack_splat
-
-
-@functools.cache
-def make_pack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that writes the rows, one thread for each splat, and sets the radii of those that are skipped to zero."""
-    pack_splat = make_pack_splat(num_features, with_depth)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def pack(
-        first: int,
-        means2d: wp.array[wp.vec2],
-        conics: wp.array[wp.vec3],
-        depths: wp.array[float],
-        opacities: wp.array[float],
-        radii: wp.array[wp.vec2i],
-        features: wp.array2d[float],
-        rows: wp.array2d[wp.vec4],
-        depth_keys: wp.array[int],
-        gaussian_from_rank: wp.array[int],
-        scan_words: wp.array[wp.int64],
-        sort_counters: wp.array[int],
-    ):
-        i = first + wp.tid()
-        splat = Splat()
-        splat.mean = means2d[i]
-        splat.conic = conics[i]
-        splat.depth = depths[i]
-        splat.opacity = opacities[i]
-        splat.radius = radii[i]
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
-            if splat.radius[0] != 0 or splat.radius[1] != 0:
-                radii[i] = wp.vec2i(0, 0)
-
-    return pack
-
-
-@functools.cache
-def make_project_and_pack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that projects Gaussians and packs them at once, one thread for each."""
-    pack_splat = make_pack_splat(num_features, with_depth)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def project_and_pack(
-        first: int,
-        means: wp.array[wp.vec3],
-        quats: wp.array[wp.vec4],
-        scales: wp.array[wp.vec3],
-        opacities: wp.array[float],
-        viewmat: wp.array2d[float],
-        K: wp.array2d[float],
-        width: int,
-        height: int,
-        near: float,
-        compensate: int,
-        screen_offsets: wp.array[wp.vec2],
-        features: wp.array2d[float],
-        radii: wp.array[wp.vec2i],
-        rows: wp.array2d[wp.vec4],
-        depth_keys: wp.array[int],
-        gaussian_from_rank: wp.array[int],
-        scan_words: wp.array[wp.int64],
-        sort_counters: wp.array[int],
-    ):
-        i = first + wp.tid()
-        splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
-        if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
-            splat.radius = wp.vec2i(0, 0)
-        radii[i] = splat.radius
-
-    return project_and_pack
 
 
 sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)
@@ -207,8 +149,8 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
         i: int,
         rows: wp.array2d[wp.vec4],
         gradients: wp.array3d[float],
-        half_width: float,
-        half_height: float,
+        width: int,
+        height: int,
         imagegrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],
@@ -229,9 +171,9 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
                 total += gradients[shard, i, wp.static(num_channels) + k]
             s[k] = total
         v_offset = wp.vec2(0.0)
-        row0 = row_load(rows, i, 0)
-        row1 = row_load(rows, i, 1)
-        if row1[1] != CULLED_LOG2_OPACITY:
+        if not is_culled(rows, i):
+            row0 = row_load(rows, i, 0)
+            row1 = row_load(rows, i, 1)
             conic = LN_2 * wp.vec3(2.0 * row0[2], row0[3], 2.0 * row1[0])
             v_splat.mean = -wp.vec2(conic[0] * s[1] + conic[1] * s[2], conic[1] * s[1] + conic[2] * s[2])
             v_splat.conic = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
@@ -240,106 +182,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
             if imagegrad != 0:
                 v_offset = -wp.vec2(s[6], s[7])
         if v_screen_offsets.shape[0] > 0:
-            v_screen_offsets[i] = wp.vec2(v_offset[0] * half_width, v_offset[1] * half_height)
+            v_screen_offsets[i] = wp.vec2(v_offset[0] * 0.5 * float(width), v_offset[1] * 0.5 * float(height))
         return v_splat
 
     return unpack_splat
-
-
-@functools.cache
-def make_unpack(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that turns gradient rows into the gradients of the inputs of packing, one thread for each splat."""
-    unpack_splat = make_unpack_splat(num_features, with_depth)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def unpack(
-        first: int,
-        rows: wp.array2d[wp.vec4],
-        gradients: wp.array3d[float],
-        half_width: float,
-        half_height: float,
-        imagegrad: int,
-        v_means2d: wp.array[wp.vec2],
-        v_conics: wp.array[wp.vec3],
-        v_depths: wp.array[float],
-        v_opacities: wp.array[float],
-        v_features: wp.array2d[float],
-        v_screen_offsets: wp.array[wp.vec2],
-    ):
-        i = first + wp.tid()
-        v_splat = unpack_splat(i, rows, gradients, half_width, half_height, imagegrad, v_features, v_screen_offsets)
-        v_means2d[i] = v_splat.mean
-        v_conics[i] = v_splat.conic
-        v_opacities[i] = v_splat.opacity
-        if wp.static(with_depth):
-            v_depths[i] = v_splat.depth
-
-    return unpack
-
-
-@functools.cache
-def make_unpack_and_unproject(num_features: int, with_depth: bool) -> wp.Kernel:
-    """Kernel that turns gradient rows into the gradients of the Gaussians at once, one thread for each."""
-    unpack_splat = make_unpack_splat(num_features, with_depth)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def unpack_and_unproject(
-        first: int,
-        means: wp.array[wp.vec3],
-        quats: wp.array[wp.vec4],
-        scales: wp.array[wp.vec3],
-        opacities: wp.array[float],
-        viewmat: wp.array2d[float],
-        K: wp.array2d[float],
-        width: int,
-        height: int,
-        compensate: int,
-        radii: wp.array[wp.vec2i],
-        rows: wp.array2d[wp.vec4],
-        gradients: wp.array3d[float],
-        imagegrad: int,
-        v_features: wp.array2d[float],
-        v_screen_offsets: wp.array[wp.vec2],
-        v_means: wp.array[wp.vec3],
-        v_quats: wp.array[wp.vec4],
-        v_scales: wp.array[wp.vec3],
-        v_opacities: wp.array[float],
-        v_cameras: wp.array2d[float],
-        no_colors: wp.array[wp.vec3],
-    ):
-        """``no_colors`` is an empty array: features that are given have no gradient of the means."""
-        i = first + wp.tid()
-        half_width = 0.5 * float(width)
-        half_height = 0.5 * float(height)
-        v_splat = unpack_splat(
-            i,
-            rows,
-            gradients,
-            half_width,
-            half_height,
-            imagegrad,
-            v_features,
-            v_screen_offsets,
-        )
-        unproject(
-            i,
-            means,
-            quats,
-            scales,
-            opacities,
-            viewmat,
-            K,
-            width,
-            height,
-            compensate,
-            radii,
-            v_splat,
-            v_means,
-            v_quats,
-            v_scales,
-            v_opacities,
-            v_cameras,
-            no_colors,
-        )
-
-    return unpack_and_unproject

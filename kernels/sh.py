@@ -103,22 +103,19 @@ def sh_fwd(
     means: wp.array[wp.vec3],
     coefficients: wp.array2d[wp.vec3],
     viewmat: wp.array2d[float],
-    radii: wp.array[wp.vec2i],
     num_bases: int,
     colors: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
-    color = wp.vec3(0.0)
-    if radii[i][0] > 0:
-        bases = sh_bases(direction_from(means[i], viewpoint(viewmat)))
-        color = wp.vec3(0.5)
-        for k in range(NUM_BASES):
-            if k < num_bases:
-                color += bases[k] * coefficients[i, k]
-        if wp.isfinite(color[0] + color[1] + color[2]):
-            color = wp.max(color, wp.vec3(0.0))
-        else:
-            color = wp.vec3(wp.nan)  # so that the Gaussian is culled instead of turning black
+    bases = sh_bases(direction_from(means[i], viewpoint(viewmat)))
+    color = wp.vec3(0.5)
+    for k in range(NUM_BASES):
+        if k < num_bases:
+            color += bases[k] * coefficients[i, k]
+    if wp.isfinite(color[0] + color[1] + color[2]):
+        color = wp.max(color, wp.vec3(0.0))
+    else:
+        color = wp.vec3(wp.nan)  # so that the Gaussian is culled instead of turning black
     colors[i] = color
 
 
@@ -128,13 +125,14 @@ def sh_bwd(
     means: wp.array[wp.vec3],
     coefficients: wp.array2d[wp.vec3],
     viewmat: wp.array2d[float],
-    radii: wp.array[wp.vec2i],
     num_bases: int,
     colors: wp.array[wp.vec3],
     v_colors: wp.array[wp.vec3],
     v_means: wp.array[wp.vec3],
     v_coefficients: wp.array2d[wp.vec3],
+    v_viewpoints: wp.array[wp.vec3],
 ):
+    """Adds to ``v_means``. ``v_viewpoints``, what each Gaussian contributes to that of the camera, may be missing."""
     i = first + wp.tid()
     total = coefficients.shape[1]
     v_mean = wp.vec3(0.0)
@@ -143,7 +141,8 @@ def sh_bwd(
     for c in range(3):
         if not (colors[i][c] > 0.0):
             v[c] = 0.0
-    if radii[i][0] > 0 and wp.isfinite(colors[i][0]):
+    # Culled Gaussians, which may have values that are not finite, have no gradient.
+    if v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0:
         origin = viewpoint(viewmat)
         d = direction_from(means[i], origin)
         bases = sh_bases(d)
@@ -156,7 +155,9 @@ def sh_bwd(
         distance = wp.length(means[i] - origin)
         if distance > 0.0:
             v_mean = (v_d - d * wp.dot(d, v_d)) / distance
+            v_means[i] = v_means[i] + v_mean  # += would be atomic
         begin = num_bases
     for k in range(begin, total):
         v_coefficients[i, k] = wp.vec3(0.0)
-    v_means[i] = v_mean
+    if v_viewpoints.shape[0] > 0:
+        v_viewpoints[i] = -v_mean

@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 from tests.scenes import as_leaves, float_tensors, gradients, make_camera, make_splats
 from warpgs import rendering
 from warpgs.config import RenderSettings
-from warpgs.ops import rows as rows_op
+from warpgs.ops import projection
 from warpgs.ops.mlp import perceptron
 from warpgs.rendering import render
 
@@ -72,10 +72,10 @@ def test_a_parameter_changed_in_place_before_the_backward_pass_is_an_error(name)
 
 def render_layers(splats, background):
     rendering = render(splats, CAMERA, background, RenderSettings(depth=True, branches=True))
-    return {"radii": rendering.radii, **rendering.dynamic._asdict()}
+    return rendering.dynamic._asdict()
 
 
-@pytest.mark.parametrize("name", ["radii", "depth", "alpha"])
+@pytest.mark.parametrize("name", ["depth", "alpha"])
 def test_an_output_that_the_backward_pass_reads_must_not_be_changed_before(name):
     splats, background = as_leaves(make_splats()), torch.zeros(3, requires_grad=True)
     layers = render_layers(splats, background)
@@ -215,12 +215,12 @@ def test_a_render_without_gradients_is_freed_at_once(backward_passes):
 def test_a_checkpointed_render_keeps_nothing_of_its_gaussians(monkeypatch):
     kept = []
 
-    def pack(*args):
-        rows, order = rows_op.pack(*args)
+    def project(*args):
+        rows, *rest = projection.project_fwd(*args)
         kept.append(weakref.ref(rows.packed))
-        return rows, order
+        return rows, *rest
 
-    monkeypatch.setattr(rendering, "pack", pack)
+    monkeypatch.setattr(rendering, "project_fwd", project)
     splats = as_leaves(make_splats())
     image = checkpoint(lambda means: render(splats, CAMERA).joint.image, splats.means, use_reentrant=False)
     assert [reference() for reference in kept] == [None]

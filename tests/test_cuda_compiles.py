@@ -8,7 +8,7 @@ import warp as wp
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
-from warpgs.kernels.rows import make_pack, make_project_and_pack, make_unpack, make_unpack_and_unproject
+from warpgs.kernels.projection import make_project_bwd, make_project_fwd
 from warpgs.kernels.sort import make_sort_pairs
 from warpgs.kernels.ssim import make_ssim_bwd, make_ssim_fwd
 from warpgs.ops.compositing import CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS
@@ -22,7 +22,7 @@ def assert_compiles(module, folder):
     assert f".target sm_{ARCH}" in ptx.read_text()
 
 
-MODULES = ["activation", "adam", "depth_error", "mlp", "projection", "raytrace", "sh", "tiles"]
+MODULES = ["activation", "adam", "depth_error", "mlp", "raytrace", "sh", "tiles"]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -40,9 +40,9 @@ def test_the_encoding_compiles(half, tmp_path):
     assert_compiles(make_encode(half).module, tmp_path)
 
 
-@pytest.mark.parametrize("make", [make_pack, make_project_and_pack, make_unpack, make_unpack_and_unproject])
+@pytest.mark.parametrize("make", [make_project_fwd, make_project_bwd])
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_rows_compile(make, with_depth, tmp_path):
+def test_the_projection_compiles(make, with_depth, tmp_path):
     assert_compiles(make(3, with_depth).module, tmp_path)
 
 

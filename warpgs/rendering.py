@@ -13,15 +13,7 @@ from .config import RenderSettings
 from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, composite_bwd, composite_fwd
 from .ops.projection import Geometry, View, project_bwd, project_fwd
-from .ops.rows import (
-    DepthOrder,
-    PackedSplats,
-    Rows,
-    pack,
-    project_and_pack,
-    unpack,
-    unpack_and_unproject,
-)
+from .ops.rows import Rows
 from .ops.sh import degree_of, sh_bwd, sh_fwd
 from .ops.tiles import bin_splats
 from .runtime.checks import check_same_device, check_tensor
@@ -117,7 +109,6 @@ class _Saved(NamedTuple):
     background: Tensor | None
     sh: Any
     features: Any
-    radii: Tensor
     packed: Tensor
 
 
@@ -204,48 +195,39 @@ def _check_inputs(
 
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
-    """project → bin → composite; every differentiable step records its backward function on one tape."""
+    """(color →) project → bin → composite; every differentiable step records its backward function on one tape."""
     inputs, (size, settings, _, sh_degree) = _Inputs._make(tensors), request
+    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *size)
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
-    splats, features, order = _project(request, inputs)
-    for step in [back.unpack_and_unproject] if sh_degree is None else [back.unproject, back.color, back.unpack]:
-        tape.record_func(step, [])
-    rows = splats.rows
+    colors = inputs.appearance
+    if sh_degree is not None:
+        colors = sh_fwd(inputs.means, inputs.appearance, inputs.viewmat, sh_degree)
+        tape.record_func(back.color, [])
+    options = (settings.near, settings.antialias, settings.depth)
+    rows, radii, order = project_fwd(geometry, colors, view, *options, inputs.screen_offsets)
+    tape.record_func(back.project, [])
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
-    options = (settings.statistics, settings.max_alpha)
-    composite, back.traversal = composite_fwd(rows, tiles, size, inputs.background, *options)
+    composite, back.traversal = composite_fwd(
+        rows, tiles, size, inputs.background, settings.statistics, settings.max_alpha
+    )
     tape.record_func(back.composite, [])
 
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
-    sh = None if sh_degree is None else inputs.appearance
+    sh, features = (None, None) if sh_degree is None else (inputs.appearance, colors)
     camera, background = (inputs.viewmat, inputs.K), inputs.background
-    saved = _Saved(*inputs[:4], *camera, background, sh, features, splats.radii, rows.packed)
+    saved = _Saved(*geometry, *camera, background, sh, features, rows.packed)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
         backward=partial(_backward, back, tape),
         saved=(*saved, *composite.depths, *alphas),
-        constants=(splats.radii, *composite.statistics, *num_intersections),
+        constants=(radii, *composite.statistics, *num_intersections),
     )
 
 
-def _project(request: _Request, inputs: _Inputs) -> tuple[PackedSplats, Tensor | None, DepthOrder]:
-    """project → color → pack: splats, colours, order by depth; without spherical harmonics it is a single kernel."""
-    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *request.size)
-    settings, appearance, offsets = request.settings, inputs.appearance, inputs.screen_offsets
-    near, antialias, with_depth = settings.near, settings.antialias, settings.depth
-    if request.sh_degree is None:
-        splats, order = project_and_pack(geometry, appearance, view, near, antialias, with_depth, offsets)
-        return splats, None, order
-    projection = project_fwd(geometry, view, near, antialias, offsets)
-    features = sh_fwd(inputs.means, appearance, inputs.viewmat, projection.radii, request.sh_degree)
-    rows, order = pack(projection, features, with_depth)
-    return PackedSplats(projection.radii, rows), features, order
-
-
 def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: Gradients) -> Gradients:
-    """composite → unproject: plays the tape in reverse."""
+    """composite → project (→ color): plays the tape in reverse."""
     num_saved = len(_Saved._fields)
     with back.lock:
         back.saved, back.layers, back.v = _Saved._make(saved[:num_saved]), saved[num_saved:], {"layers": v_layers}
@@ -257,9 +239,7 @@ def _backward(back: "_Backward", tape: Tape, saved: tuple[Any, ...], v_layers: G
 
 
 class _Backward:
-    """The backward pass of one render: the tape calls the methods from ``composite`` to ``unproject``, in this order.
-
-    Without spherical harmonics, ``unpack_and_unproject`` takes the place of those after ``composite``.
+    """The backward pass of one render: the tape calls ``composite``, ``project`` and, with harmonics, ``color``.
 
     Attributes:
         request: Of the render.
@@ -269,7 +249,7 @@ class _Backward:
         traversal: Of the forward pass.
         saved: What autograd saved; during the backward pass only, as all that follows.
         layers: The depths, which torch checks for changes, and the alphas if the background requires a gradient.
-        v: Gradients so far: of inputs by their names, and of all layers, ``rows`` and ``splats``.
+        v: Gradients so far: of inputs by their names, and of all layers and ``rows``.
     """
 
     traversal: Traversal
@@ -288,45 +268,25 @@ class _Backward:
             alphas = self.layers[-traversal.num_images :]
             v["background"] = background_bwd(saved.background, alphas, v["layers"][: traversal.num_images])
 
-    def unpack(self) -> None:
-        v = self.v
-        v["splats"] = unpack(self._rows(), v["rows"], self.request.size, self.with_offsets, self.imagegrad)
-        v["screen_offsets"] = v["splats"].screen_offsets
+    def project(self) -> None:
+        saved, v = self.saved, self.v
+        geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *self.request.size)
+        inputs = (geometry, view, self.request.settings.antialias, self._rows())
+        v_geometry, v["appearance"], v["viewmat"], v["K"], v["screen_offsets"] = project_bwd(
+            *inputs, v["rows"], self.with_offsets, self.imagegrad
+        )
+        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
 
     def color(self) -> None:
         saved, v, degree = self.saved, self.v, self.request.sh_degree
         assert degree is not None
-        inputs = (saved.means, saved.sh, saved.viewmat, saved.radii)
-        v["means"], v["appearance"], v["viewmat"] = sh_bwd(inputs, degree, saved.features, v["splats"].features)
-
-    def unproject(self) -> None:
-        saved, v, antialias = self.saved, self.v, self.request.settings.antialias
-        geometry, v_colors = Geometry(*saved[:4]), v["viewmat"]
-        v_geometry, v_viewmat, v["K"] = project_bwd(
-            geometry, self._view(), antialias, saved.radii, v["splats"][:4], v["means"]
-        )
-        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
-        v["viewmat"] = v_viewmat if v_viewmat is None or v_colors is None else v_colors + v_viewmat
-
-    def unpack_and_unproject(self) -> None:
-        saved, v = self.saved, self.v
-        v_geometry, v_camera, v["appearance"], v["screen_offsets"] = unpack_and_unproject(
-            Geometry(*saved[:4]),
-            self._view(),
-            self.request.settings.antialias,
-            PackedSplats(saved.radii, self._rows()),
-            v["rows"],
-            self.with_offsets,
-            self.imagegrad,
-        )
-        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
-        v["viewmat"], v["K"] = v_camera
+        inputs = (saved.means, saved.sh, saved.viewmat)
+        v["appearance"], v_viewmat = sh_bwd(inputs, degree, saved.features, v["appearance"], v["means"])
+        if v_viewmat is not None:
+            v["viewmat"] += v_viewmat
 
     def _rows(self) -> Rows:
         return Rows(self.saved.packed, self.request.num_features, self.request.settings.depth)
-
-    def _view(self) -> View:
-        return View(self.saved.viewmat, self.saved.K, *self.request.size)
 
 
 def _has_gradient(tensor: Tensor | None) -> TypeGuard[Tensor]:

@@ -75,9 +75,8 @@ def test_the_profile_is_a_trace_of_forward_and_backward_kernels(tmp_path):
     bench(dataclasses.replace(OPTIONS, profile=path), [TINY], "cpu")
     events = json.loads(path.read_text())["traceEvents"]
     kernels = [event for event in events if event["ph"] == "X"]
-    assert {"project_and_pack", "sort_pairs", "composite_fwd", "composite_bwd", "unpack_and_unproject"} <= {
-        k["name"] for k in kernels
-    }
+    names = {kernel["name"] for kernel in kernels}
+    assert names >= {"project_fwd", "sort_pairs", "composite_fwd", "composite_bwd", "project_bwd"}
     assert all(k["dur"] > 0 and k["ts"] >= 0 for k in kernels)
 
 

@@ -4,12 +4,11 @@ import warnings
 
 import pytest
 
-from tests.ops.alone import project, spherical_harmonics
+from tests.ops.alone import pack, project, spherical_harmonics
 from tests.reference.covariance import covariance
 from tests.scenes import error, make_camera, make_splats, relative_error
 from warpgs.ops import tiles
 from warpgs.ops.projection import Geometry, View
-from warpgs.ops.rows import pack
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of gsplat itself, on import

@@ -4,17 +4,19 @@ import pytest
 import torch
 
 from tests.ops.alone import project
+from tests.reference import rows as rows_reference
 from tests.reference.projection import project as reference
-from tests.scenes import GEOMETRY, make_camera, make_splats, random_like, relative_error, weighted_sum
-from warpgs.ops.projection import Geometry, View
+from tests.scenes import GEOMETRY, generator, make_camera, make_splats, relative_error, weighted_sum
+from warpgs.kernels.rows import gradient_stride
+from warpgs.ops.projection import Geometry, View, project_bwd, project_fwd
 
 CAMERA = make_camera()
 NUM = 150
 
 
-def inputs(requires_grad: bool = False):
+def inputs():
     splats = make_splats(NUM)
-    return [getattr(splats, name).clone().requires_grad_(requires_grad) for name in GEOMETRY]
+    return [getattr(splats, name) for name in GEOMETRY]
 
 
 def project_here(*tensors, near=0.01, antialias=False):
@@ -38,52 +40,64 @@ def test_values_equal_the_reference(antialias, near):
         assert relative_error(actual[visible], expected[visible]) < 1e-6
 
 
+OUTPUTS = {"means2d": slice(3, 5), "conics": slice(5, 8), "depths": slice(1, 2), "opacities": slice(2, 3)}
+"""The columns of gradient rows of one feature and depth that make up the gradient of each output."""
+
+
+def random_gradient_rows(num: int, *outputs: str) -> torch.Tensor:
+    """[1, N, stride] rows with random gradients of some outputs."""
+    rows, v_rows = torch.randn(1, num, gradient_stride(2), generator=generator()), torch.zeros(1, num, 12)
+    for name in outputs or OUTPUTS:
+        v_rows[..., OUTPUTS[name]] = rows[..., OUTPUTS[name]]
+    return v_rows
+
+
+def assert_same_gradients(tensors, camera, v_rows, antialias, of_camera=False):
+    """Compares the backward pass with that of the reference in double precision; returns what is visible."""
+    view = View(*(t.clone().requires_grad_(of_camera) for t in (camera.viewmat, camera.K)), *camera.size)
+    features = torch.zeros(len(tensors[0]), 1)
+    rows, *_ = project_fwd(Geometry(*tensors), features, view, 0.01, antialias, with_depth=True)
+    v = project_bwd(Geometry(*tensors), view, antialias, rows, v_rows)
+
+    doubles = [t.double().requires_grad_() for t in (*tensors, camera.viewmat, camera.K)]
+    *values, visible = reference(Geometry(*doubles[:4]), View(*doubles[4:], *camera.size), antialias=antialias)
+    v_means2d, v_conics, v_opacities = rows_reference.splat_gradients(values[1], values[3], v_rows[0, :, 2:].double())
+    v_values = [t[visible].detach() for t in (v_means2d, v_conics, v_rows[0, :, 1].double(), v_opacities)]
+    weighted_sum((value[visible] for value in values), v_values).backward()
+    pairs = [*zip(v.geometry, doubles, strict=False)]
+    pairs += [*zip((v.viewmat, v.K), doubles[4:], strict=True)] if of_camera else []
+    for actual, double in pairs:
+        assert (actual - double.grad).norm() <= 1e-5 * double.grad.norm()
+    return visible
+
+
 @pytest.mark.parametrize("antialias", [False, True])
-@pytest.mark.parametrize("output", range(4))
+@pytest.mark.parametrize("output", OUTPUTS)
 def test_the_gradient_of_each_output_equals_the_reference(output, antialias):
-    ours, theirs = inputs(True), [t.double().requires_grad_() for t in inputs()]
-    splats = project_here(*ours, antialias=antialias)
-    *values, visible = reference_here(*theirs, antialias=antialias)
-    (v_output,) = random_like([splats[output]])
-    weighted_sum([splats[output]], [v_output]).backward()
-    weighted_sum([values[output][visible]], [v_output[visible]]).backward()
-    for actual, expected in zip(ours, theirs, strict=True):
-        wanted = torch.zeros_like(expected) if expected.grad is None else expected.grad
-        assert (actual.grad - wanted).norm() <= 1e-5 * wanted.norm()
+    visible = assert_same_gradients(inputs(), CAMERA, random_gradient_rows(NUM, output), antialias)
+    assert 10 < visible.sum() < NUM
+
+
+def far_out_inputs():
+    """Gaussians beyond the margins of the image, where slopes are clamped."""
+    means = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])
+    return means, torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
 
 
 def test_slopes_outside_the_margin_use_the_clamped_jacobian():
-    means = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])
-    rest = torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
-    ours = [t.clone().requires_grad_() for t in (means, *rest)]
-    theirs = [t.double().requires_grad_() for t in (means, *rest)]
-    splats = project_here(*ours)
-    *values, visible = reference_here(*theirs)
+    tensors = far_out_inputs()
+    splats = project_here(*tensors)
+    *values, visible = reference_here(*(t.double() for t in tensors))
     assert visible.all()
-    v_outputs = random_like(splats[:4])
-    weighted_sum(splats[:4], v_outputs).backward()
-    weighted_sum(values, v_outputs).backward()
     assert relative_error(splats.conics, values[1]) < 2e-6
-    for actual, expected in zip(ours, theirs, strict=True):
-        assert relative_error(actual.grad, expected.grad) < 1e-5
+    assert_same_gradients(tensors, CAMERA, random_gradient_rows(4), antialias=False)
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_of_the_camera_equal_the_reference(antialias):
-    far_out = torch.tensor([[-3.0, 0.1, 2.0], [3.0, 0.3, 2.0], [0.1, -3.0, 2.0], [0.2, 3.0, 2.0]])  # clamped slopes
-    rest = torch.randn(4, 4), torch.full((4, 3), 1.5) * torch.rand(4, 3), torch.full((4,), 0.9)
-    geometry = [torch.cat(pair) for pair in zip(inputs(), (far_out, *rest), strict=True)]
-    ours = [t.clone().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
-    theirs = [t.double().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
-    splats = project(Geometry(*geometry), View(*ours, *CAMERA.size), antialias=antialias)[:4]
-    doubles = Geometry(*(t.double() for t in geometry))
-    *values, visible = reference(doubles, View(*theirs, *CAMERA.size), antialias=antialias)
+    geometry = [torch.cat(pair) for pair in zip(inputs(), far_out_inputs(), strict=True)]
+    visible = assert_same_gradients(geometry, CAMERA, random_gradient_rows(NUM + 4), antialias, of_camera=True)
     assert visible[-4:].all()
-    v_outputs = random_like(splats)
-    weighted_sum(splats, v_outputs).backward()
-    weighted_sum((v[visible] for v in values), (c[visible] for c in v_outputs)).backward()
-    for actual, expected in zip(ours, theirs, strict=True):
-        assert relative_error(actual.grad, expected.grad) < 1e-5
 
 
 def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05, antialias=False):
@@ -152,8 +166,10 @@ def test_antialiasing_only_lowers_opacities():
 
 @pytest.mark.parametrize("num", [0, 1])
 def test_few_gaussians_are_enough(num):
-    splats = make_splats(num)
-    tensors = [getattr(splats, name).requires_grad_() for name in GEOMETRY]
-    camera = [t.clone().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)]
-    project(Geometry(*tensors), View(*camera, *CAMERA.size)).means2d.sum().backward()
-    assert all(t.grad.shape == t.shape for t in (*tensors, *camera))
+    geometry = Geometry(*(t[:num].contiguous() for t in inputs()))
+    view = View(*(t.clone().requires_grad_() for t in (CAMERA.viewmat, CAMERA.K)), *CAMERA.size)
+    rows, *_ = project_fwd(geometry, torch.rand(num, 1), view, 0.01, False, with_depth=True)
+    v = project_bwd(geometry, view, False, rows, random_gradient_rows(num))
+    for gradient, tensor in zip((*v.geometry, v.viewmat, v.K), (*geometry, *view[:2]), strict=True):
+        assert gradient.shape == tensor.shape
+        assert gradient.isfinite().all()

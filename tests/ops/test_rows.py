@@ -1,18 +1,19 @@
-"""Splat rows: packing and its backward pass."""
+"""Splat rows: packing and its backward pass, as parts of the projection."""
 
 import pytest
 import torch
 
 from tests.ops.alone import project
 from tests.reference import rows as reference
+from tests.reference.projection import project as reference_projection
 from tests.scenes import GEOMETRY, HEIGHT, WIDTH, error, generator, make_camera, make_splats, relative_error
 from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.kernels.rows import NUM_MOMENTS, gradient_stride
-from warpgs.ops.projection import Geometry, Projection, View, project_bwd, project_fwd
-from warpgs.ops.rows import pack, project_and_pack, unpack, unpack_and_unproject
+from warpgs.ops.projection import Geometry, View, project_bwd, project_fwd
 
 NUM = 150
 SIZE = (WIDTH, HEIGHT)
+CHANNELS = 5
 
 
 def geometry_and_view(num=NUM) -> tuple[Geometry, View]:
@@ -20,30 +21,37 @@ def geometry_and_view(num=NUM) -> tuple[Geometry, View]:
     return Geometry(*(getattr(splats, name) for name in GEOMETRY)), View(camera.viewmat, camera.K, *SIZE)
 
 
-def projected(num=NUM) -> Projection:
-    return project(*geometry_and_view(num))
-
-
-def random_features(num=NUM, channels=5) -> torch.Tensor:
+def random_features(num=NUM, channels=CHANNELS) -> torch.Tensor:
     return torch.rand(num, channels, generator=generator())
+
+
+def pack(features, with_depth=False, geometry=None):
+    own, view = geometry_and_view(len(features))
+    return project_fwd(geometry or own, features, view, 0.01, False, with_depth)
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 4, 5])
 def test_rows_of_visible_splats_equal_the_reference(channels, with_depth):
-    splats, features = projected(), random_features(channels=channels)
-    visible = splats.radii[:, 0] > 0
+    geometry, view = geometry_and_view()
+    features = random_features(channels=channels)
+    doubles = Geometry(*(t.double() for t in geometry)), View(view.viewmat.double(), view.K.double(), *SIZE)
+    means2d, conics, depths, opacities, visible = reference_projection(*doubles)
     assert 10 < visible.sum() < NUM
-    rows, _ = pack(splats, features, with_depth)
-    packed = torch.cat([features, splats.depths[:, None]], 1) if with_depth else features
-    doubles = [t[visible].double() for t in (splats.means2d, splats.conics, splats.opacities, packed)]
-    assert relative_error(rows.packed[visible].flatten(1), reference.pack(*doubles)) < 1e-6
+    rows, radii, _ = pack(features, with_depth)
+    assert torch.equal(radii.gt(0).all(1), visible)
+    channels = torch.cat([features, depths[:, None]], 1) if with_depth else features
+    expected = reference.pack(means2d, conics, opacities, channels)[visible]
+    packed = rows.packed[visible].flatten(1)
+    for columns in (slice(2), slice(2, 5), slice(5, 6), slice(8, None)):
+        assert relative_error(packed[:, columns], expected[:, columns]) < 1e-6
+    assert not packed[:, 6:8].any()
 
 
 def test_culled_splats_are_marked_and_sorted_last():
-    splats = projected()
+    splats = project(*geometry_and_view())
     visible = splats.radii[:, 0] > 0
-    rows, order = pack(splats, random_features(), False)
+    rows, _, order = pack(random_features())
     assert torch.equal(rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY, ~visible)
     assert (order.keys[:NUM][~visible] == CULLED_DEPTH).all()
     depths = torch.where(visible, splats.depths, torch.inf)
@@ -52,101 +60,90 @@ def test_culled_splats_are_marked_and_sorted_last():
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_splat_with_a_feature_that_is_not_finite_is_marked_as_culled(value):
-    splats, features = projected(), random_features()
+def test_a_splat_with_a_feature_that_is_not_finite_is_culled(value):
+    features = random_features()
+    radii_before = pack(features)[1]
     features[::3, 2] = value
-    rows, order = pack(splats, features, False)
+    rows, radii, order = pack(features)
     culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
     assert culled[::3].all()
     assert (order.keys[:NUM][::3] == CULLED_DEPTH).all()
-    assert torch.equal(culled[1::3], projected().radii[1::3, 0] == 0)
-    assert torch.equal(culled, splats.radii[:, 0] == 0)
-    assert torch.equal(culled, splats.radii[:, 1] == 0)
+    assert torch.equal(culled[1::3], radii_before[1::3, 0] == 0)
+    assert torch.equal(culled, radii[:, 0] == 0)
+    assert torch.equal(culled, radii[:, 1] == 0)
 
 
-def test_radii_of_splats_with_a_singular_conic_become_zero():
-    splats = projected()
-    splats.conics[::3] = 1.0
-    rows, _ = pack(splats, random_features(), False)
-    culled = rows.packed[:, 1, 1] == CULLED_LOG2_OPACITY
-    assert culled[::3].all()
-    assert torch.equal(culled, splats.radii[:, 0] == 0)
+@pytest.mark.parametrize(("length", "is_culled"), [(10.0, False), (3000.0, True)])
+def test_a_splat_whose_conic_is_singular_in_single_precision_is_culled(length, is_culled):
+    diagonal = torch.tensor([[1.0, 0.0, 0.0, 0.4142]])  # turned by 45° around z
+    needle = torch.tensor([[length, 1e-3, 1e-3]])
+    geometry = Geometry(torch.tensor([[0.0, 0.0, 3.0]]), diagonal, needle, torch.tensor([0.9]))
+    view = View(torch.eye(4), geometry_and_view()[1].K, *SIZE)
+    rows, radii, order = project_fwd(geometry, torch.rand(1, 3), view, 0.01, False, False)
+    assert (rows.packed[0, 1, 1] == CULLED_LOG2_OPACITY) == is_culled
+    assert radii.eq(0).all() == is_culled
+    assert (order.keys[0] == CULLED_DEPTH) == is_culled
 
 
-@pytest.mark.parametrize("with_depth", [False, True])
-def test_projecting_and_packing_at_once_gives_the_same_bits(with_depth):
-    geometry, view = geometry_and_view()
-    features, offsets = random_features(), 0.1 * random_features(channels=2)
-    features[::7, 1] = torch.nan
-    projection = project_fwd(geometry, view, 0.01, True, offsets)
-    rows, order = pack(projection, features, with_depth)
-    splats, own_order = project_and_pack(geometry, features, view, 0.01, True, with_depth, offsets)
-    expected = (projection.radii, rows.packed, *order[:2])
-    for result, tensor in zip((splats.radii, splats.rows.packed, *own_order[:2]), expected, strict=True):
-        assert torch.equal(result.view(torch.int32)[:NUM], tensor.view(torch.int32)[:NUM])
-
-
-@pytest.mark.parametrize("imagegrad", [False, True])
-@pytest.mark.parametrize("with_depth", [False, True])
-def test_unpacking_and_unprojecting_at_once_gives_the_same_bits(with_depth, imagegrad):
-    geometry, view = geometry_and_view()
-    view.viewmat.requires_grad_()
-    packed, _ = project_and_pack(geometry, random_features(), view, 0.01, True, with_depth)
-    v_rows = torch.randn(2, NUM, gradient_stride(packed.rows.num_channels), generator=generator())
-    v_splats = unpack(packed.rows, v_rows, SIZE, True, imagegrad)
-    v_geometry, *v_camera = project_bwd(geometry, view, True, packed.radii, v_splats[:4])
-    result = unpack_and_unproject(geometry, view, True, packed, v_rows, True, imagegrad)
-    expected = (*v_geometry, *v_camera, v_splats.features, v_splats.screen_offsets)
-    for value, tensor in zip((*result[0], *result[1], *result[2:]), expected, strict=True):
-        assert torch.equal(value, tensor)
-
-
-def random_gradient_rows(splats: Projection, pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int):
-    """[1, N, stride] random gradients of features, and the moments of s = alpha v_alpha."""
+def random_gradient_rows(pixels: torch.Tensor, v_alpha: torch.Tensor, channels: int) -> torch.Tensor:
+    """[1, N, stride] random gradients of channels, and the moments of s = alpha v_alpha."""
+    splats = project(*geometry_and_view())
     means2d, conics, opacities = (t.double() for t in (splats.means2d, splats.conics, splats.opacities))
     s = reference.log_alpha(means2d, conics, opacities, pixels).exp() * v_alpha
-    rows = torch.zeros(1, len(means2d), gradient_stride(channels))
-    rows[0, :, :channels] = torch.randn(len(means2d), channels, generator=generator(5))
+    rows = torch.randn(1, len(means2d), gradient_stride(channels), generator=generator(5))
     rows[0, :, channels : channels + NUM_MOMENTS] = reference.moments(means2d, pixels, s)
     return rows
 
 
 @pytest.mark.parametrize("with_depth", [False, True])
 def test_gradients_equal_the_reference(with_depth):
-    splats, features = projected(), random_features()
-    visible = splats.radii[:, 0] > 0
+    geometry, view = geometry_and_view()
     pixels = torch.rand(40, 2, generator=generator(1)).double() * torch.tensor(SIZE)
     v_alpha = torch.randn(NUM, 40, generator=generator(2)).double()
-    rows, _ = pack(splats, features, with_depth)
-    gradient_rows = random_gradient_rows(splats, pixels, v_alpha, rows.num_channels)
-    v_splats = unpack(rows, gradient_rows, SIZE, with_offsets=True)
+    rows, radii, _ = pack(random_features(), with_depth)
+    v_rows = random_gradient_rows(pixels, v_alpha, rows.num_channels)
+    v = project_bwd(geometry, view, False, rows, v_rows, with_offsets=True)
 
-    leaves = [t[visible].double().requires_grad_() for t in (splats.means2d, splats.conics, splats.opacities)]
-    (reference.log_alpha(*leaves, pixels).exp() * v_alpha[visible]).sum().backward()
-    for gradient, leaf in zip((v_splats.means2d, v_splats.conics, v_splats.opacities), leaves, strict=True):
-        assert relative_error(gradient[visible], leaf.grad) < 1e-5
+    leaves = [t.double().requires_grad_() for t in geometry]
+    doubles = View(view.viewmat.double(), view.K.double(), *SIZE)
+    means2d, conics, depths, opacities, visible = reference_projection(Geometry(*leaves), doubles)
+    assert torch.equal(visible, radii[:, 0] > 0)
+    means2d.retain_grad()
+    inner = reference.log_alpha(*(t[visible] for t in (means2d, conics, opacities)), pixels).exp() * v_alpha[visible]
+    depth_term = (depths * v_rows[0, :, CHANNELS])[visible].sum() if with_depth else 0.0
+    (inner.sum() + depth_term).backward()
+    for gradient, leaf in zip(v.geometry, leaves, strict=True):
+        assert relative_error(gradient[visible], leaf.grad[visible]) < 1e-5
         assert not gradient[~visible].any()
-    assert error(v_splats.features, gradient_rows[0, :, : features.shape[1]]) == 0
-    assert (v_splats.depths is not None) == with_depth
-    if with_depth:
-        assert error(v_splats.depths, gradient_rows[0, :, rows.num_channels - 1]) == 0
-    assert relative_error(v_splats.screen_offsets[visible], leaves[0].grad * torch.tensor(SIZE) / 2) < 1e-5
-    assert not v_splats.screen_offsets[~visible].any()
+    assert error(v.features, v_rows[0, :, :CHANNELS]) == 0
+    assert relative_error(v.screen_offsets[visible], means2d.grad[visible] * torch.tensor(SIZE) / 2) < 1e-5
+    assert not v.screen_offsets[~visible].any()
+    assert v.viewmat is v.K is None
+
+
+def test_offsets_on_screen_get_the_gradient_of_the_images_alone_on_request():
+    geometry, view = geometry_and_view()
+    rows, radii, _ = pack(random_features())
+    v_rows = torch.randn(1, NUM, gradient_stride(CHANNELS), generator=generator())
+    v = project_bwd(geometry, view, False, rows, v_rows, with_offsets=True, imagegrad=True)
+    expected = -v_rows[0, :, CHANNELS + NUM_MOMENTS :][:, :2] * torch.tensor(SIZE) / 2
+    assert relative_error(v.screen_offsets, torch.where(radii > 0, expected, 0.0)) < 1e-6
 
 
 def test_gradients_are_summed_over_shards():
-    splats, features = projected(), random_features()
-    rows, _ = pack(splats, features, False)
-    shards = torch.rand(3, NUM, gradient_stride(5), generator=generator())
-    v_splats = unpack(rows, shards, SIZE)
-    assert error(v_splats.features, shards[:, :, :5].sum(0)) < 1e-6
-    assert v_splats.screen_offsets is None
+    geometry, view = geometry_and_view()
+    rows, *_ = pack(random_features())
+    shards = torch.rand(3, NUM, gradient_stride(CHANNELS), generator=generator())
+    v, v_sum = (project_bwd(geometry, view, False, rows, t) for t in (shards, shards.sum(0, keepdim=True)))
+    for value, expected in zip((*v.geometry, v.features), (*v_sum.geometry, v_sum.features), strict=True):
+        assert relative_error(value, expected) < 1e-6
+    assert v.screen_offsets is None
 
 
 @pytest.mark.parametrize("num", [0, 1])
 def test_few_gaussians_are_enough(num):
-    splats, features = projected(num), random_features(num)
-    rows, _ = pack(splats, features, False)
-    v_splats = unpack(rows, torch.zeros(1, num, gradient_stride(5)), SIZE)
+    rows, radii, _ = pack(random_features(num))
+    v = project_bwd(*geometry_and_view(num), False, rows, torch.zeros(1, num, gradient_stride(CHANNELS)))
     assert rows.packed.shape == (num, 4, 4)
-    assert v_splats.features.shape == (num, 5)
+    assert radii.shape == (num, 2)
+    assert v.features.shape == (num, CHANNELS)

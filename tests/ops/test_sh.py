@@ -6,6 +6,7 @@ import torch
 from tests.ops.alone import spherical_harmonics
 from tests.reference.sh import spherical_harmonics as reference
 from tests.scenes import assert_same_gradients, error, make_camera, make_splats, random_like, relative_error
+from warpgs.ops.sh import sh_bwd, sh_fwd
 
 VIEW = make_camera().viewmat
 
@@ -52,15 +53,29 @@ def test_a_lower_degree_ignores_the_higher_bases(degree):
     assert not sh.grad[:, bases:].any()
 
 
-def test_culled_gaussians_stay_black_and_get_no_gradient():
-    means, sh = (t.clone().requires_grad_() for t in inputs())
-    radii = torch.ones(60, 2, dtype=torch.int32)
-    radii[::2] = 0
-    colors = spherical_harmonics(means, sh, VIEW, radii=radii)
-    colors.sum().backward()
-    for value in (colors, means.grad, sh.grad):
-        assert not value[::2].any()
-        assert value[1::2].any()
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_gaussians_without_a_gradient_may_have_values_that_are_not_finite(value):
+    means, sh = (t.clone() for t in inputs())
+    means[::4, 1], sh[2::4, 0, 2] = value, value
+    means.requires_grad_(), sh.requires_grad_()
+    view = VIEW.clone().requires_grad_()
+    colors = spherical_harmonics(means, sh, view)
+    assert colors[2::4].isnan().all()
+    (colors[1::2] @ torch.ones(3)).sum().backward()
+    for gradient in (means.grad, sh.grad):
+        assert not gradient[::2].any()
+        assert gradient[1::2].any()
+    assert view.grad.isfinite().all()
+
+
+def test_the_gradient_of_the_means_is_added_to_that_of_the_rest():
+    means, sh = inputs()
+    colors, v_means, rest = sh_fwd(means, sh, VIEW, 3), torch.zeros_like(means), torch.rand_like(means)
+    sh_bwd((means, sh, VIEW), 3, colors, torch.ones_like(colors), v_means)
+    both = rest.clone()
+    sh_bwd((means, sh, VIEW), 3, colors, torch.ones_like(colors), both)
+    assert v_means.any()
+    assert torch.equal(both, rest + v_means)
 
 
 def test_a_gaussian_at_the_viewpoint_has_finite_colour_and_gradients():

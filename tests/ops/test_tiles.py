@@ -3,14 +3,13 @@
 import pytest
 import torch
 
-from tests.ops.alone import composite, project
+from tests.ops.alone import Projection, composite, pack, project
 from tests.reference.tiles import ALPHA_MIN, max_alphas
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
 from warpgs.kernels import tiles as kernels
 from warpgs.kernels.sort import MAX_PAIRS
 from warpgs.ops import tiles
-from warpgs.ops.projection import Geometry, Projection, View
-from warpgs.ops.rows import pack
+from warpgs.ops.projection import Geometry, View
 from warpgs.rendering import render
 
 NUM = 120

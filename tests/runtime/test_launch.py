@@ -7,17 +7,25 @@ import torch
 
 from tests.scenes import as_leaves, generator, gradients, make_camera, make_splats
 from warpgs.kernels.mlp import relu_bwd
-from warpgs.kernels.projection import project_fwd
+from warpgs.kernels.projection import make_project_fwd
+from warpgs.ops.rows import new_order, new_rows
 from warpgs.rendering import render
 from warpgs.runtime import launch as launching
 from warpgs.runtime.profiling import profile
 
 
+def project(means, quats, scales, opacities, near, offsets) -> torch.Tensor:
+    """[N, 4] means on screen and radii."""
+    camera, features, radii = make_camera(), torch.zeros(len(means), 3), torch.zeros(len(means), 2, dtype=torch.int32)
+    inputs = (means, quats, scales, opacities, camera.viewmat, camera.K, *camera.size, near, 0, offsets, features)
+    rows = new_rows(features, with_depth=False)
+    kernel = make_project_fwd(rows.num_features, rows.with_depth)
+    launching.launch(kernel, len(means), *inputs, radii, rows.packed, *new_order(radii))
+    return torch.cat([rows.packed[:, 0, :2], radii], 1)
+
+
 def launch(quats, scales):
-    camera, opacities, radii = make_camera(), torch.ones(7), torch.zeros(7, 2, dtype=torch.int32)
-    inputs = (torch.zeros(7, 3), quats, scales, opacities, camera.viewmat, camera.K, *camera.size, 0.01, 0, None)
-    outputs = (torch.zeros(7, 2), torch.zeros(7, 3), torch.zeros(7), torch.zeros(7), radii)
-    launching.launch(project_fwd, 7, *inputs, *outputs)
+    project(torch.zeros(7, 3), quats, scales, torch.ones(7), 0.01, None)
 
 
 @pytest.mark.parametrize(
@@ -58,12 +66,8 @@ def test_leading_axes_of_a_kernel_argument_are_flattened():
 
 
 def projected_radii(num: int, near: float, offsets: torch.Tensor | None) -> torch.Tensor:
-    splats, camera = make_splats(num), make_camera()
-    inputs = (splats.means, splats.quats, splats.scales, splats.opacities, camera.viewmat, camera.K, *camera.size)
-    means2d, radii = torch.zeros(num, 2), torch.zeros(num, 2, dtype=torch.int32)
-    outputs = (means2d, torch.zeros(num, 3), torch.zeros(num), torch.zeros(num), radii)
-    launching.launch(project_fwd, num, *inputs, near, 0, offsets, *outputs)
-    return torch.cat([means2d, radii], 1)
+    splats = make_splats(num)
+    return project(splats.means, splats.quats, splats.scales, splats.opacities, near, offsets)
 
 
 def test_numbers_shapes_and_missing_arrays_may_change_from_launch_to_launch():
@@ -128,8 +132,8 @@ def test_a_profile_lists_the_kernels_of_forward_and_backward():
     with profile() as taken:
         image_and_gradients(0)
     times = taken.times()
-    forward = "project_fwd sh_fwd pack sort_pairs count_tiles emit_isects sort_pairs tile_ranges composite_fwd"
-    assert [t.name for t in times] == f"{forward} composite_bwd unpack sh_bwd project_bwd".split()
+    forward = "sh_fwd project_fwd sort_pairs count_tiles emit_isects sort_pairs tile_ranges composite_fwd"
+    assert [t.name for t in times] == f"{forward} composite_bwd project_bwd sh_bwd".split()
     assert all(t.duration_ms > 0 for t in times)
     assert [t.start_ms for t in times] == sorted(t.start_ms for t in times)
 

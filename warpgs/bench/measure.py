@@ -13,7 +13,6 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.ops.projection import Geometry, View, project_fwd
-from warpgs.ops.rows import pack
 from warpgs.ops.ssim import ssim
 from warpgs.ops.tiles import bin_splats
 from warpgs.runtime.graphs import capture
@@ -32,12 +31,12 @@ VISIBLE_DIFFERENCE = 1e-3
 """A pixel that differs by more than this in any channel counts as visibly different."""
 
 STAGES = {
-    "project": ("project_and_pack", "project_fwd", "sh_fwd", "pack"),
+    "project": ("sh_fwd", "project_fwd"),
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
     "composite_bwd": ("composite_bwd",),
-    "unproject": ("unpack_and_unproject", "unpack", "sh_bwd", "project_bwd"),
+    "unproject": ("project_bwd", "sh_bwd"),
     "ssim": ("ssim_fwd", "ssim_bwd"),
 }
 """Kernels of each stage of a render."""
@@ -145,9 +144,9 @@ def count_intersections(splats: Splats, camera: Camera, settings: RenderSettings
     """Number of pairs of a Gaussian and a tile that it intersects."""
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     view = View(camera.viewmat, camera.K, *camera.size)
-    projection = project_fwd(geometry, view, settings.near, settings.antialias)
     features = splats.means  # any will do
-    begins, ends = bin_splats(*pack(projection, features, with_depth=False), camera.size).ranges.unbind(-1)
+    rows, _, order = project_fwd(geometry, features, view, settings.near, settings.antialias, with_depth=False)
+    begins, ends = bin_splats(rows, order, camera.size).ranges.unbind(-1)
     return int((ends - begins).sum())
 
 

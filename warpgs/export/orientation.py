@@ -92,8 +92,7 @@ def _bases(directions: np.ndarray, degree: int) -> Float64[np.ndarray, "D K"]:
     sh = torch.zeros(end - first, len(directions), end, 3)
     sh[torch.arange(end - first), :, torch.arange(first, end)] = 0.25
     means = torch.from_numpy(directions).float().expand(end - first, -1, -1).reshape(-1, 3)
-    radii = torch.ones(len(means), 2, dtype=torch.int32)
-    colors = sh_fwd(means.contiguous(), sh.reshape(-1, end, 3), torch.eye(4), radii, degree)[:, 0]
+    colors = sh_fwd(means.contiguous(), sh.reshape(-1, end, 3), torch.eye(4), degree)[:, 0]
     return ((colors.double() - 0.5) * 4).reshape(end - first, -1).T.numpy()
 
 

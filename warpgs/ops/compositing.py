@@ -173,7 +173,7 @@ def composite_bwd(
     v_layers: Gradients,
     imagegrad: bool = False,
 ) -> Tensor:
-    """Sums for ``unpack``, [shards, N, gradient_stride].
+    """Sums for ``project_bwd``, [shards, N, gradient_stride].
 
     Args:
         rows, background: As in ``composite_fwd``.

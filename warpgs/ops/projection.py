@@ -1,14 +1,15 @@
-"""EWA projection of Gaussians to splats (kernels/projection.py)."""
+"""EWA projection of Gaussians to rows of splats (kernels/projection.py)."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float
 from torch import Tensor, int32
 
 from warpgs.kernels import projection as kernels
 from warpgs.runtime.launch import launch
+
+from .rows import DepthOrder, Rows, new_order, new_rows
 
 
 class Geometry(NamedTuple):
@@ -42,95 +43,82 @@ class View(NamedTuple):
     height: int
 
 
-class Projection(NamedTuple):
-    """N Gaussians as a camera sees them; all values of a culled Gaussian are zero.
+class SplatGradients(NamedTuple):
+    """Gradients of the inputs of ``project_fwd``; None if an input requires none."""
 
-    Attributes:
-        means2d: [N, 2] centres [px], x right, y down, pixel centres at +0.5.
-        conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] z in camera space [scene units].
-        opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
-        radii: [N, 2] int32 half sizes of the box outside which alpha is below 1/255 [px]; 0 = culled.
-    """
-
-    means2d: Float[Tensor, "N 2"]
-    conics: Float[Tensor, "N 3"]
-    depths: Float[Tensor, " N"]
-    opacities: Float[Tensor, " N"]
-    radii: Int32[Tensor, "N 2"]
+    geometry: Geometry
+    features: Tensor
+    viewmat: Tensor | None
+    K: Tensor | None
+    screen_offsets: Tensor | None
 
 
 def project_fwd(
-    geometry: Geometry, view: View, near: float, antialias: bool, screen_offsets: Tensor | None = None
-) -> Projection:
-    """Projects Gaussians into a pinhole camera.
+    geometry: Geometry,
+    features: Tensor,
+    view: View,
+    near: float,
+    antialias: bool,
+    with_depth: bool,
+    screen_offsets: Tensor | None = None,
+) -> tuple[Rows, Tensor, DepthOrder]:
+    """Projects Gaussians into a pinhole camera and packs the splats.
 
     Gaussians that are at the near plane or behind it, 1e10 or more from the camera, outside the image, fainter than
-    1/255 or that have an opacity above 1 or a value that is not finite are culled.
+    1/255 or that have an opacity above 1, a value that is not finite, or a conic that is singular in single precision
+    are culled.
 
     Args:
         geometry: N Gaussians.
+        features: [N, num_features] colours or other values to composite.
         view: The camera.
         near: Depth of the near plane [scene units].
         antialias: Scales opacities by sqrt(|Σ'| / |Σ' + 0.3 I|), so that thin Gaussians do not swell (Mip-Splatting).
+        with_depth: Whether depth in camera space becomes one more channel.
         screen_offsets: [N, 2] added to the means on screen, in halves of the image size.
+
+    Returns:
+        The rows; [N, 2] int32 half sizes of the box outside which alpha is below 1/255 [px], 0 = culled; and the input
+        of binning.
     """
-    means = geometry.means
-    N = means.shape[0]
-    splats = Projection(
-        means2d=means.new_empty(N, 2),
-        conics=means.new_empty(N, 3),
-        depths=means.new_empty(N),
-        opacities=means.new_empty(N),
-        radii=means.new_empty(N, 2, dtype=int32),
-    )
-    launch(kernels.project_fwd, N, *geometry, *view, near, int(antialias), screen_offsets, *splats)
-    return splats
+    rows, radii = new_rows(features, with_depth), features.new_empty(features.shape[0], 2, dtype=int32)
+    order, kernel = new_order(radii), kernels.make_project_fwd(rows.num_features, with_depth)
+    inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
+    launch(kernel, features.shape[0], *inputs, radii, rows.packed, *order)
+    return rows, radii, order
 
 
 def project_bwd(
     geometry: Geometry,
     view: View,
     antialias: bool,
-    radii: Tensor,
-    v_splats: Sequence[Tensor | None],
-    v_means_of_colors: Tensor | None = None,
-) -> tuple[Geometry, Tensor | None, Tensor | None]:
-    """Gradients of the geometry, and of ``viewmat`` and ``K`` if one of them requires a gradient.
+    rows: Rows,
+    v_rows: Tensor,
+    with_offsets: bool = False,
+    imagegrad: bool = False,
+) -> SplatGradients:
+    """The backward pass of ``project_fwd``.
 
     Args:
         geometry, view, antialias: As in ``project_fwd``.
-        radii: Of its result.
-        v_splats: Gradients of means2d, conics, depths and opacities of its result; None for zeros.
-        v_means_of_colors: [N, 3] gradient of the means through the colours, to be added; overwritten.
+        rows: Its first result.
+        v_rows: [shards, N, gradient_stride] sums from ``composite_bwd``.
+        with_offsets: Whether to return the gradient of ``screen_offsets``.
+        imagegrad: As in ``composite_bwd``.
     """
-    N = geometry.means.shape[0]
-    v_geometry = new_geometry(geometry)
-    if v_means_of_colors is not None:
-        v_geometry = v_geometry._replace(means=v_means_of_colors)
-    v_cameras = new_camera_gradients(view, N)
-    inputs = (*geometry, *view, int(antialias), radii)
-    launch(kernels.project_bwd, N, *inputs, *v_splats, *v_geometry, v_cameras, v_means_of_colors)
-    return v_geometry, *sum_camera_gradients(view, v_cameras)
+    new, N = geometry.means.new_empty, geometry.means.shape[0]
+    v_geometry = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))  # torch.empty_like takes the host longer
+    v_features, v_offsets = new(N, rows.num_features), new(N, 2) if with_offsets else None
+    v_cameras = new(N, kernels.CAMERA_GRADIENTS) if view.viewmat.requires_grad or view.K.requires_grad else None
+    inputs = (*geometry, *view, int(antialias), rows.packed, v_rows, int(imagegrad))
+    kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth)
+    launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras)
+    v_viewmat, v_K = (None, None) if v_cameras is None else _sum_over_gaussians(view, v_cameras)
+    return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets)
 
 
-def new_geometry(geometry: Geometry) -> Geometry:
-    """Memory of the same shapes; ``torch.empty_like`` takes the host longer."""
-    N, new = geometry.means.shape[0], geometry.means.new_empty
-    return Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))
-
-
-def new_camera_gradients(view: View, num_gaussians: int) -> Tensor | None:
-    """Memory for what each Gaussian contributes to the gradient of the camera; None if the camera requires none."""
-    if view.viewmat.requires_grad or view.K.requires_grad:
-        return view.viewmat.new_empty(num_gaussians, kernels.CAMERA_GRADIENTS)
-    return None
-
-
-def sum_camera_gradients(view: View, v_cameras: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-    """Gradients of ``viewmat`` and ``K``; None if the camera requires none."""
-    if v_cameras is None:
-        return None, None
+def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of ``viewmat`` and ``K`` from what each Gaussian contributes."""
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]

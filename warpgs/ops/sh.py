@@ -36,43 +36,44 @@ def check_coefficients(sizes: dict[str, int], sh: Tensor, degree: int | None) ->
     return degree
 
 
-def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, radii: Tensor, degree: int) -> Tensor:
+def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, degree: int) -> Tensor:
     """Colours of Gaussians seen from a camera, max(0, ½ + Σ Y_k(direction) sh_k).
 
     Args:
         means: [N, 3] centres in the world.
         sh: [N, bases, 3] coefficients with 1, 4, 9 or 16 bases (degree 0 to 3).
         viewmat: [4, 4] rigid world-to-camera transform.
-        radii: [N, 2] int32 of a ``Projection``; culled Gaussians (radius 0) are black.
         degree: Highest degree to use.
 
     Returns:
-        [N, 3] RGB, not negative.
+        [N, 3] RGB, not negative; NaN where a value is not finite.
     """
     colors = torch.empty_like(means)
-    launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, radii, num_bases(degree), colors)
+    launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, num_bases(degree), colors)
     return colors
 
 
 def sh_bwd(
-    inputs: Sequence[Tensor], degree: int, colors: Tensor, v_colors: Tensor
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Gradients of means, sh and, if it requires one, viewmat.
+    inputs: Sequence[Tensor], degree: int, colors: Tensor, v_colors: Tensor, v_means: Tensor
+) -> tuple[Tensor, Tensor | None]:
+    """Gradients of sh and, if it requires one, viewmat; that of the means is added to ``v_means``.
 
     Args:
-        inputs: means, sh, viewmat and radii, as in ``sh_fwd``.
+        inputs: means, sh and viewmat, as in ``sh_fwd``.
         degree: As in ``sh_fwd``.
         colors: Its result.
         v_colors: [N, 3] gradient of the colours.
+        v_means: [N, 3] gradient of the means through everything else.
     """
-    means, sh, viewmat, _ = inputs
-    v_means, v_sh = torch.empty_like(means), torch.empty_like(sh)
-    launch(kernels.sh_bwd, means.shape[0], *inputs, num_bases(degree), colors, v_colors, v_means, v_sh)
-    if not viewmat.requires_grad:
-        return v_means, v_sh, None
+    means, sh, viewmat = inputs
+    v_sh, v_viewpoints = torch.empty_like(sh), torch.empty_like(means) if viewmat.requires_grad else None
+    outputs = (v_means, v_sh, v_viewpoints)
+    launch(kernels.sh_bwd, means.shape[0], *inputs, num_bases(degree), colors, v_colors, *outputs)
+    if v_viewpoints is None:
+        return v_sh, None
     # The viewpoint is -Wᵀ translation of the viewing matrix [W, translation].
-    v_viewpoint = -v_means.sum(0)
+    v_viewpoint = v_viewpoints.sum(0)
     v_viewmat, finite = torch.zeros_like(viewmat), viewmat.nan_to_num(0.0, 0.0, 0.0)  # otherwise all are culled, v = 0
     v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
     v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
-    return v_means, v_sh, v_viewmat
+    return v_sh, v_viewmat

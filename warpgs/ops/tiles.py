@@ -133,7 +133,7 @@ def bin_splats(
     """Bins splats into the tiles of an image.
 
     Args:
-        splat_rows, order: The N splats, from ``pack``. ``order`` is used up: pack again to bin again.
+        splat_rows, order: The N splats, from ``project_fwd``. ``order`` is used up: project again to bin again.
         size: (width, height) of the image [px].
         is_dynamic: [N] uint8 branches, to get the lists of each branch, too.
         max_intersections: For how many intersections to allocate buffers; with more, the lists are longer than
