@@ -15,8 +15,8 @@ from warpgs.rendering import render
 NUM = 120
 
 
-def projected(width=WIDTH, height=HEIGHT, num=NUM, device="cpu") -> Projection:
-    camera, splats = make_camera(width, height).to(device), make_splats(num).to(device)
+def projected(width=WIDTH, height=HEIGHT, num=NUM) -> Projection:
+    camera, splats = make_camera(width, height), make_splats(num)
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     return project(geometry, View(camera.viewmat, camera.K, *camera.size))
 
