@@ -72,11 +72,11 @@ const int num_chunks = (num_pairs - 1) / (segments_per_chunk * per_segment) + 1;
 while (true) {
     if (tid == 0) job = atomicAdd(num_taken, 1);
     __syncthreads();
-    const int round = job < num_chunks ? 0 : (job - num_chunks) / num_segments + 1;
-    const int index = round == 0 ? job : (job - num_chunks) % num_segments;
-    if (round > num_passes) return;
+    const int this_round = job < num_chunks ? 0 : (job - num_chunks) / num_segments + 1;
+    const int index = this_round == 0 ? job : (job - num_chunks) % num_segments;
+    if (this_round > num_passes) return;
 
-    if (round == 0) {
+    if (this_round == 0) {
         // Four copies of each number, because lanes that add to the same one take turns.
         static_assert(num_passes * 4 <= num_warps, "");
         int* const copies = &positions[0][0];
@@ -99,11 +99,11 @@ while (true) {
             if (sum > 0) atomicAdd(counts + k, sum);
         }
     } else {
-        const int num_jobs = round == 1 ? num_chunks : num_segments;  // of the preceding round
-        if (tid == 0) while (((volatile int*)num_done)[round - 1] < num_jobs) __nanosleep(32);
+        const int num_jobs = this_round == 1 ? num_chunks : num_segments;  // of the preceding round
+        if (tid == 0) while (((volatile int*)num_done)[this_round - 1] < num_jobs) __nanosleep(32);
         __threadfence();
         __syncthreads();
-        const int pass = round - 1, shift = pass * digit_bits;
+        const int pass = this_round - 1, shift = pass * digit_bits;
         const int source = pass & 1 ? num_pairs : 0, target = num_pairs - source;
         const int begin = index * per_segment, length = min(num_pairs - begin, per_segment);
         const int first = warp * 32 * per_thread + lane;  // a thread's pairs are 32 apart
@@ -207,7 +207,7 @@ while (true) {
     }
     __threadfence();
     __syncthreads();
-    if (tid == 0) atomicAdd(num_done + round, 1);
+    if (tid == 0) atomicAdd(num_done + this_round, 1);
 }
 """
 )

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -198,20 +198,28 @@ def _files(capture: Capture) -> Iterator[Finding]:
         yield from _dynamic_depth(trained)
 
 
-def _dynamic_counts(frame: Frame) -> tuple[int, int, int, int]:
-    """Numbers of dynamic regions, of those that the border cuts off, of dynamic pixels and of those with depth."""
+class _DynamicCounts(NamedTuple):
+    """Numbers of a frame: dynamic regions, those that the border cuts off, dynamic pixels, those with depth."""
+
+    regions: int
+    cut: int
+    pixels: int
+    with_depth: int
+
+
+def _dynamic_counts(frame: Frame) -> _DynamicCounts:
     assert frame.static_mask is not None
     regions, is_dynamic = dynamic_regions(frame), ~frame.static_mask
-    known = 0 if frame.inverse_depth is None else int((frame.inverse_depth.isfinite() & is_dynamic).sum())
-    return len(regions), sum(map(is_cut, regions)), int(is_dynamic.sum()), known
+    with_depth = 0 if frame.inverse_depth is None else int((frame.inverse_depth.isfinite() & is_dynamic).sum())
+    return _DynamicCounts(len(regions), sum(map(is_cut, regions)), int(is_dynamic.sum()), with_depth)
 
 
-def _dynamic_depth(counts: list[tuple[int, int, int, int]]) -> Iterator[Finding]:
-    """Whether something tells the depth of what moves; ``counts`` are those of each training frame."""
-    regions, cut, pixels, known = np.array(counts).reshape(-1, 4).T
-    is_known = known.sum() >= MIN_KNOWN_FRACTION * pixels.sum()
-    if regions.any() and (cut < regions).sum() < MIN_FRAMES and not is_known:
-        yield Finding("warning", "depth", unknown_depth(int((cut > 0).sum()), len(counts)))
+def _dynamic_depth(frames: list[_DynamicCounts]) -> Iterator[Finding]:
+    """Whether something tells the depth of what moves in the training frames."""
+    is_known = sum(f.with_depth for f in frames) >= MIN_KNOWN_FRACTION * sum(f.pixels for f in frames)
+    num_whole = sum(f.cut < f.regions for f in frames)
+    if any(f.regions for f in frames) and num_whole < MIN_FRAMES and not is_known:
+        yield Finding("warning", "depth", unknown_depth(sum(f.cut > 0 for f in frames), len(frames)))
 
 
 def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
