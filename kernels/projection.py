@@ -161,129 +161,6 @@ def project(
     return splat
 
 
-@wp.func
-def unproject(
-    i: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    viewmat: wp.array2d[float],
-    K: wp.array2d[float],
-    width: int,
-    height: int,
-    compensate: int,
-    rows: wp.array2d[wp.vec4],
-    v_splat: Splat,
-    v_means: wp.array[wp.vec3],
-    v_quats: wp.array[wp.vec4],
-    v_scales: wp.array[wp.vec3],
-    v_opacities: wp.array[float],
-    v_cameras: wp.array2d[float],
-):
-    """Writes the gradients of Gaussian i from those of its splat."""
-    if is_culled(rows, i):
-        for part in range(v_cameras.shape[1]):
-            v_cameras[i, part] = 0.0
-        v_means[i] = wp.vec3(0.0)
-        v_quats[i] = wp.vec4(0.0)
-        v_scales[i] = wp.vec3(0.0)
-        v_opacities[i] = 0.0
-        return
-    rotation = camera_rotation(viewmat)
-    t = rotation * means[i] + camera_translation(viewmat)
-    fx = K[0, 0]
-    fy = K[1, 1]
-    rz = 1.0 / t[2]
-    slope_u = t[0] * rz
-    slope_v = t[1] * rz
-    u = clamped_slope(slope_u, float(width), fx, K[0, 2])
-    v = clamped_slope(slope_v, float(height), fy, K[1, 2])
-    jacobian = projection_jacobian(t, fx, fy, u, v)
-    to_image = jacobian * rotation
-    q = quats[i]
-    s = scales[i]
-    orientation = quaternion_to_rotation(q)
-    shape = orientation * wp.diag(s)
-    spread = to_image * shape
-
-    a_sharp = wp.dot(spread[0], spread[0])
-    b = wp.dot(spread[0], spread[1])
-    c_sharp = wp.dot(spread[1], spread[1])
-    det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
-    det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
-    A = (c_sharp + LOW_PASS) / det
-    B = -b / det
-    C = (a_sharp + LOW_PASS) / det
-    v_conic = v_splat.conic
-    v_a = -(A * A * v_conic[0] + A * B * v_conic[1] + B * B * v_conic[2])
-    v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
-    v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
-
-    v_opacity = float(v_splat.opacity)
-    if compensate != 0:
-        compensation = wp.sqrt(det_sharp / det)
-        # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
-        # finite for needles and for discs seen edge-on, whose compensated opacity is far below ALPHA_MIN.
-        factor = v_opacity * opacities[i] * 0.5 / (wp.max(compensation, 1.0e-6) * det)
-        remainder = 1.0 - compensation * compensation
-        v_a += factor * (c_sharp * remainder - LOW_PASS * compensation * compensation)
-        v_c += factor * (a_sharp * remainder - LOW_PASS * compensation * compensation)
-        v_b -= factor * 2.0 * b * remainder
-        v_opacity = v_opacity * compensation
-    v_opacities[i] = v_opacity
-
-    v_spread = mat23(
-        2.0 * v_a * spread[0, 0] + v_b * spread[1, 0],
-        2.0 * v_a * spread[0, 1] + v_b * spread[1, 1],
-        2.0 * v_a * spread[0, 2] + v_b * spread[1, 2],
-        v_b * spread[0, 0] + 2.0 * v_c * spread[1, 0],
-        v_b * spread[0, 1] + 2.0 * v_c * spread[1, 1],
-        v_b * spread[0, 2] + 2.0 * v_c * spread[1, 2],
-    )
-    v_shape = wp.transpose(to_image) * v_spread
-    v_scales[i] = wp.vec3(
-        orientation[0, 0] * v_shape[0, 0] + orientation[1, 0] * v_shape[1, 0] + orientation[2, 0] * v_shape[2, 0],
-        orientation[0, 1] * v_shape[0, 1] + orientation[1, 1] * v_shape[1, 1] + orientation[2, 1] * v_shape[2, 1],
-        orientation[0, 2] * v_shape[0, 2] + orientation[1, 2] * v_shape[1, 2] + orientation[2, 2] * v_shape[2, 2],
-    )
-    v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
-
-    v_to_image = v_spread * wp.transpose(shape)
-    v_jacobian = v_to_image * wp.transpose(rotation)
-    v_mean2d = v_splat.mean
-    # The centre depends on the slope t_x / z itself, the Jacobian on the clamped slope, constant where it is clamped.
-    v_u = fx * v_mean2d[0]
-    v_v = fy * v_mean2d[1]
-    if u == slope_u:
-        v_u -= fx * rz * v_jacobian[0, 2]
-    if v == slope_v:
-        v_v -= fy * rz * v_jacobian[1, 2]
-    v_z = -rz * (
-        jacobian[0, 0] * v_jacobian[0, 0]
-        + jacobian[0, 2] * v_jacobian[0, 2]
-        + jacobian[1, 1] * v_jacobian[1, 1]
-        + jacobian[1, 2] * v_jacobian[1, 2]
-    )
-    v_z += v_splat.depth
-    v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
-    v_means[i] = wp.transpose(rotation) * v_t
-    if v_cameras.shape[1] > 0:
-        v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
-        v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])
-        v_cx = v_mean2d[0]
-        v_cy = v_mean2d[1]
-        # A clamped slope is (constant - c) / f.
-        if u != slope_u:
-            v_fx += rz * u * v_jacobian[0, 2]
-            v_cx += rz * v_jacobian[0, 2]
-        if v != slope_v:
-            v_fy += rz * v * v_jacobian[1, 2]
-            v_cy += rz * v_jacobian[1, 2]
-        v_rotation = wp.transpose(jacobian) * v_to_image
-        store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))
-
-
 @functools.cache
 def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
     """Kernel that projects Gaussians and packs them, one thread for each."""
@@ -350,24 +227,105 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
     ):
         i = first + wp.tid()
         v_splat = unpack_splat(i, rows, gradients, width, height, imagegrad, v_features, v_screen_offsets)
-        unproject(
-            i,
-            means,
-            quats,
-            scales,
-            opacities,
-            viewmat,
-            K,
-            width,
-            height,
-            compensate,
-            rows,
-            v_splat,
-            v_means,
-            v_quats,
-            v_scales,
-            v_opacities,
-            v_cameras,
+        if is_culled(rows, i):
+            for part in range(v_cameras.shape[1]):
+                v_cameras[i, part] = 0.0
+            v_means[i] = wp.vec3(0.0)
+            v_quats[i] = wp.vec4(0.0)
+            v_scales[i] = wp.vec3(0.0)
+            v_opacities[i] = 0.0
+            return
+        rotation = camera_rotation(viewmat)
+        t = rotation * means[i] + camera_translation(viewmat)
+        fx = K[0, 0]
+        fy = K[1, 1]
+        rz = 1.0 / t[2]
+        slope_u = t[0] * rz
+        slope_v = t[1] * rz
+        u = clamped_slope(slope_u, float(width), fx, K[0, 2])
+        v = clamped_slope(slope_v, float(height), fy, K[1, 2])
+        jacobian = projection_jacobian(t, fx, fy, u, v)
+        to_image = jacobian * rotation
+        q = quats[i]
+        s = scales[i]
+        orientation = quaternion_to_rotation(q)
+        shape = orientation * wp.diag(s)
+        spread = to_image * shape
+
+        a_sharp = wp.dot(spread[0], spread[0])
+        b = wp.dot(spread[0], spread[1])
+        c_sharp = wp.dot(spread[1], spread[1])
+        det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+        det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
+        A = (c_sharp + LOW_PASS) / det
+        B = -b / det
+        C = (a_sharp + LOW_PASS) / det
+        v_conic = v_splat.conic
+        v_a = -(A * A * v_conic[0] + A * B * v_conic[1] + B * B * v_conic[2])
+        v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
+        v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
+
+        v_opacity = float(v_splat.opacity)
+        if compensate != 0:
+            compensation = wp.sqrt(det_sharp / det)
+            # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
+            # finite for needles and for discs seen edge-on, whose compensated opacity is far below ALPHA_MIN.
+            factor = v_opacity * opacities[i] * 0.5 / (wp.max(compensation, 1.0e-6) * det)
+            remainder = 1.0 - compensation * compensation
+            v_a += factor * (c_sharp * remainder - LOW_PASS * compensation * compensation)
+            v_c += factor * (a_sharp * remainder - LOW_PASS * compensation * compensation)
+            v_b -= factor * 2.0 * b * remainder
+            v_opacity = v_opacity * compensation
+        v_opacities[i] = v_opacity
+
+        v_spread = mat23(
+            2.0 * v_a * spread[0, 0] + v_b * spread[1, 0],
+            2.0 * v_a * spread[0, 1] + v_b * spread[1, 1],
+            2.0 * v_a * spread[0, 2] + v_b * spread[1, 2],
+            v_b * spread[0, 0] + 2.0 * v_c * spread[1, 0],
+            v_b * spread[0, 1] + 2.0 * v_c * spread[1, 1],
+            v_b * spread[0, 2] + 2.0 * v_c * spread[1, 2],
         )
+        v_shape = wp.transpose(to_image) * v_spread
+        v_scales[i] = wp.vec3(
+            orientation[0, 0] * v_shape[0, 0] + orientation[1, 0] * v_shape[1, 0] + orientation[2, 0] * v_shape[2, 0],
+            orientation[0, 1] * v_shape[0, 1] + orientation[1, 1] * v_shape[1, 1] + orientation[2, 1] * v_shape[2, 1],
+            orientation[0, 2] * v_shape[0, 2] + orientation[1, 2] * v_shape[1, 2] + orientation[2, 2] * v_shape[2, 2],
+        )
+        v_quats[i] = quaternion_to_rotation_bwd(q, v_shape * wp.diag(s))
+
+        v_to_image = v_spread * wp.transpose(shape)
+        v_jacobian = v_to_image * wp.transpose(rotation)
+        v_mean2d = v_splat.mean
+        # The centre depends on the slope t_x / z itself, the Jacobian on the clamped slope, constant where clamped.
+        v_u = fx * v_mean2d[0]
+        v_v = fy * v_mean2d[1]
+        if u == slope_u:
+            v_u -= fx * rz * v_jacobian[0, 2]
+        if v == slope_v:
+            v_v -= fy * rz * v_jacobian[1, 2]
+        v_z = -rz * (
+            jacobian[0, 0] * v_jacobian[0, 0]
+            + jacobian[0, 2] * v_jacobian[0, 2]
+            + jacobian[1, 1] * v_jacobian[1, 1]
+            + jacobian[1, 2] * v_jacobian[1, 2]
+        )
+        v_z += v_splat.depth
+        v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
+        v_means[i] = wp.transpose(rotation) * v_t
+        if v_cameras.shape[1] > 0:
+            v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
+            v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])
+            v_cx = v_mean2d[0]
+            v_cy = v_mean2d[1]
+            # A clamped slope is (constant - c) / f.
+            if u != slope_u:
+                v_fx += rz * u * v_jacobian[0, 2]
+                v_cx += rz * v_jacobian[0, 2]
+            if v != slope_v:
+                v_fy += rz * v * v_jacobian[1, 2]
+                v_cy += rz * v_jacobian[1, 2]
+            v_rotation = wp.transpose(jacobian) * v_to_image
+            store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))
 
     return project_bwd
