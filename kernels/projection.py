@@ -135,7 +135,7 @@ def project(
     opacity = opacities[i]
     if compensate != 0:
         opacity = opacity * wp.sqrt(det_sharp / det)
-    if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0 and det > 0.0):
+    if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0):
         return splat
     reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
     radius_x = wp.ceil(reach * wp.sqrt(a))
@@ -268,9 +268,9 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         v_opacity = float(v_splat.opacity)
         if compensate != 0:
             compensation = wp.sqrt(det_sharp / det)
-            # d compensation = (d det' - compensation² d det) / (2 compensation det); the floor keeps 1 / compensation
-            # finite for needles and for discs seen edge-on, whose compensated opacity is far below ALPHA_MIN.
-            factor = v_opacity * opacities[i] * 0.5 / (wp.max(compensation, 1.0e-6) * det)
+            # d compensation = (d det' - compensation² d det) / (2 compensation det); visible splats have at least
+            # ALPHA_MIN of it.
+            factor = v_opacity * opacities[i] * 0.5 / (compensation * det)
             remainder = 1.0 - compensation * compensation
             v_a += factor * (c_sharp * remainder - LOW_PASS * compensation * compensation)
             v_c += factor * (a_sharp * remainder - LOW_PASS * compensation * compensation)

@@ -3,8 +3,9 @@
     [x, y, a, b], [c, log2 opacity, 0, 0], [feature 0..3], [feature 4..7] …
 
 with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so that
-log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, with a value that is not finite,
-or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY, and its radii become 0.
+log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, with a feature that is not
+finite, or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY, and its radii become
+0.
 
 For each Gaussian, the backward pass of compositing leaves the gradients of its features and the moments of
 s = alpha v_alpha over its pixels, and
@@ -99,8 +100,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
         mean = splat.mean
         conic = splat.conic
         depth = splat.depth
-        # A sum is finite only if all of its terms are, and a comparison with NaN fails.
-        total = mean[0] + mean[1] + conic[0] + conic[1] + conic[2] + depth
+        total = float(0.0)  # a sum is finite only if all of its terms are
         for part in range(wp.static((num_channels + 3) // 4)):
             value = wp.vec4(0.0)
             for k in range(4):
@@ -110,11 +110,10 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
                     value[k] = depth
             total += value[0] + value[1] + value[2] + value[3]
             row_store(rows, i, wp.static(GEOMETRY_PARTS) + part, value)
-        visible = splat.radius[0] > 0 and wp.isfinite(total)
-        visible = visible and conic[0] > 0.0 and conic[2] > 0.0 and conic[0] * conic[2] > conic[1] * conic[1]
+        visible = splat.radius[0] > 0 and wp.isfinite(total) and conic[0] * conic[2] > conic[1] * conic[1]
         key = CULLED_DEPTH
-        row0 = wp.vec4(0.0, 0.0, 1.0, 0.0)
-        row1 = wp.vec4(1.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
+        row0 = wp.vec4(0.0)
+        row1 = wp.vec4(0.0, CULLED_LOG2_OPACITY, 0.0, 0.0)
         if visible:
             key = wp.cast(depth, wp.int32)  # the bits of positive floats have the order of the floats
             row0 = wp.vec4(mean[0], mean[1], 0.5 * LOG2_E * conic[0], LOG2_E * conic[1])

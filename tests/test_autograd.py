@@ -72,7 +72,7 @@ def test_a_parameter_changed_in_place_before_the_backward_pass_is_an_error(name)
 
 def render_layers(splats, background):
     rendering = render(splats, CAMERA, background, RenderSettings(depth=True, branches=True))
-    return rendering.dynamic._asdict()
+    return {"radii": rendering.radii, **rendering.dynamic._asdict()}
 
 
 @pytest.mark.parametrize("name", ["depth", "alpha"])
@@ -92,6 +92,18 @@ def test_other_outputs_may_be_changed_and_gradients_are_correct(name):
     for multiply in (torch.mul, torch.Tensor.mul_):
         splats = as_leaves(make_splats())
         multiply(render_layers(splats, torch.zeros(3))[name], 2).square().sum().backward()
+        found.append(splats.means.grad)
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("harmonics", [False, True])
+def test_radii_may_be_changed_and_gradients_are_correct(harmonics):
+    found = []
+    for change in (torch.Tensor.clone, torch.Tensor.zero_):
+        splats = as_leaves(make_splats() if harmonics else make_splats(channels=3))
+        rendering = render(splats, CAMERA)
+        change(rendering.radii)
+        rendering.joint.image.square().sum().backward()
         found.append(splats.means.grad)
     assert torch.equal(*found)
 

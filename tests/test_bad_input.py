@@ -33,10 +33,10 @@ def odd(splats: Splats | None = None, **values) -> Splats:
     return splats
 
 
-def render_image(splats: Splats, camera: Camera = CAMERA) -> torch.Tensor:
+def render_image(splats: Splats, camera: Camera = CAMERA, offsets: torch.Tensor | None = None) -> torch.Tensor:
     """The image, after checking that it and all gradients are finite."""
     splats = as_leaves(splats)
-    image = render(splats, camera, torch.full((3,), 0.2)).joint.image
+    image = render(splats, camera, torch.full((3,), 0.2), screen_offsets=offsets).joint.image
     image.square().sum().backward()
     assert image.isfinite().all()
     for name, gradient in gradients(splats).items():
@@ -155,6 +155,13 @@ def test_a_gaussian_that_is_not_finite_leaves_the_image_unchanged(name, entry, v
     (tensor if entry == "all" else tensor.view(60, -1)[:, 0])[ODD] = value
     image = render_image(dataclasses.replace(splats, **{name: tensor}))
     assert torch.equal(image, render_image(select(splats, ~ODD)))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_an_offset_on_screen_that_is_not_finite_leaves_the_image_unchanged(value):
+    splats, offsets = make_splats(), torch.zeros(60, 2)
+    offsets[ODD, 1] = value
+    assert torch.equal(render_image(splats, offsets=offsets), render_image(select(splats, ~ODD)))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])

@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from tests.ops.alone import Projection
 from tests.ops.test_sort import CASES, random_keys, sorted_pairs
 from tests.ops.test_tiles import binned, projected
 from tests.reference.depth_error import random_inputs
+from tests.reference.projection import Projection
 from tests.scenes import (
+    GEOMETRY,
     as_leaves,
     generator,
     gradients,
@@ -22,8 +23,10 @@ from tests.scenes import (
 )
 from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
 from warpgs.config import RenderSettings
+from warpgs.kernels.constants import CULLED_DEPTH
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
+from warpgs.ops.projection import Geometry, View, project_fwd
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import reset_budgets
 from warpgs.rendering import render
@@ -274,6 +277,20 @@ def test_the_lists_of_tiles_equal_those_on_cpu(num):
     assert all(same)
     for max_intersections in (None, actual, actual + 1000):
         assert binned(splats, *size, max_intersections) == (lists, actual)
+
+
+@pytest.mark.parametrize("num", [1, 255, 256, 257, 8191, 8192, 8193, 20_000])
+def test_projection_prepares_binning_in_memory_that_was_used(num):
+    splats, camera = make_splats(num).to("cuda"), make_camera().to("cuda")
+    geometry = Geometry(*(getattr(splats, name) for name in GEOMETRY))
+    view, features = View(camera.viewmat, camera.K, *camera.size), torch.rand(num, 3, device="cuda")
+    with torch.no_grad():  # what it frees is not zero
+        render(splats, camera)
+    _, radii, order = project_fwd(geometry, features, view, 0.01, False, False)
+    assert not order.scan_words.any()
+    assert not order.sort_counters.any()
+    assert torch.equal(order.gaussian_from_rank[:num], torch.arange(num, device="cuda", dtype=torch.int32))
+    assert torch.equal(order.keys[:num] == CULLED_DEPTH, radii[:, 0] == 0)
 
 
 @pytest.mark.parametrize("branches", [False, True])

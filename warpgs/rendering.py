@@ -97,7 +97,7 @@ class _Inputs(NamedTuple):
 class _Saved(NamedTuple):
     """The tensors that autograd saves for the backward pass, besides some layers.
 
-    ``sh`` and ``features``, the colours of it, are None without spherical harmonics; ``packed`` are the splats' rows.
+    ``sh`` and ``colors``, those of it, are None without spherical harmonics; ``packed`` are the splats' rows.
     """
 
     means: Tensor
@@ -108,7 +108,7 @@ class _Saved(NamedTuple):
     K: Tensor
     background: Tensor | None
     sh: Any
-    features: Any
+    colors: Any
     packed: Tensor
 
 
@@ -122,8 +122,8 @@ def render(
     """Renders splats through a camera; differentiable, once, in the splats, the camera and the background.
 
     Gaussians that are behind the near plane, 1e10 or more from the camera, outside the image, fainter than 1/255 or
-    that have an opacity above 1, a parameter that is not finite or a zero quaternion are culled: they leave the image
-    unchanged and get zero gradients.
+    that have an opacity above 1, a parameter or offset that is not finite or a zero quaternion are culled: they leave
+    the image unchanged and get zero gradients.
 
     Args:
         splats: N Gaussians; N may be 0.
@@ -200,12 +200,13 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *size)
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
-    colors = inputs.appearance
+    features, sh, colors = inputs.appearance, None, None
     if sh_degree is not None:
-        colors = sh_fwd(inputs.means, inputs.appearance, inputs.viewmat, sh_degree)
+        sh = inputs.appearance
+        features = colors = sh_fwd(inputs.means, sh, inputs.viewmat, sh_degree)
         tape.record_func(back.color, [])
     options = (settings.near, settings.antialias, settings.depth)
-    rows, radii, order = project_fwd(geometry, colors, view, *options, inputs.screen_offsets)
+    rows, radii, order = project_fwd(geometry, features, view, *options, inputs.screen_offsets)
     tape.record_func(back.project, [])
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
     composite, back.traversal = composite_fwd(
@@ -214,9 +215,7 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     tape.record_func(back.composite, [])
 
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
-    sh, features = (None, None) if sh_degree is None else (inputs.appearance, colors)
-    camera, background = (inputs.viewmat, inputs.K), inputs.background
-    saved = _Saved(*geometry, *camera, background, sh, features, rows.packed)
+    saved = _Saved(*geometry, inputs.viewmat, inputs.K, inputs.background, sh, colors, rows.packed)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
@@ -272,16 +271,17 @@ class _Backward:
         saved, v = self.saved, self.v
         geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *self.request.size)
         inputs = (geometry, view, self.request.settings.antialias, self._rows())
-        v_geometry, v["appearance"], v["viewmat"], v["K"], v["screen_offsets"] = project_bwd(
-            *inputs, v["rows"], self.with_offsets, self.imagegrad
-        )
-        v["means"], v["quats"], v["scales"], v["opacities"] = v_geometry
+        splats = project_bwd(*inputs, v["rows"], self.with_offsets, self.imagegrad)
+        v |= splats.geometry._asdict()
+        v["appearance"], v["viewmat"], v["K"] = splats.features, splats.viewmat, splats.K
+        v["screen_offsets"] = splats.screen_offsets
 
     def color(self) -> None:
         saved, v, degree = self.saved, self.v, self.request.sh_degree
         assert degree is not None
         inputs = (saved.means, saved.sh, saved.viewmat)
-        v["appearance"], v_viewmat = sh_bwd(inputs, degree, saved.features, v["appearance"], v["means"])
+        v_colors = v["appearance"]  # what was projected
+        v["appearance"], v_viewmat = sh_bwd(inputs, degree, saved.colors, v_colors, v["means"])
         if v_viewmat is not None:
             v["viewmat"] += v_viewmat
 

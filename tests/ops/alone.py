@@ -1,11 +1,10 @@
 """The steps of a render on their own: each a forward and a backward function of ``warpgs.ops``."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from tests.reference import rows as reference
+from tests.reference.projection import Projection
 from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.ops.compositing import NUM_BRANCH_IMAGES, Composite, background_bwd, composite_bwd, composite_fwd
 from warpgs.ops.projection import Geometry, View, project_fwd
@@ -13,24 +12,6 @@ from warpgs.ops.rows import DepthOrder, Rows, new_order, new_rows
 from warpgs.ops.sh import degree_of, sh_bwd, sh_fwd
 from warpgs.ops.tiles import bin_splats
 from warpgs.runtime.tape import Recorded, differentiable
-
-
-class Projection(NamedTuple):
-    """N Gaussians as a camera sees them; all values of a culled Gaussian are zero.
-
-    Attributes:
-        means2d: [N, 2] centres [px].
-        conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] z in camera space [scene units].
-        opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
-        radii: [N, 2] int32 half sizes on screen [px]; 0 = culled.
-    """
-
-    means2d: Tensor
-    conics: Tensor
-    depths: Tensor
-    opacities: Tensor
-    radii: Tensor
 
 
 def project(geometry: Geometry, view: View, *, near=0.01, antialias=False) -> Projection:

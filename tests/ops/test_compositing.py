@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from tests.ops.alone import Projection, composite, pack
+from tests.ops.alone import composite, pack
 from tests.reference.compositing import composite as reference
+from tests.reference.projection import Projection
 from tests.reference.rows import splat_gradients
 from tests.scenes import assert_same_gradients, error, generator, random_like, relative_error, weighted_sum
 from warpgs.kernels.rows import NUM_MOMENTS, NUM_OFFSET_SUMS

@@ -7,6 +7,7 @@ from tests.ops.alone import project
 from tests.reference import rows as rows_reference
 from tests.reference.projection import project as reference
 from tests.scenes import GEOMETRY, generator, make_camera, make_splats, relative_error, weighted_sum
+from warpgs.kernels.constants import CULLED_DEPTH, CULLED_LOG2_OPACITY
 from warpgs.kernels.rows import gradient_stride
 from warpgs.ops.projection import Geometry, View, project_bwd, project_fwd
 
@@ -46,7 +47,8 @@ OUTPUTS = {"means2d": slice(3, 5), "conics": slice(5, 8), "depths": slice(1, 2),
 
 def random_gradient_rows(num: int, *outputs: str) -> torch.Tensor:
     """[1, N, stride] rows with random gradients of some outputs."""
-    rows, v_rows = torch.randn(1, num, gradient_stride(2), generator=generator()), torch.zeros(1, num, 12)
+    rows = torch.randn(1, num, gradient_stride(2), generator=generator())
+    v_rows = torch.zeros_like(rows)
     for name in outputs or OUTPUTS:
         v_rows[..., OUTPUTS[name]] = rows[..., OUTPUTS[name]]
     return v_rows
@@ -100,12 +102,25 @@ def test_gradients_of_the_camera_equal_the_reference(antialias):
     assert visible[-4:].all()
 
 
-def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05, antialias=False):
-    """The projection of a round Gaussian to a 64 × 64 image of a camera at the origin."""
+def round_gaussian(depth=2.0, x=0.0, opacity=0.5, scale=0.05) -> tuple[Geometry, View]:
+    """A round Gaussian, and a camera at the origin with an image of 64 × 64 pixels."""
     K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 32.0], [0.0, 0.0, 1.0]])
     means, quats = torch.tensor([[x, 0.0, depth]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     geometry = Geometry(means, quats, torch.full((1, 3), scale), torch.tensor([opacity]))
-    return project(geometry, View(torch.eye(4), K, 64, 64), antialias=antialias)
+    return geometry, View(torch.eye(4), K, 64, 64)
+
+
+def one(antialias=False, **values):
+    return project(*round_gaussian(**values), antialias=antialias)
+
+
+def assert_culled(geometry: Geometry, view: View, antialias=False):
+    rows, radii, order = project_fwd(geometry, torch.rand(1, 1), view, 0.01, antialias, with_depth=True)
+    assert not radii.any()
+    assert rows.packed[0, 1, 1] == CULLED_LOG2_OPACITY
+    assert order.keys[0] == CULLED_DEPTH
+    v = project_bwd(geometry, view, antialias, rows, random_gradient_rows(1), with_offsets=True)
+    assert not any(gradient.any() for gradient in (*v.geometry, v.screen_offsets))
 
 
 @pytest.mark.parametrize("antialias", [False, True])
@@ -115,21 +130,19 @@ def one(depth=2.0, x=0.0, opacity=0.5, scale=0.05, antialias=False):
         *({"depth": value} for value in (-2.0, 0.0, 0.01)),
         *({"x": value} for value in (5.0, -5.0)),
         *({"opacity": value} for value in (0.9999 / 255, 1.0001, -0.5, float("nan"))),
-        *({"scale": value} for value in (float("inf"), float("nan"))),
+        *({"scale": value} for value in (4e7, float("inf"), float("nan"))),
     ],
 )
-def test_culled_gaussians_have_radius_zero_and_zero_values(culled, antialias):
+def test_culled_gaussians_are_marked_and_have_no_gradient(culled, antialias):
     assert one(antialias=antialias).radii.min() > 0
-    for value in one(**culled, antialias=antialias):
-        assert not value.any()
+    assert_culled(*round_gaussian(**culled), antialias)
 
 
 def test_a_depth_that_overflows_is_culled():
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3e38
     geometry = [torch.tensor([[0.0, 0.0, 3e38]]), torch.ones(1, 4), torch.ones(1, 3), torch.ones(1)]
-    for value in project(Geometry(*geometry), View(viewmat, CAMERA.K, *CAMERA.size)):
-        assert not value.any()
+    assert_culled(Geometry(*geometry), View(viewmat, CAMERA.K, *CAMERA.size))
 
 
 def test_gaussians_are_culled_from_a_distance_of_1e10_on():
@@ -141,6 +154,7 @@ def test_gaussians_are_culled_from_a_distance_of_1e10_on():
 
 def test_just_visible_opacity_and_depth_are_kept():
     assert one(opacity=1.0001 / 255).radii.min() > 0
+    assert one(opacity=1 / 255).radii.eq(1).all()  # which reaches no further than its mean
     assert one(depth=0.0101, scale=1e-4).radii.min() > 0
 
 

@@ -88,6 +88,12 @@ def test_a_gaussian_at_the_viewpoint_has_finite_colour_and_gradients():
     assert sh.grad.isfinite().all()
 
 
+def test_a_camera_that_is_not_finite_has_a_finite_gradient():
+    view = torch.full((4, 4), torch.nan, requires_grad=True)
+    (0.0 * spherical_harmonics(*inputs(), view)).nan_to_num().sum().backward()
+    assert view.grad.isfinite().all()
+
+
 @pytest.mark.parametrize("num", [0, 1])
 def test_few_gaussians_are_enough(num):
     means, sh = (t.clone().requires_grad_() for t in inputs(num=num))

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from tests.ops.alone import Projection, composite, pack, project
+from tests.ops.alone import composite, pack, project
+from tests.reference.projection import Projection
 from tests.reference.tiles import ALPHA_MIN, max_alphas
 from tests.scenes import HEIGHT, WIDTH, generator, make_camera, make_splats
 from warpgs.kernels import tiles as kernels

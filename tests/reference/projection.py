@@ -1,5 +1,7 @@
 """EWA projection in plain torch, any dtype: through Σ and its full 2D image, unlike the kernel."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -8,6 +10,24 @@ from warpgs.ops.projection import Geometry, View
 
 LOW_PASS = 0.3
 ALPHA_MIN = 1.0 / 255.0
+
+
+class Projection(NamedTuple):
+    """N Gaussians as a camera sees them; all values of a culled Gaussian are zero.
+
+    Attributes:
+        means2d: [N, 2] centres [px].
+        conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
+        depths: [N] z in camera space [scene units].
+        opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
+        radii: [N, 2] int32 half sizes on screen [px]; 0 = culled.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    radii: Tensor
 
 
 def project(

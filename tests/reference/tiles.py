@@ -3,15 +3,16 @@
 import torch
 from torch import Tensor
 
+from tests.reference.projection import Projection
+
 ALPHA_MIN = 1 / 255
 TILE_SIZE = 16
 
 
-def max_alphas(splats, size: tuple[int, int], step: float) -> Tensor:
+def max_alphas(splats: Projection, size: tuple[int, int], step: float) -> Tensor:
     """[N, tiles] maximum of alpha over a grid of points in the box of the pixel centres of each tile.
 
-    ``splats`` have means2d, conics, opacities and radii. Tiles are in row-major order; the points are ``step`` pixels
-    apart and include the first pixel centre.
+    Tiles are in row-major order; the points are ``step`` pixels apart and include the first pixel centre.
     """
     width, height = size
     mean, opacity = splats.means2d.double(), splats.opacities.double()[:, None, None]

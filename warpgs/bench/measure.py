@@ -31,12 +31,12 @@ VISIBLE_DIFFERENCE = 1e-3
 """A pixel that differs by more than this in any channel counts as visibly different."""
 
 STAGES = {
-    "project": ("sh_fwd", "project_fwd"),
+    "project_fwd": ("sh_fwd", "project_fwd"),
     "bin": ("count_tiles", "emit_isects", "tile_ranges", "split_tiles"),
     "sort": ("sort_pairs",),
     "composite_fwd": ("composite_fwd",),
     "composite_bwd": ("composite_bwd",),
-    "unproject": ("project_bwd", "sh_bwd"),
+    "project_bwd": ("project_bwd", "sh_bwd"),
     "ssim": ("ssim_fwd", "ssim_bwd"),
 }
 """Kernels of each stage of a render."""

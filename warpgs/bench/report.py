@@ -40,6 +40,8 @@ NAMES = {
     "graph_forward_backward_ms": "forward and backward, CUDA graph [ms]",
     "graph_forward_backward": "forward and backward, CUDA graph",
     "stages_ms": "pass [ms]:",
+    "project_fwd": "project, forward",
+    "project_bwd": "project, backward",
     "composite_fwd": "composite, forward",
     "composite_bwd": "composite, backward",
     "ssim": "SSIM, forward and backward",

@@ -188,7 +188,7 @@ def composite_bwd(
             v_arrays[k // num_images * NUM_BRANCH_IMAGES + k % num_images] = v
             images_with_gradient |= 1 << (k % num_images)
     packed, num_features, with_depth = rows
-    v_rows = packed.new_zeros(num_shards(packed), packed.shape[0], gradient_stride(num_features + int(with_depth)))
+    v_rows = packed.new_zeros(num_shards(packed), packed.shape[0], gradient_stride(rows.num_channels))
     kernel = make_composite_bwd(num_features, with_depth, num_images, traversal.pixels, imagegrad)
     inputs = (*traversal.lists, packed, background, *traversal.view, *traversal.state, *v_arrays, images_with_gradient)
     launch(kernel, traversal.num_threads, *inputs, per_shard=(v_rows,), block_dim=BLOCK_DIM, work=WORK)

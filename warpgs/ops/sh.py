@@ -46,7 +46,7 @@ def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, degree: int) -> Tensor:
         degree: Highest degree to use.
 
     Returns:
-        [N, 3] RGB, not negative; NaN where a value is not finite.
+        [N, 3] RGB, not negative; NaN where the sum is not finite, without meaning for Gaussians that projection culls.
     """
     colors = torch.empty_like(means)
     launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, num_bases(degree), colors)
@@ -73,7 +73,8 @@ def sh_bwd(
         return v_sh, None
     # The viewpoint is -Wᵀ translation of the viewing matrix [W, translation].
     v_viewpoint = v_viewpoints.sum(0)
-    v_viewmat, finite = torch.zeros_like(viewmat), viewmat.nan_to_num(0.0, 0.0, 0.0)  # otherwise all are culled, v = 0
+    # If it is not finite, all Gaussians are culled and v_viewpoint is 0, but 0 · NaN would be NaN.
+    v_viewmat, finite = torch.zeros_like(viewmat), viewmat.nan_to_num(0.0, 0.0, 0.0)
     v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
     v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
     return v_sh, v_viewmat
