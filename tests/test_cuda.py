@@ -21,7 +21,7 @@ from tests.scenes import (
     relative_error,
     weighted_sum,
 )
-from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
+from warpgs.bench.workloads import graphed, make_workload, parameter_names
 from warpgs.config import RenderSettings
 from warpgs.kernels.constants import CULLED_DEPTH
 from warpgs.ops.depth_error import depth_error
@@ -191,9 +191,10 @@ def test_a_render_can_be_a_graphed_callable(settings):
             assert relative_error(actual, wanted) < 1e-4
 
 
-def test_graphed_workloads_of_the_benchmark_compute_the_same():
-    splats, camera = make_splats(200, channels=3).to("cuda"), make_camera().to("cuda")
-    for name in PARAMETERS:
+@pytest.mark.parametrize("channels", [3, None])
+def test_graphed_workloads_of_the_benchmark_compute_the_same(channels):
+    splats, camera = make_splats(200, channels=channels).to("cuda"), make_camera().to("cuda")
+    for name in parameter_names(splats):
         getattr(splats, name).requires_grad_()
     workload = make_workload(splats, camera, RenderSettings(branches=True, depth=True))
     expected = workload.forward_backward()

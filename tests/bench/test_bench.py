@@ -14,7 +14,7 @@ from warpgs.bench.measure import STAGES, time_in_turn
 from warpgs.bench.run_bench import bench
 from warpgs.bench.scenes import SCENES, Scene, in_disc, random_splats
 from warpgs.bench.training import measure_steps, plain_phase, random_scene
-from warpgs.bench.workloads import PARAMETERS, graphed, make_workload
+from warpgs.bench.workloads import graphed, make_workload, parameter_names, sh_degree_of
 from warpgs.cli import main
 from warpgs.config import RenderSettings
 from warpgs.config.presets import PRESETS
@@ -122,6 +122,19 @@ def test_graphs_are_captured_after_plain_calls_are_measured(monkeypatch):
     assert order == ["call", "call", "graph", "call", "graph", "call"]
 
 
+@pytest.mark.parametrize("degree", range(4))
+def test_spherical_harmonics_of_any_degree_can_be_measured(degree, tmp_path, capsys):
+    (result,) = report(tmp_path, sh_degree=degree)["results"]
+    assert result["sh_degree"] == degree
+    assert f"spherical harmonics of degree {degree}" in capsys.readouterr().out
+    workload = tiny_workload(degree)
+    assert sh_degree_of(workload) == degree
+    difference = (workload.render()[0] - tiny_workload().render()[0]).abs().mean()
+    assert difference < 1e-6 if degree == 0 else 1e-3 < difference < 0.1
+    *_, v_sh = workload.forward_backward()
+    assert v_sh[:, -1].any()
+
+
 def test_a_workload_renders_the_given_parameters():
     workload = tiny_workload()
     images = workload.render()
@@ -130,9 +143,9 @@ def test_a_workload_renders_the_given_parameters():
     assert torch.allclose(workload.render(*geometry, 0.5 * colors)[0], 0.5 * images[0])
 
 
-def tiny_workload():
-    splats, camera = TINY.make("none", "cpu")
-    for name in PARAMETERS:
+def tiny_workload(sh_degree=None):
+    splats, camera = TINY.make("none", "cpu", sh_degree)
+    for name in parameter_names(splats):
         getattr(splats, name).requires_grad_()
     return make_workload(splats, camera, RenderSettings())
 

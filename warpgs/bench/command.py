@@ -23,6 +23,9 @@ class Bench:
     probability 1/2 (random), or if it projects into a disc that covers 20 % of the image (disc)."""
     depth: bool = False
     """Also render depth."""
+    sh_degree: Literal[0, 1, 2, 3] | None = None
+    """Give the Gaussians colours of spherical harmonics of this degree instead of colours that are the same from all
+    sides."""
     graph: bool = False
     """Also measure forward and backward pass as CUDA graphs: one of each pass (torch.cuda.make_graphed_callables), and
     one of both."""

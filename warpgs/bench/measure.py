@@ -21,7 +21,7 @@ from warpgs.runtime.profiling import KernelTime, profile
 from .command import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
-from .workloads import OTHERS, PARAMETERS, Workload, graphed, make_workload
+from .workloads import OTHERS, Workload, graphed, make_workload, parameter_names
 
 WARM_UPS = {"cuda": 50, "cpu": 1}
 """Runs before the first measured one. On CUDA they bring clock rates and threads to a steady state; on CPU, where runs
@@ -49,8 +49,8 @@ Measurements = dict[str, Any]
 
 def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, list[KernelTime]]:
     """All measurements of a scene, and the kernels of one forward and backward pass."""
-    splats, camera = scene.make(options.branches, device)
-    for name in PARAMETERS:
+    splats, camera = scene.make(options.branches, device, options.sh_degree)
+    for name in parameter_names(splats):
         getattr(splats, name).requires_grad_()
     settings = RenderSettings(depth=options.depth)
     one = make_workload(splats, camera, settings)
@@ -68,6 +68,7 @@ def measure(options: Bench, scene: Scene, device: str) -> tuple[Measurements, li
         measured[name]["stages_ms"] = time_stages(workloads[name], device, options.repeats)
     result = {
         **dataclasses.asdict(scene),
+        "sh_degree": options.sh_degree,
         "intersections": count_intersections(splats, camera, settings),
         **measured,
         "ratios_to_one_image": {n: ratios(measured[n], measured["one_image"]) for n in measured if n != "one_image"},
@@ -169,5 +170,5 @@ def differences(ours: Workload, theirs: Workload) -> Measurements:
         "max_image": float(difference.max()),
         "mean_image": float(difference.mean()),
         "visible_pixels": int((difference.amax(-1) > VISIBLE_DIFFERENCE).sum()),
-        "relative_gradients": dict(zip(PARAMETERS, relative, strict=True)),
+        "relative_gradients": dict(zip(ours.names, relative, strict=True)),
     }

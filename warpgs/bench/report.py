@@ -106,6 +106,8 @@ def print_result(result: dict[str, Any]) -> None:
         f"{result['name']}: {result['width']}x{result['height']}, {result['num_gaussians']:,} Gaussians, "
         f"{result['intersections']:,} intersections"
     )
+    if result["sh_degree"] is not None:
+        title += f", spherical harmonics of degree {result['sh_degree']}"
     table = _titled(console, title)
     table.add_column("")
     for name in names:

@@ -9,11 +9,16 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.model.gaussians import SH_C0
 from warpgs.model.splats import Splats
+from warpgs.ops.sh import num_bases
 
 Branches = Literal["none", "random", "disc"]
 
 SEED = 0
+SH_NOISE = 0.1
+"""Standard deviation of the coefficients of spherical harmonics from degree 1 on."""
+
 DISC_AREA = 0.2
 """Fraction of the image area that the disc of dynamic Gaussians covers."""
 
@@ -35,9 +40,11 @@ class Scene:
     num_gaussians: int
     pixels: float
 
-    def make(self, branches: Branches, device: str) -> tuple[Splats, Camera]:
+    def make(self, branches: Branches, device: str, sh_degree: int | None = None) -> tuple[Splats, Camera]:
         """The splats and the camera; ``is_dynamic`` is set unless ``branches`` is none."""
         splats, camera = random_splats(self.num_gaussians, self.width, self.height, self.pixels, SEED)
+        if sh_degree is not None:
+            splats = with_harmonics(splats, sh_degree)
         if branches == "random":
             coins = torch.rand(self.num_gaussians, generator=torch.Generator().manual_seed(SEED + 1))
             splats = dataclasses.replace(splats, is_dynamic=coins < 0.5)
@@ -83,6 +90,14 @@ def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> 
     colors = torch.rand(N, 3, generator=generator)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Splats(means, quats, scales, opacities, colors), Camera(torch.eye(4), K, width, height)
+
+
+def with_harmonics(splats: Splats, degree: int) -> Splats:
+    """The splats with spherical harmonics of a degree whose mean over all directions is their colour."""
+    assert splats.colors is not None
+    sh = SH_NOISE * torch.randn(len(splats.means), num_bases(degree), 3, generator=torch.Generator().manual_seed(SEED))
+    sh[:, 0] = (splats.colors - 0.5) / SH_C0
+    return dataclasses.replace(splats, colors=None, sh=sh)
 
 
 def in_disc(means: Tensor, camera: Camera) -> Tensor:

@@ -13,11 +13,15 @@ from torch.nn.functional import normalize
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
+from warpgs.ops.sh import degree_of
 from warpgs.rendering import render
 
 from .scenes import SEED
 
-PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
+def parameter_names(splats: Splats) -> tuple[str, ...]:
+    """Names of the tensors whose gradients are computed; the last one is the appearance."""
+    return ("means", "quats", "scales", "opacities", "colors" if splats.sh is None else "sh")
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,14 @@ class Workload:
 
     Attributes:
         render: Renders the images, of other tensors in the place of the parameters if they are given.
-        parameters: Tensors to compute gradients of, in the order of ``PARAMETERS``.
+        parameters: Tensors to compute gradients of.
+        names: Their names.
         v_images: Gradient with respect to each image.
     """
 
     render: Callable[..., tuple[Tensor, ...]]
     parameters: tuple[Tensor, ...]
+    names: tuple[str, ...]
     v_images: tuple[Tensor, ...]
 
     def forward(self) -> tuple[Tensor, ...]:
@@ -55,9 +61,10 @@ def graphed(workload: Workload) -> Workload:
 
 def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> Workload:
     """A render by this package, with random gradients that depend only on the sizes of its images."""
+    names = parameter_names(splats)
 
     def run(*parameters: Tensor) -> tuple[Tensor, ...]:
-        given: dict[str, Any] = dict(zip(PARAMETERS, parameters, strict=True)) if parameters else {}
+        given: dict[str, Any] = dict(zip(names, parameters, strict=True)) if parameters else {}
         own = dataclasses.replace(splats, **given) if given else splats  # which checks them
         rendering = render(own, camera, settings=settings)
         layers = [layer for layer in (rendering.joint, rendering.static, rendering.dynamic) if layer is not None]
@@ -67,7 +74,7 @@ def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> W
         images = run()
     generator = torch.Generator().manual_seed(SEED)
     v_images = tuple(torch.randn(image.shape, generator=generator).to(image.device) for image in images)
-    return Workload(run, tuple(getattr(splats, name) for name in PARAMETERS), v_images)
+    return Workload(run, tuple(getattr(splats, name) for name in names), names, v_images)
 
 
 def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
@@ -75,13 +82,18 @@ def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
     from gsplat import rasterization
 
     views, intrinsics = camera.viewmat[None], camera.K[None]
-    mode = "RGB+ED" if depth else "RGB"
+    options = {"packed": False, "render_mode": "RGB+ED" if depth else "RGB", "sh_degree": sh_degree_of(ours)}
 
     def run() -> tuple[Tensor, ...]:
-        images, _, _ = rasterization(*ours.parameters, views, intrinsics, *camera.size, packed=False, render_mode=mode)
+        images, _, _ = rasterization(*ours.parameters, views, intrinsics, *camera.size, **options)
         return (images[0, ..., :-1], images[0, ..., -1]) if depth else (images[0],)
 
-    return Workload(run, ours.parameters, ours.v_images)
+    return dataclasses.replace(ours, render=run)
+
+
+def sh_degree_of(workload: Workload) -> int | None:
+    """Degree of the spherical harmonics of a render; None if its Gaussians have colours."""
+    return degree_of(workload.parameters[-1].shape[1]) if workload.names[-1] == "sh" else None
 
 
 def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
@@ -102,7 +114,7 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
         scale_modifier=1.0,
         viewmatrix=camera.viewmat.T.contiguous(),
         projmatrix=(projection @ camera.viewmat).T.contiguous(),
-        sh_degree=0,
+        sh_degree=sh_degree_of(ours) or 0,
         campos=camera.viewmat.inverse()[:3, 3].contiguous(),
         prefiltered=False,
         auto_tune_verbose=False,
@@ -110,17 +122,18 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
     gswarp.set_compute_depth(depth)
     rasterizer = gswarp.GaussianRasterizer(settings)  # which expects unit quaternions
     offsets = torch.zeros_like(ours.parameters[0], requires_grad=True)
+    keyword = "colors_precomp" if ours.names[-1] == "colors" else "shs"
 
     def run() -> tuple[Tensor, ...]:
-        means, quats, scales, opacities, colors = ours.parameters
+        means, quats, scales, opacities, appearance = ours.parameters
         image, _, meta = rasterizer(
-            means, offsets, opacities[:, None], colors_precomp=colors, scales=scales, rotations=normalize(quats)
+            means, offsets, opacities[:, None], scales=scales, rotations=normalize(quats), **{keyword: appearance}
         )
         image = image.movedim(0, -1)
         # Its depth is a sum; that of the others is divided by alpha.
         return (image, meta.depth[0] / meta.alpha[0].clamp_min(1e-10)) if depth else (image,)
 
-    return Workload(run, ours.parameters, ours.v_images)
+    return dataclasses.replace(ours, render=run)
 
 
 OTHERS = {"gsplat": make_gsplat_workload, "gswarp": make_gswarp_workload}
