@@ -10,6 +10,8 @@ import math
 
 import warp as wp
 
+from .lanes import native
+
 C0 = wp.constant(0.5 * math.sqrt(1.0 / math.pi))
 C1 = wp.constant(0.5 * math.sqrt(3.0 / math.pi))
 C2_XY = wp.constant(0.5 * math.sqrt(15.0 / math.pi))
@@ -23,6 +25,7 @@ C3_P2 = wp.constant(0.25 * math.sqrt(105.0 / math.pi))
 
 NUM_BASES = 16
 bases_vector = wp.types.vector(length=NUM_BASES, dtype=float)
+mat43 = wp.types.matrix(shape=(4, 3), dtype=float)
 
 
 @wp.func
@@ -97,6 +100,48 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
     return wp.vec3(0.0)
 
 
+# Coefficients of one Gaussian are far from those of the next, so that every instruction of a warp that accesses one
+# number touches 32 sectors of memory. Where they begin at multiples of 16 bytes, because the number of bases is a
+# multiple of four, four of them are three pieces of 16 bytes.
+@wp.func_native(
+    native(
+        """
+        const float4* pieces = (const float4*)&wp::index(coefficients, i, first);
+        mat43 four;
+        float* v = &four.data[0][0];
+        for (int k = 0; k < 3; ++k) {
+            const float4 p = pieces[k];
+            v[4 * k] = p.x; v[4 * k + 1] = p.y; v[4 * k + 2] = p.z; v[4 * k + 3] = p.w;
+        }
+        return four;
+        """,
+        """
+        mat43 four;
+        for (int k = 0; k < 4; ++k)
+            for (int c = 0; c < 3; ++c) four.data[k][c] = wp::index(coefficients, i, first + k)[c];
+        return four;
+        """,
+    ).replace("mat43", "wp::mat_t<4, 3, wp::float32>")
+)
+def load_four(coefficients: wp.array2d[wp.vec3], i: int, first: int) -> mat43: ...
+
+
+@wp.func_native(
+    native(
+        """
+        float4* pieces = (float4*)&wp::index(coefficients, i, first);
+        const float* v = &four.data[0][0];
+        for (int k = 0; k < 3; ++k) pieces[k] = make_float4(v[4 * k], v[4 * k + 1], v[4 * k + 2], v[4 * k + 3]);
+        """,
+        """
+        for (int k = 0; k < 4; ++k)
+            for (int c = 0; c < 3; ++c) wp::index(coefficients, i, first + k)[c] = four.data[k][c];
+        """,
+    )
+)
+def store_four(coefficients: wp.array2d[wp.vec3], i: int, first: int, four: mat43): ...
+
+
 @wp.kernel(enable_backward=False)
 def sh_fwd(
     first: int,
@@ -109,9 +154,17 @@ def sh_fwd(
     i = first + wp.tid()
     bases = sh_bases(direction_from(means[i], viewpoint(viewmat)))
     color = wp.vec3(0.5)
-    for k in range(NUM_BASES):
-        if k < num_bases:
-            color += bases[k] * coefficients[i, k]
+    if coefficients.shape[1] % 4 == 0:
+        for group in range(NUM_BASES // 4):
+            if 4 * group < num_bases:
+                four = load_four(coefficients, i, 4 * group)
+                for part in range(4):
+                    if 4 * group + part < num_bases:
+                        color += bases[4 * group + part] * four[part]
+    else:
+        for k in range(NUM_BASES):
+            if k < num_bases:
+                color += bases[k] * coefficients[i, k]
     if wp.isfinite(color[0] + color[1] + color[2]):
         color = wp.max(color, wp.vec3(0.0))
     else:
@@ -135,29 +188,41 @@ def sh_bwd(
     """Adds to ``v_means``. ``v_viewpoints``, what each Gaussian contributes to that of the camera, may be missing."""
     i = first + wp.tid()
     total = coefficients.shape[1]
-    v_mean = wp.vec3(0.0)
-    begin = int(0)
     v = v_colors[i]
     for c in range(3):
         if not (colors[i][c] > 0.0):
             v[c] = 0.0
     # Culled Gaussians, which may have values that are not finite, have no gradient.
+    used = int(0)
     if v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0:
-        origin = viewpoint(viewmat)
-        d = direction_from(means[i], origin)
-        bases = sh_bases(d)
-        v_bases = bases_vector()
+        used = num_bases
+    origin = viewpoint(viewmat)
+    d = direction_from(means[i], origin)
+    bases = sh_bases(d)
+    v_bases = bases_vector()
+    if total % 4 == 0:
+        for group in range(NUM_BASES // 4):
+            if 4 * group < total:
+                v_four = mat43()
+                if 4 * group < used:
+                    four = load_four(coefficients, i, 4 * group)
+                    for part in range(4):
+                        if 4 * group + part < used:
+                            v_four[part] = bases[4 * group + part] * v
+                            v_bases[4 * group + part] = wp.dot(four[part], v)
+                store_four(v_coefficients, i, 4 * group, v_four)
+    else:
         for k in range(NUM_BASES):
-            if k < num_bases:
+            if k < used:
                 v_coefficients[i, k] = bases[k] * v
                 v_bases[k] = wp.dot(coefficients[i, k], v)
+            elif k < total:
+                v_coefficients[i, k] = wp.vec3(0.0)
+    v_mean = wp.vec3(0.0)
+    distance = wp.length(means[i] - origin)
+    if used > 0 and distance > 0.0:
         v_d = sh_direction_bwd(d, v_bases)
-        distance = wp.length(means[i] - origin)
-        if distance > 0.0:
-            v_mean = (v_d - d * wp.dot(d, v_d)) / distance
-            v_means[i] = v_means[i] + v_mean  # += would be atomic
-        begin = num_bases
-    for k in range(begin, total):
-        v_coefficients[i, k] = wp.vec3(0.0)
+        v_mean = (v_d - d * wp.dot(d, v_d)) / distance
+        v_means[i] = v_means[i] + v_mean  # += would be atomic
     if v_viewpoints.shape[0] > 0:
         v_viewpoints[i] = -v_mean
