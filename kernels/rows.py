@@ -62,6 +62,15 @@ def row_load(rows: wp.array2d[wp.vec4], i: int, part: int) -> wp.vec4: ...
 def row_store(rows: wp.array2d[wp.vec4], i: int, part: int, value: wp.vec4): ...
 
 
+@wp.func_native(
+    native(
+        "const float4 v = *(const float4*)&wp::index(gradients, shard, i, part); return wp::vec4(v.x, v.y, v.z, v.w);",
+        "return wp::index(gradients, shard, i, part);",
+    )
+)
+def gradients_load(gradients: wp.array3d[wp.vec4], shard: int, i: int, part: int) -> wp.vec4: ...
+
+
 @wp.func
 def is_culled(rows: wp.array2d[wp.vec4], i: int) -> bool:
     return row_load(rows, i, 1)[1] == CULLED_LOG2_OPACITY
@@ -147,7 +156,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     def unpack_splat(
         i: int,
         rows: wp.array2d[wp.vec4],
-        gradients: wp.array3d[float],
+        gradients: wp.array3d[wp.vec4],
         width: int,
         height: int,
         imagegrad: int,
@@ -155,20 +164,18 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
         v_screen_offsets: wp.array[wp.vec2],
     ) -> Splat:
         v_splat = Splat()
-        for k in range(wp.static(num_channels)):
-            total = float(0.0)
-            for shard in range(gradients.shape[0]):
-                total += gradients[shard, i, k]
-            if k < wp.static(num_features):
-                v_features[i, k] = total
-            else:
-                v_splat.depth = total
         s = sums_vector()
-        for k in range(wp.static(NUM_MOMENTS + NUM_OFFSET_SUMS)):
-            total = float(0.0)
+        for part in range(wp.static(gradient_stride(num_channels) // 4)):
+            total = wp.vec4(0.0)
             for shard in range(gradients.shape[0]):
-                total += gradients[shard, i, wp.static(num_channels) + k]
-            s[k] = total
+                total += gradients_load(gradients, shard, i, part)
+            for k in range(4):
+                if part * 4 + k < wp.static(num_features):
+                    v_features[i, part * 4 + k] = total[k]
+                elif part * 4 + k < wp.static(num_channels):
+                    v_splat.depth = total[k]
+                elif part * 4 + k < wp.static(num_channels + NUM_MOMENTS + NUM_OFFSET_SUMS):
+                    s[part * 4 + k - wp.static(num_channels)] = total[k]
         v_offset = wp.vec2(0.0)
         if not is_culled(rows, i):
             row0 = row_load(rows, i, 0)
