@@ -29,7 +29,9 @@ def test_a_second_derivative_is_an_error_not_zero():
 
 def test_a_second_derivative_of_the_perceptron_is_an_error_not_zero():
     inputs, values = torch.rand(5, 4), torch.rand(5 * 8).requires_grad_()
-    (first,) = torch.autograd.grad(perceptron(inputs, values, [(8, 4)], 0, 8).square().sum(), values, create_graph=True)
+    (first,) = torch.autograd.grad(
+        perceptron(inputs, values, [(8, 4)], 0, (8,))[0].square().sum(), values, create_graph=True
+    )
     with pytest.raises(RuntimeError, match="differentiate twice"):
         first.sum().backward()
 

@@ -37,7 +37,7 @@ def randomize_head(trunk):
 
 
 def make_trunk(**changes):
-    trunk = Trunk(model(**changes), CENTER, HALF_SIZE, OUTPUTS)
+    trunk = Trunk(model(**changes), CENTER, HALF_SIZE, (OUTPUTS,))
     randomize_head(trunk)
     return trunk
 
@@ -74,7 +74,7 @@ def double_parameters(trunk):
 def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip, raw):
     """Its values and gradients."""
     trunk = make_trunk(depth=depth, skip=skip, raw_input=raw)
-    parameters, outputs = double_parameters(trunk), trunk(random_means(), TIME)
+    parameters, outputs = double_parameters(trunk), trunk(random_means(), TIME)[0]
     expected = plain_trunk(parameters, random_means(), skip, raw)
     assert relative_error(outputs, expected) < 2e-6
     (v_outputs,) = random_like([outputs])
@@ -87,7 +87,7 @@ def test_the_trunk_is_a_chain_of_layers_with_a_skip_connection(depth, skip, raw)
 
 def test_padding_gets_no_gradient():
     trunk = make_trunk()
-    trunk(random_means(), TIME).square().sum().backward()
+    trunk(random_means(), TIME)[0].square().sum().backward()
     counted = torch.zeros_like(trunk.values)
     for part in (part for layer in trunk.layers(counted) for part in layer):
         part.fill_(1.0)
@@ -97,7 +97,7 @@ def test_padding_gets_no_gradient():
 
 
 def test_layers_are_initialized_as_those_of_torch():
-    trunk = Trunk(model(width=64), CENTER, HALF_SIZE, OUTPUTS)
+    trunk = Trunk(model(width=64), CENTER, HALF_SIZE, (OUTPUTS,))
     for weight, bias in trunk.layers(trunk.values.detach())[:-1]:
         bound = weight.shape[1] ** -0.5
         assert 0.95 * bound < float(weight.abs().max()) <= bound
@@ -105,7 +105,7 @@ def test_layers_are_initialized_as_those_of_torch():
 
 
 def test_the_default_trunk_has_eight_layers_of_256_units():
-    trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, OUTPUTS)
+    trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, (OUTPUTS,))
     encoded = 3 * 21 + 21
     shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
     columns = [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
@@ -113,17 +113,17 @@ def test_the_default_trunk_has_eight_layers_of_256_units():
 
 
 def test_the_trunk_of_the_paper_reads_80_sines_and_cosines_and_reads_them_again_after_its_fifth_layer():
-    trunk = Trunk(PRESETS["paper"].model, CENTER, HALF_SIZE, OUTPUTS)
+    trunk = Trunk(PRESETS["paper"].model, CENTER, HALF_SIZE, (OUTPUTS,))
     columns = [weight.shape[1] for weight, _ in trunk.layers(trunk.values)]
     assert columns == [80, 256, 256, 256, 256, 256 + 80, 256, 256, 256]
 
 
 def test_positions_are_normalized_by_the_box():
     trunk = make_trunk()
-    twin = Trunk(model(), torch.zeros(3), torch.ones(3), OUTPUTS)
+    twin = Trunk(model(), torch.zeros(3), torch.ones(3), (OUTPUTS,))
     twin.values.data.copy_(trunk.values.data)
     means = random_means()
-    assert relative_error(twin((means - CENTER) / HALF_SIZE, TIME), trunk(means, TIME)) < 1e-6
+    assert relative_error(twin((means - CENTER) / HALF_SIZE, TIME)[0], trunk(means, TIME)[0]) < 1e-6
 
 
 def test_the_box_is_saved_with_the_network():

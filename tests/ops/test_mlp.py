@@ -8,14 +8,14 @@ from tests.scenes import error, generator, random_like, relative_error
 from warpgs.ops import mlp
 from warpgs.ops.mlp import MAX_CHUNKS, ROWS_PER_CHUNK, num_sums, num_values, perceptron, relu_backward, split
 
-COLUMNS, WIDTH, OUTPUTS = 6, 16, 5
+COLUMNS, WIDTH, OUTPUTS = 6, 16, (3, 1, 1)
 LAYOUTS = [(9, 4), (4, 2), (4, 1), (5, 0), (2, 0)]
 """Numbers of layers with the last one, and the layer that reads the encoding again (0: none)."""
 
 
 def make_shapes(depth, skip):
     hidden = [(WIDTH, WIDTH + COLUMNS * (k == skip)) for k in range(1, depth - 1)]
-    return [(WIDTH, COLUMNS), *hidden, (OUTPUTS + 2, WIDTH)]
+    return [(WIDTH, COLUMNS), *hidden, (sum(OUTPUTS) + 2, WIDTH)]
 
 
 def random_inputs(num, skip):
@@ -34,15 +34,17 @@ def double_layers(values, shapes):
     return [tuple(part.detach().double().requires_grad_() for part in layer) for layer in split(values, shapes)]
 
 
-@pytest.mark.parametrize("num", [0, 1, 37])
+@pytest.mark.parametrize("num", [0, 1, 37, 200])
 @pytest.mark.parametrize(("depth", "skip"), LAYOUTS)
 def test_outputs_and_gradients_equal_the_reference(depth, skip, num):
     shapes = make_shapes(depth, skip)
     inputs, values = random_inputs(num, skip), random_values(shapes)
     layers = double_layers(values, shapes)
-    expected = reference.perceptron(inputs[:, -COLUMNS:].double(), layers, skip)[:, :OUTPUTS]
-    outputs = perceptron(inputs, values, shapes, skip, OUTPUTS)
-    assert outputs.shape == (num, OUTPUTS)
+    expected = reference.perceptron(inputs[:, -COLUMNS:].double(), layers, skip)[:, : sum(OUTPUTS)]
+    parts = perceptron(inputs, values, shapes, skip, OUTPUTS)
+    assert [part.shape for part in parts] == [(num, columns) for columns in OUTPUTS]
+    assert all(part.is_contiguous() for part in parts)
+    outputs = torch.cat(parts, 1)
     (v_outputs,) = random_like([outputs])
     outputs.backward(v_outputs)
     expected.backward(v_outputs.double())
@@ -69,18 +71,29 @@ def test_padding_rows_change_neither_outputs_nor_gradients(half, num, monkeypatc
     for rows in (64, 128) if half else (num, 40):
         inputs = torch.randn(128, 8 + WIDTH, generator=generator())[:rows].to(torch.float16 if half else torch.float32)
         values.grad = None
-        outputs = perceptron(inputs.contiguous(), values, shapes, 1, OUTPUTS, num)
-        outputs.backward(torch.randn(40, OUTPUTS, generator=generator(2))[:num])
+        outputs = torch.cat(perceptron(inputs.contiguous(), values, shapes, 1, OUTPUTS, num), 1)
+        outputs.backward(torch.randn(40, sum(OUTPUTS), generator=generator(2))[:num])
         results.append((outputs.detach(), values.grad))
     for padded, expected in zip(*results, strict=True):
         assert padded.shape == expected.shape
         assert torch.allclose(padded, expected, rtol=0.0, atol=1e-5)
 
 
+def test_outputs_that_are_not_used_have_no_gradient():
+    shapes = make_shapes(3, 0)
+    inputs, values = random_inputs(70, 0), random_values(shapes)
+    first, *_ = perceptron(inputs, values, shapes, 0, OUTPUTS)
+    (alone,) = torch.autograd.grad(first.square().sum(), values)
+    first, *others = perceptron(inputs, values, shapes, 0, OUTPUTS)
+    (beside,) = torch.autograd.grad(first.square().sum() + sum(0.0 * other.sum() for other in others), values)
+    assert alone.any()
+    assert torch.equal(alone, beside)
+
+
 def test_inputs_get_no_gradient():
     shapes = make_shapes(3, 0)
     inputs = random_inputs(4, 0).requires_grad_()
-    perceptron(inputs, random_values(shapes), shapes, 0, OUTPUTS).sum().backward()
+    perceptron(inputs, random_values(shapes), shapes, 0, OUTPUTS)[0].sum().backward()
     assert inputs.grad is None
 
 

@@ -200,32 +200,32 @@ def plain(encoding, weights, biases, skip):
 def test_gradients_of_weights_omit_no_gaussian(num, last):
     """On an H100, cuBLAS 13.0 omits the last rows of matrices of these sizes from the product of a head's gradient."""
     config = dataclasses.replace(PRESETS["paper"].model, half=True)
-    trunk = Trunk(config, torch.zeros(3), torch.ones(3), 10).cuda()
+    trunk = Trunk(config, torch.zeros(3), torch.ones(3), (10,)).cuda()
     trunk.layers(trunk.values.data)[-1].weight.normal_()
     means, time = torch.rand(num, 3, device="cuda") * 2 - 1, torch.full((1,), 0.3, device="cuda")
     v_outputs = torch.zeros(num, 10, device="cuda")
     v_outputs[-last:].normal_()
-    (actual,) = torch.autograd.grad(trunk(means, time), trunk.values, v_outputs)
-    (expected,) = torch.autograd.grad(trunk(means[-last:].contiguous(), time), trunk.values, v_outputs[-last:])
+    (actual,) = torch.autograd.grad(trunk(means, time)[0], trunk.values, v_outputs)
+    (expected,) = torch.autograd.grad(trunk(means[-last:].contiguous(), time)[0], trunk.values, v_outputs[-last:])
     assert relative_error(actual, expected) < 1e-2
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e6])
 @pytest.mark.parametrize("num", [0, 1, 1000])
-@pytest.mark.parametrize("outputs", [3, 10, 49])
+@pytest.mark.parametrize("outputs", [(3,), (10,), (48, 1)])
 def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outputs):
     g = generator()
     encoding = torch.rand(num, 21, generator=g).double() * 2 - 1
-    shapes = [(64, 21), (64, 64), (64, 85), (64, 64), (outputs, 64)]
+    shapes = [(64, 21), (64, 64), (64, 85), (64, 64), (sum(outputs), 64)]
     weights = [torch.randn(*shape, generator=g) / shape[1] ** 0.5 for shape in shapes]
     biases = [0.1 * torch.randn(rows, generator=g) for rows, _ in shapes]
-    v_outputs = scale * torch.randn(num, outputs, generator=g)
+    v_outputs = scale * torch.randn(num, sum(outputs), generator=g)
 
     expected = [p.double().requires_grad_() for p in (*weights, *biases)]
     values = plain(encoding, expected[:5], expected[5:], skip=2)
     values.backward(v_outputs.double())
 
-    padded = [(64, 24), (64, 64), (64, 88), (64, 64), (aligned(outputs), 64)]
+    padded = [(64, 24), (64, 64), (64, 88), (64, 64), (aligned(sum(outputs)), 64)]
     flat = torch.zeros(num_values(padded))
     for layer, weight, bias in zip(split(flat, padded), weights, biases, strict=True):
         layer.weight[: weight.shape[0], : weight.shape[1]] = weight
@@ -233,10 +233,12 @@ def test_half_precision_loses_little_for_all_sizes_of_gradients(num, scale, outp
     flat = flat.cuda().requires_grad_()
     # Columns for the hidden units before, padding after; rows of padding after.
     inputs = torch.nn.functional.pad(encoding.half().cuda(), (64, 3, 0, -num % ROW_ALIGNMENT))
-    ours = perceptron(inputs, flat, padded, skip=2, num_outputs=outputs, num_rows=num)
+    parts = perceptron(inputs, flat, padded, skip=2, outputs=outputs, num_rows=num)
+    assert [part.shape for part in parts] == [(num, columns) for columns in outputs]
+    assert all(part.is_contiguous() for part in parts)
+    ours = torch.cat(parts, 1)
     ours.backward(v_outputs.cuda())
 
-    assert ours.is_contiguous()
     gradients = split(flat.grad, padded)
     pairs = [(values.detach(), ours.detach())]
     pairs += [(e.grad, g.weight[: e.shape[0], : e.shape[1]]) for e, g in zip(expected[:5], gradients, strict=True)]

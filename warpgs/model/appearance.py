@@ -15,11 +15,11 @@ class AppearanceField(nn.Module):
 
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.changes_opacity = config.appearance_opacity
         self.bases = (config.appearance_degree + 1) ** 2
         depth, width = config.appearance_depth or config.depth, config.appearance_width or config.width
         config = dataclasses.replace(config, depth=depth, width=width)
-        self.trunk = Trunk(config, center, half_size, outputs=3 * self.bases + int(self.changes_opacity))
+        outputs = (3 * self.bases, 1) if config.appearance_opacity else (3 * self.bases,)
+        self.trunk = Trunk(config, center, half_size, outputs)
 
     def forward(
         self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]
@@ -30,7 +30,5 @@ class AppearanceField(nn.Module):
             [N, bases, 3] residuals of the SH coefficients of the lowest degrees, and [N] residuals of the opacities'
             logits, or None if the network does not change opacities.
         """
-        residuals = self.trunk(means, time)
-        if not self.changes_opacity:
-            return residuals.unflatten(1, (self.bases, 3)), None
-        return residuals[:, :-1].unflatten(1, (self.bases, 3)).contiguous(), residuals[:, -1].contiguous()
+        residuals, *logits = self.trunk(means, time)
+        return residuals.unflatten(1, (self.bases, 3)), logits[0][:, 0] if logits else None

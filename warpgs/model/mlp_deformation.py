@@ -13,8 +13,9 @@ class MlpDeformation(nn.Module):
 
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.trunk = Trunk(config, center, half_size, outputs=10)
+        self.trunk = Trunk(config, center, half_size, outputs=(10,))
 
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
         """Offsets; see ``fields.FIELDS``. No gradient flows to ``means``, as in Deformable-3DGS."""
-        return self.trunk(means, time)
+        (offsets,) = self.trunk(means, time)
+        return offsets

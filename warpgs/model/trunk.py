@@ -14,7 +14,8 @@ class Trunk(nn.Module):
     The last layer, the head, is initialized to zero, so that a network starts as "no change"; the other layers are
     initialized as ``nn.Linear`` does.
 
-    Positions are in the box ``center`` ± ``half_size``, [3] each.
+    Positions are in the box ``center`` ± ``half_size``, [3] each. ``outputs`` are the numbers of columns of the tensors
+    that the network returns.
 
     Attributes:
         center, half_size: [3] box that positions are normalized by, to about [-1, 1].
@@ -26,10 +27,11 @@ class Trunk(nn.Module):
     half_size: Tensor
 
     def __init__(
-        self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"], outputs: int
+        self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"], outputs: tuple[int, ...]
     ) -> None:
         super().__init__()
         self.bands, self.raw = (config.position_bands, config.time_bands), config.raw_input
+        self.outputs = outputs
         self.skip = config.skip if config.skip < config.depth else 0
         self.reserved_columns = config.width if self.skip else 0
         self.uses_half = config.half and config.width % ALIGNMENT == 0
@@ -37,10 +39,10 @@ class Trunk(nn.Module):
         self.register_buffer("half_size", half_size.clone())
         encoded = encoded_size(*self.bands, self.raw)
         columns = [encoded] + [config.width + (encoded if k == self.skip else 0) for k in range(1, config.depth)]
-        self.sizes = [*((config.width, c) for c in columns), (outputs, config.width)]
+        self.sizes = [*((config.width, c) for c in columns), (sum(outputs), config.width)]
         padding = aligned(encoded) - encoded
         self.shapes = [(rows, c + (padding if k in (0, self.skip) else 0)) for k, (rows, c) in enumerate(self.sizes)]
-        self.shapes[-1] = (aligned(outputs), config.width)
+        self.shapes[-1] = (aligned(sum(outputs)), config.width)
         self.values = nn.Parameter(center.new_zeros(num_values(self.shapes)))
         for layer, (rows, c) in zip(self.layers(self.values.data)[:-1], self.sizes, strict=False):
             initial = nn.Linear(c, rows)
@@ -52,12 +54,15 @@ class Trunk(nn.Module):
         layers = split(values, self.shapes)
         return [Layer(weight[:r, :c], bias[:r]) for (weight, bias), (r, c) in zip(layers, self.sizes, strict=True)]
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N outputs"]:
-        """Evaluates the network at N positions and one time in [0, 1]. No gradient flows to the positions."""
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> tuple[Tensor, ...]:
+        """[N, number] for each of ``outputs``, at N positions and one time in [0, 1].
+
+        No gradient flows to the positions.
+        """
         half = self.uses_half and means.is_cuda
         box = (self.center, self.half_size)
         inputs = encode(means.detach(), time, self.bands, box, self.reserved_columns, half, self.raw)
-        return perceptron(inputs, self.values, self.shapes, self.skip, self.sizes[-1][0], len(means))
+        return perceptron(inputs, self.values, self.shapes, self.skip, self.outputs, len(means))
 
 
 def in_single_precision(model: nn.Module) -> nn.Module:

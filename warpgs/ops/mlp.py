@@ -35,6 +35,9 @@ MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 MAX_CHUNKS = 4096
 """Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
 
+ROWS_PER_SUM = 64
+"""Rows that are added up first for the bias of the head."""
+
 ROWS_PER_CHUNK = 4
 """Minimum number of rows of a partial sum."""
 
@@ -69,9 +72,9 @@ def perceptron(
     values: Float[Tensor, " values"],
     shapes: Sequence[tuple[int, int]],
     skip: int,
-    num_outputs: int,
+    outputs: tuple[int, ...],
     num_rows: int | None = None,
-) -> Float[Tensor, "N outputs"]:
+) -> tuple[Float[Tensor, "N _"], ...]:
     """Evaluates the layers; differentiable in ``values`` only.
 
     Args:
@@ -81,14 +84,15 @@ def perceptron(
             and the result are single precision.
         values: Weights and biases in the layout of ``split``.
         shapes: Of the weights: [width, E], [width, width] …; that of layer ``skip`` is [width, R + E], and the last
-            one has at least ``num_outputs`` rows. In half precision all sizes must be multiples of 8, and all hidden
-            layers must have the same width.
+            one has at least as many rows as there are outputs. In half precision all sizes must be multiples of 8, and
+            all hidden layers must have the same width.
         skip: Index of the layer that reads the encoding again, after its features; 0 for none.
-        num_outputs: Number of rows of the last layer to return; the others are padding.
+        outputs: Numbers of outputs to return in each tensor, from the first row of the last layer on; the other rows
+            are padding.
         num_rows: N, the number of inputs to return the outputs of; the others are padding. All by default.
 
     Returns:
-        [N, num_outputs].
+        [N, number] for each number of outputs: separate tensors, so that neither they nor their gradients are copied.
 
     Raises:
         ValueError: In half precision, if the sizes do not fit, or MPS limits the multiprocessors of this process.
@@ -96,7 +100,7 @@ def perceptron(
     if inputs.dtype == torch.float16:
         _check_sizes(len(inputs), num_rows, [inputs.shape[1], *chain(*shapes)])
         check_half_precision()
-    return _Perceptron.apply(inputs, values, tuple(shapes), skip, num_outputs, num_rows)
+    return _Perceptron.apply(inputs, values, tuple(shapes), skip, outputs, num_rows)
 
 
 def limit_of_multiprocessors() -> str:
@@ -132,9 +136,9 @@ class _Perceptron(torch.autograd.Function):
         values: Tensor,
         shapes: tuple[tuple[int, int], ...],
         skip: int,
-        num_outputs: int,
+        outputs: tuple[int, ...],
         num_rows: int | None,
-    ) -> Tensor:
+    ) -> tuple[Tensor, ...]:
         copy = values.to(inputs.dtype)
         *hidden, head = split(copy, shapes)
         x = inputs[:, inputs.shape[1] - shapes[0][1] :]
@@ -148,25 +152,27 @@ class _Perceptron(torch.autograd.Function):
             x = torch._addmm_activation(layer.bias, x, layer.weight.t())
         ctx.save_for_backward(*layer_inputs, x, copy)
         ctx.shapes = shapes
-        bias = split(values, shapes)[-1].bias[:num_outputs]
-        return _product(x, head.weight.t())[:num_rows, :num_outputs] + bias
+        bias, sizes = split(values, shapes)[-1].bias, [*outputs, shapes[-1][0] - sum(outputs)]
+        parts = zip(_product(x, head.weight.t())[:num_rows].split(sizes, 1), bias.split(sizes), outputs, strict=False)
+        return tuple(part + b for part, b, _ in parts)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *layer_inputs, copy = ctx.saved_tensors
         layers = split(copy, ctx.shapes)
         is_half = copy.dtype == torch.float16
-        v_values = torch.empty_like(copy, dtype=gradient.dtype)
+        v_values = torch.empty_like(copy, dtype=torch.float32)
         v_layers = split(v_values, ctx.shapes)
         shape = len(layer_inputs[0]), len(layers[-1].bias)
-        padding = 0, shape[1] - gradient.shape[1]
-        v_head_bias = torch.nn.functional.pad(gradient.sum(0), padding)
+        v_head_bias = v_values.new_zeros(shape[1])
+        torch.cat([_column_sums(v) for v in gradients], out=v_head_bias[: sum(v.shape[1] for v in gradients)])
         if is_half:
-            gradient, unscale = _scaled(gradient, shape)
+            gradient, unscale = _scaled(gradients, shape)
             sums = v_values.new_empty(len(layers) - 1, num_sums(len(gradient)), len(layers[0].bias))
         else:
-            gradient = torch.nn.functional.pad(gradient, (*padding, 0, shape[0] - len(gradient)))
+            gradient = v_values.new_zeros(shape)
+            torch.cat(gradients, 1, out=gradient[: len(gradients[0]), : sum(v.shape[1] for v in gradients)])
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0:
@@ -185,14 +191,23 @@ class _Perceptron(torch.autograd.Function):
         return None, v_values, None, None, None, None
 
 
-def _scaled(gradient: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The output's gradient in half precision, scaled and padded to a shape, and the inverse of the scale."""
+def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The outputs' gradients in half precision, beside each other, scaled and padded, and the inverse of the scale."""
     # A row of zeros is appended because the maximum of no rows is undefined.
-    largest = torch.linalg.vector_norm(torch.nn.functional.pad(gradient, (0, 0, 0, 1)), torch.inf)
-    largest = largest.clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
-    scaled = gradient.new_zeros(shape, dtype=torch.float16)
-    torch.mul(gradient, MAX_GRADIENT / largest, out=scaled[: gradient.shape[0], : gradient.shape[1]])
+    norms = [torch.linalg.vector_norm(torch.nn.functional.pad(v, (0, 0, 0, 1)), torch.inf) for v in gradients]
+    largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
+    scaled, begin = gradients[0].new_zeros(shape, dtype=torch.float16), 0
+    for v in gradients:
+        torch.mul(v, MAX_GRADIENT / largest, out=scaled[: len(v), begin : begin + v.shape[1]])
+        begin += v.shape[1]
     return scaled, largest / MAX_GRADIENT
+
+
+def _column_sums(matrix: Tensor) -> Tensor:
+    """The sums over the rows, first of every n-th row: torch's sum over all at once has too few blocks on a GPU."""
+    n = len(matrix) // ROWS_PER_SUM
+    whole = matrix[: n * ROWS_PER_SUM].view(ROWS_PER_SUM, n, matrix.shape[1])
+    return whole.sum(0).sum(0) + matrix[n * ROWS_PER_SUM :].sum(0)
 
 
 def _copy_columns(source: Tensor, target: Tensor) -> None:
