@@ -35,9 +35,6 @@ MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 MAX_CHUNKS = 4096
 """Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
 
-ROWS_PER_SUM = 64
-"""Rows that are added up first for the bias of the head."""
-
 ROWS_PER_CHUNK = 4
 """Minimum number of rows of a partial sum."""
 
@@ -152,9 +149,9 @@ class _Perceptron(torch.autograd.Function):
             x = torch._addmm_activation(layer.bias, x, layer.weight.t())
         ctx.save_for_backward(*layer_inputs, x, copy)
         ctx.shapes = shapes
-        bias, sizes = split(values, shapes)[-1].bias, [*outputs, shapes[-1][0] - sum(outputs)]
-        parts = zip(_product(x, head.weight.t())[:num_rows].split(sizes, 1), bias.split(sizes), outputs, strict=False)
-        return tuple(part + b for part, b, _ in parts)
+        product, bias = _product(x, head.weight.t())[:num_rows], split(values, shapes)[-1].bias
+        used = slice(sum(outputs))
+        return tuple(p + b for p, b in zip(product[:, used].split(outputs, 1), bias[used].split(outputs), strict=True))
 
     @staticmethod
     @once_differentiable
@@ -165,14 +162,14 @@ class _Perceptron(torch.autograd.Function):
         v_values = torch.empty_like(copy, dtype=torch.float32)
         v_layers = split(v_values, ctx.shapes)
         shape = len(layer_inputs[0]), len(layers[-1].bias)
-        v_head_bias = v_values.new_zeros(shape[1])
-        torch.cat([_column_sums(v) for v in gradients], out=v_head_bias[: sum(v.shape[1] for v in gradients)])
+        v_head_bias, used = v_values.new_zeros(shape[1]), slice(sum(v.shape[1] for v in gradients))
+        torch.cat([v.sum(0) for v in gradients], out=v_head_bias[used])
         if is_half:
             gradient, unscale = _scaled(gradients, shape)
             sums = v_values.new_empty(len(layers) - 1, num_sums(len(gradient)), len(layers[0].bias))
         else:
             gradient = v_values.new_zeros(shape)
-            torch.cat(gradients, 1, out=gradient[: len(gradients[0]), : sum(v.shape[1] for v in gradients)])
+            torch.cat(gradients, 1, out=gradient[: len(gradients[0]), used])
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0:
@@ -193,21 +190,13 @@ class _Perceptron(torch.autograd.Function):
 
 def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The outputs' gradients in half precision, beside each other, scaled and padded, and the inverse of the scale."""
-    # A row of zeros is appended because the maximum of no rows is undefined.
-    norms = [torch.linalg.vector_norm(torch.nn.functional.pad(v, (0, 0, 0, 1)), torch.inf) for v in gradients]
+    norms = [torch.linalg.vector_norm(v, torch.inf) for v in gradients if len(v)] or [gradients[0].new_zeros(())]
     largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
     scaled, begin = gradients[0].new_zeros(shape, dtype=torch.float16), 0
     for v in gradients:
         torch.mul(v, MAX_GRADIENT / largest, out=scaled[: len(v), begin : begin + v.shape[1]])
         begin += v.shape[1]
     return scaled, largest / MAX_GRADIENT
-
-
-def _column_sums(matrix: Tensor) -> Tensor:
-    """The sums over the rows, first of every n-th row: torch's sum over all at once has too few blocks on a GPU."""
-    n = len(matrix) // ROWS_PER_SUM
-    whole = matrix[: n * ROWS_PER_SUM].view(ROWS_PER_SUM, n, matrix.shape[1])
-    return whole.sum(0).sum(0) + matrix[n * ROWS_PER_SUM :].sum(0)
 
 
 def _copy_columns(source: Tensor, target: Tensor) -> None:
