@@ -8,6 +8,7 @@ from tests import tiny
 from tests.data.captures import edit_json
 from warpgs.cli import main
 from warpgs.runs import checkpoint
+from warpgs.runs.run import Run
 
 COMMANDS = {
     "render": ["render"],
@@ -48,7 +49,7 @@ def truncate_checkpoint(run):
 def remove_metadata(run):
     path = checkpoint.list_checkpoints(run)[-1]
     tiny.edit_metadata(path, lambda values: values.pop("relit"))
-    return f"{path} is damaged: it has no relit\n"
+    return f"{path} is damaged: it has no relit"
 
 
 OF_CONFIG = [empty, change_version, nest_config]
@@ -68,3 +69,18 @@ def test_a_bad_run_ends_a_command_with_one_line(finished_run, tmp_path, capsys, 
     error = capsys.readouterr().err
     assert error.startswith(beginning)
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_damaged_checkpoint_is_named_with_the_one_from_which_training_continues(finished_run, tmp_path, others):
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    *earlier, newest = checkpoint.list_checkpoints(run)
+    for path in earlier:
+        path.unlink()
+    intact = checkpoint.path_of(run, 1)
+    if others:
+        shutil.copy(newest, intact)
+    newest.write_bytes(newest.read_bytes()[:1000])
+    with pytest.raises(ValueError, match=f"{newest} is damaged") as raised:
+        Run.open(run, "cpu").trained_scene()
+    assert str(raised.value).endswith(f"{run} continues from {intact.name}") == bool(others)

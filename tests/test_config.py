@@ -136,7 +136,7 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
     found = fitted(config, capture, lines.append).loss.branches_in_stage2
     distrusted = asked == "given-masks" and estimated and assume == "masks"
     assert found == ("no" if distrusted else "yes" if asked == "given-masks" else asked)
-    assert lines == (["the masks are estimates: stage II compares the joint image alone"] if distrusted else [])
+    assert [line.partition(":")[0] for line in lines] == (["the masks are estimates"] if distrusted else [])
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():

@@ -2,15 +2,18 @@
 
 import dataclasses
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
+from tests import tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
 from warpgs.config import LossConfig, ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.point_cloud import color_points, gaussians_at, scene_box, subsample, unproject
 from warpgs.training.schedule import Protocol
 from warpgs.training.views import Views
@@ -422,6 +425,15 @@ def test_the_deformation_is_fitted_where_masks_and_depth_show_what_moves(assume,
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=steps))
     views = views_of(capture)
     assert initialize.fits_motion(config, capture, views, ALIGNMENT) == fits
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_fit_of_the_deformation_which_takes_a_while_is_announced(data, tmp_path, steps):
+    config = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, fit_motion=steps))
+    trainer, logger = tiny.trainer(data, tmp_path / "run", config), Mock(spec=TrainingLogger)
+    assert trainer._add_dynamic_gaussians(logger=logger)
+    lines = [call.args[0] for call in logger.log.call_args_list]
+    assert lines == ["first, 2 steps fit the deformation to points on what moves"] * (steps > 0)
 
 
 def test_if_everything_is_assumed_static_there_are_no_dynamic_gaussians():

@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 
 from warpgs.command_line.progress import progress
+from warpgs.command_line.version import install_command
 from warpgs.video.camera_paths import evenly_spaced
 
 from .cloud import Cloud
@@ -44,4 +45,4 @@ def required(path: Path, module: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise OSError(f"{path} needs {package}: pip install {package}") from error
+        raise OSError(f"{path} needs {package}: {install_command('export')}") from error

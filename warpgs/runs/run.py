@@ -148,11 +148,17 @@ class Run:
         Raises:
             ValueError: If there is no checkpoint, or it is damaged or does not fit the config.
         """
-        path = path or self.newest_checkpoint()
-        if path is None:
+        saved = checkpoint.list_checkpoints(self.folder) if path is None else [path]
+        if not saved:
             raise ValueError(f"{self.folder} has no checkpoint yet")
-        loaded = checkpoint.load(path)
-        scene = checkpoint.load_scene(loaded, self.config.model)
+        try:
+            loaded = checkpoint.load(saved[-1])
+            scene = checkpoint.load_scene(loaded, self.config.model)
+        except checkpoint.DamagedCheckpointError as error:
+            if len(saved) == 1:
+                raise
+            resume = command("train", "--resume", self.folder)
+            raise ValueError(f"{error}; {resume} continues from {saved[-2].name}") from error
         if limit_of_multiprocessors():  # which may break half precision; PSNR is the same to 0.001 dB
             in_single_precision(scene)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)

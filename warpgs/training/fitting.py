@@ -41,7 +41,7 @@ def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) ->
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     if loss.branches_in_stage2 == "given-masks":
         if seen.uses_estimated_masks:
-            log("the masks are estimates: stage II compares the joint image alone")
+            log("the masks are estimates: stage II compares the image of all Gaussians only, not those of each branch")
         loss = dataclasses.replace(loss, branches_in_stage2="no" if seen.uses_estimated_masks else "yes")
     return dataclasses.replace(config, loss=loss)
 

@@ -127,7 +127,7 @@ class Trainer:
         if self.iteration == 0:
             self.save()
         while self.iteration < self.protocol.num_iterations:
-            if self.iteration == self.protocol.stage1.start and not self._add_dynamic_gaussians(interrupt):
+            if self.iteration == self.protocol.stage1.start and not self._add_dynamic_gaussians(interrupt, logger):
                 self.save()
                 return False
             plan = self.protocol.at(self.iteration)
@@ -236,8 +236,10 @@ class Trainer:
             limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
             logger.log(f"iteration {self.iteration + 1}: {lost}; {len(added):,} added there{limit}")
 
-    def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None) -> bool:
+    def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None, logger: TrainingLogger | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
+        if logger is not None and self.protocol.fits_motion:
+            logger.log(f"first, {self.config.schedule.fit_motion:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.protocol, self.capture, self.views, self.alignments, self.scene.deformation)
         found = initialize.dynamic_gaussians(
