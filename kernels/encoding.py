@@ -14,7 +14,7 @@ import math
 
 import warp as wp
 
-CUDA_LANES_LOG2 = 3
+CUDA_LANES_LOG2 = 2
 """Base-2 logarithm of the number of threads that share the frequencies of one value on CUDA."""
 
 
