@@ -19,6 +19,7 @@ import torch
 
 from tests import tiny
 from tests.data.captures import write_png
+from warpgs.bench.report import machine
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
@@ -353,7 +354,7 @@ def metrics(run):
 
 def test_metrics_have_every_field_that_reports_need(metrics):
     wanted = "psnr ssim lpips psnr_static psnr_dynamic flicker jitter fps train_seconds num_static num_dynamic"
-    assert {*wanted.split(), "iterations", "commit"} <= metrics.keys()
+    assert {*wanted.split(), "iterations", "device", "commit"} <= metrics.keys()
 
 
 def test_metrics_are_those_of_the_last_checkpoint(metrics, run):
@@ -363,6 +364,10 @@ def test_metrics_are_those_of_the_last_checkpoint(metrics, run):
     assert metrics["num_dynamic"] == len(state["scene.dynamic.means"]) > 0
     assert 0 < metrics["train_seconds"] < 600
     assert metrics["fps"] > 0
+
+
+def test_metrics_name_the_processor_that_rendered(metrics):
+    assert metrics["device"] == machine("cpu")["cpu"] != ""
 
 
 def test_metrics_name_the_commit_of_a_checkout(metrics):

@@ -1,10 +1,8 @@
 """Tables, traces and machine data for the output of ``warpgs bench``."""
 
 import importlib.metadata
-import platform
 from collections.abc import Iterable
 from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from warpgs.evaluation.evaluate_run import commit
+from warpgs.evaluation.machine import commit, device_name
 from warpgs.runtime.profiling import KernelTime
 
 from .workloads import OTHERS
@@ -63,10 +61,8 @@ UNITS = {"_ms": " [ms]", "_mb": " [MB]", "_bytes": " [bytes]"}
 
 def machine(device: str) -> dict[str, Any]:
     """Hardware, versions, date and commit of the measurements."""
-    if device == "cuda":
-        hardware: dict[str, Any] = {"gpu": torch.cuda.get_device_name()}
-    else:
-        hardware = {"cpu": cpu_model(), "threads": torch.get_num_threads()}
+    name = device_name(torch.device(device))
+    hardware = {"gpu": name} if device == "cuda" else {"cpu": name, "threads": torch.get_num_threads()}
     return {
         **hardware,
         "torch": torch.__version__,
@@ -74,16 +70,6 @@ def machine(device: str) -> dict[str, Any]:
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "commit": commit(),
     }
-
-
-def cpu_model() -> str:
-    """The name of the processor, or its architecture if the system does not provide the name."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def print_machine(head: dict[str, Any]) -> None:

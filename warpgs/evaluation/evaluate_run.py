@@ -1,7 +1,6 @@
 """Evaluation of a run folder: metrics.json, views.csv, images/ and time.mp4."""
 
 import dataclasses
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from warpgs.visualize.images import comparison, to_bytes
 
 from .evaluate import OnView, evaluate, write_views
 from .lpips import find
+from .machine import commit, device_name
 from .metrics import MIN_MS_SSIM_SIDE
 from .motion import jitter
 from .poses import alignment
@@ -66,7 +66,7 @@ def evaluate_run(
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), **_of_run(scene, capture)}
-    write_json(folder / "metrics.json", {**trial, **values, "commit": commit()})
+    write_json(folder / "metrics.json", {**trial, **values, "device": device_name(scene.device), "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)
@@ -140,15 +140,3 @@ def _summary(values: dict[str, Any]) -> str:
         masked = f"mPSNR {show('masked_psnr', 2, ' dB')}, mSSIM {show('masked_ssim', 4)}"
         lines.insert(1, f"co-visible: {masked}, mLPIPS {show('masked_lpips', 4)}")
     return "\n".join(lines)
-
-
-def commit() -> str | None:
-    """The commit of this program if it runs from a checkout; None if it is installed."""
-    root = Path(__file__).parents[2]
-    if not (root / ".git").exists():
-        return None
-    try:
-        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=root, capture_output=True, text=True)
-    except OSError:
-        return None
-    return done.stdout.strip() or None

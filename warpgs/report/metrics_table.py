@@ -37,6 +37,7 @@ TITLES = {
     "masked_ssim": "mSSIM, co-visible",
     "masked_lpips": "mLPIPS, co-visible",
     "fps": "FPS",
+    "device": "FPS measured on",
     "lpips_net": "LPIPS network",
     "num_views": "views",
     "poses_aligned": "held-out cameras aligned",
