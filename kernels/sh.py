@@ -101,8 +101,8 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
 
 
 # Coefficients of one Gaussian are far from those of the next, so that every instruction of a warp that accesses one
-# number touches 32 sectors of memory. Where they begin at multiples of 16 bytes, because the number of bases is a
-# multiple of four, four of them are three pieces of 16 bytes.
+# number touches 32 sectors of memory. Where those of all Gaussians begin at multiples of 16 bytes (``in_fours`` is 1),
+# four of them are three pieces of 16 bytes.
 @wp.func_native(
     native(
         """
@@ -149,12 +149,13 @@ def sh_fwd(
     coefficients: wp.array2d[wp.vec3],
     viewmat: wp.array2d[float],
     num_bases: int,
+    in_fours: int,
     colors: wp.array[wp.vec3],
 ):
     i = first + wp.tid()
     bases = sh_bases(direction_from(means[i], viewpoint(viewmat)))
     color = wp.vec3(0.5)
-    if coefficients.shape[1] % 4 == 0:
+    if in_fours != 0:
         for group in range(NUM_BASES // 4):
             if 4 * group < num_bases:
                 four = load_four(coefficients, i, 4 * group)
@@ -179,6 +180,7 @@ def sh_bwd(
     coefficients: wp.array2d[wp.vec3],
     viewmat: wp.array2d[float],
     num_bases: int,
+    in_fours: int,
     colors: wp.array[wp.vec3],
     v_colors: wp.array[wp.vec3],
     v_means: wp.array[wp.vec3],
@@ -200,7 +202,7 @@ def sh_bwd(
     d = direction_from(means[i], origin)
     bases = sh_bases(d)
     v_bases = bases_vector()
-    if total % 4 == 0:
+    if in_fours != 0:
         for group in range(NUM_BASES // 4):
             if 4 * group < total:
                 v_four = mat43()

@@ -202,6 +202,17 @@ def test_graphed_workloads_of_the_benchmark_compute_the_same(channels):
         assert relative_error(actual, wanted) < 1e-4
 
 
+def test_harmonics_may_begin_anywhere_in_memory():
+    splats, camera = make_splats(200).to("cuda"), make_camera().to("cuda")
+    shifted = torch.empty(splats.sh.numel() + 1, device="cuda")[1:].view(splats.sh.shape).copy_(splats.sh)
+    assert shifted.data_ptr() % 16 != 0
+    expected, actual = (as_leaves(splats), dataclasses.replace(as_leaves(splats), sh=shifted.requires_grad_()))
+    for own in (expected, actual):
+        render(own, camera).joint.image.square().sum().backward()
+    assert relative_error(actual.sh.grad, expected.sh.grad) < 1e-5
+    assert relative_error(actual.means.grad, expected.means.grad) < 1e-5
+
+
 def test_a_bounded_render_needs_no_render_of_its_size_before():
     splats = make_splats(200).to("cuda")
     with torch.no_grad():

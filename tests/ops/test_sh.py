@@ -94,6 +94,21 @@ def test_a_camera_that_is_not_finite_has_a_finite_gradient():
     assert view.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("held", [1, 3])
+def test_coefficients_may_begin_anywhere_in_memory(held):
+    means, sh = inputs(held)
+    shifted = torch.empty(sh.numel() + 1)[1:].view(sh.shape).copy_(sh)
+    assert sh.data_ptr() % 16 == 0
+    assert shifted.data_ptr() % 16 != 0
+    results = []
+    for coefficients in (sh, shifted):
+        leaves = [t.requires_grad_() for t in (means.clone(), coefficients)]
+        colors = spherical_harmonics(*leaves, VIEW)
+        results.append((colors, *torch.autograd.grad(colors.square().sum(), leaves)))
+    for aligned, other in zip(*results, strict=True):
+        assert torch.equal(aligned, other)
+
+
 @pytest.mark.parametrize("num", [0, 1])
 def test_few_gaussians_are_enough(num):
     means, sh = (t.clone().requires_grad_() for t in inputs(num=num))

@@ -49,7 +49,7 @@ def sh_fwd(means: Tensor, sh: Tensor, viewmat: Tensor, degree: int) -> Tensor:
         [N, 3] RGB, not negative; NaN where the sum is not finite, without meaning for Gaussians that projection culls.
     """
     colors = torch.empty_like(means)
-    launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, num_bases(degree), colors)
+    launch(kernels.sh_fwd, means.shape[0], means, sh, viewmat, num_bases(degree), _in_fours(sh), colors)
     return colors
 
 
@@ -68,7 +68,7 @@ def sh_bwd(
     means, sh, viewmat = inputs
     v_sh, v_viewpoints = torch.empty_like(sh), torch.empty_like(means) if viewmat.requires_grad else None
     outputs = (v_means, v_sh, v_viewpoints)
-    launch(kernels.sh_bwd, means.shape[0], *inputs, num_bases(degree), colors, v_colors, *outputs)
+    launch(kernels.sh_bwd, means.shape[0], *inputs, num_bases(degree), _in_fours(sh), colors, v_colors, *outputs)
     if v_viewpoints is None:
         return v_sh, None
     # The viewpoint is -Wᵀ translation of the viewing matrix [W, translation].
@@ -78,3 +78,8 @@ def sh_bwd(
     v_viewmat[:3, :3] = -torch.outer(finite[:3, 3], v_viewpoint)
     v_viewmat[:3, 3] = -finite[:3, :3] @ v_viewpoint
     return v_sh, v_viewmat
+
+
+def _in_fours(sh: Tensor) -> int:
+    """Whether the kernels may access four bases at once: all begin at multiples of 16 bytes, and so does new memory."""
+    return int(sh.shape[1] % 4 == 0 and sh.data_ptr() % 16 == 0)
