@@ -99,4 +99,4 @@ TERMS: dict[str, LossTerm] = {
         weight=lambda plan, config: config.depth_dynamic * plan.depth_weight,
     ),
 }
-"""Terms of the loss by name."""
+"""Terms of the loss by name; gradients are accumulated in this order."""

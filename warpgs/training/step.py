@@ -16,7 +16,6 @@ from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime.graphs import GraphCache
-from warpgs.runtime.streams import concurrently
 
 from . import optimizer as optim
 from . import ranks
@@ -155,8 +154,9 @@ class Step:
         backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
-        inputs = LossInputs(self.config.loss, view, splats, rendering, backgrounds, alignment, trust)
-        terms = self._terms(phase, inputs)
+        config = self.config.loss
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
+        terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()
         optim.average_gradients(self.optimizer)
@@ -165,16 +165,6 @@ class Step:
         self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
-
-    def _terms(self, phase: Phase, inputs: LossInputs) -> dict[str, Tensor]:
-        """The active terms of the loss; every second one beside the others, as one alone leaves most of a GPU idle."""
-        active = [name for name, term in TERMS.items() if term.is_active(phase, self.config.loss)]
-        terms: dict[str, Tensor] = {}
-        with concurrently(self.views.device) as beside:
-            with beside:
-                terms |= {name: TERMS[name].compute(inputs) for name in active[1::2]}
-            terms |= {name: TERMS[name].compute(inputs) for name in active[::2]}
-        return {name: terms[name] for name in active}
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
         """Alignment of the depth of the selected view, and how much it is trusted."""
