@@ -4,8 +4,7 @@
 
 with a = ½ log2(e) conic_xx, b = log2(e) conic_xy, c = ½ log2(e) conic_yy, so that
 log2 alpha = log2 opacity - (a dx² + b dx dy + c dy²). A splat that is skipped (culled, with a feature that is not
-finite, or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY, and its radii become
-0.
+finite, or with a conic that is singular in single precision) has log2 opacity CULLED_LOG2_OPACITY and radii of 0.
 
 For each Gaussian, the backward pass of compositing leaves the gradients of its features and the moments of
 s = alpha v_alpha over its pixels, and

@@ -101,8 +101,8 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
 
 
 # Coefficients of one Gaussian are far from those of the next, so that every instruction of a warp that accesses one
-# number touches 32 sectors of memory. Where those of all Gaussians begin at multiples of 16 bytes (``in_fours`` is 1),
-# four of them are three pieces of 16 bytes.
+# number touches 32 sectors of memory. Where those of all Gaussians begin at multiples of 16 bytes (``in_fours`` is 1 on
+# CUDA), four of them are three pieces of 16 bytes.
 @wp.func_native(
     native(
         """
@@ -196,12 +196,13 @@ def sh_bwd(
             v[c] = 0.0
     # Culled Gaussians, which may have values that are not finite, have no gradient.
     used = int(0)
-    if v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0:
-        used = num_bases
     origin = viewpoint(viewmat)
     d = direction_from(means[i], origin)
-    bases = sh_bases(d)
+    bases = bases_vector()
     v_bases = bases_vector()
+    if v[0] != 0.0 or v[1] != 0.0 or v[2] != 0.0:
+        used = num_bases
+        bases = sh_bases(d)
     if in_fours != 0:
         for group in range(NUM_BASES // 4):
             if 4 * group < total:

@@ -31,7 +31,7 @@ from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import reset_budgets
 from warpgs.rendering import render
 from warpgs.runtime.graphs import capture, record
-from warpgs.runtime.streams import concurrently
+from warpgs.runtime.streams import concurrently, side_stream
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 SETTINGS = [
@@ -200,6 +200,10 @@ def test_graphed_workloads_of_the_benchmark_compute_the_same(channels):
     expected = workload.forward_backward()
     for actual, wanted in zip(graphed(workload).forward_backward(), expected, strict=True):
         assert relative_error(actual, wanted) < 1e-4
+
+
+def test_a_device_without_an_index_has_the_side_stream_of_the_current_one():
+    assert side_stream(torch.device("cuda")) is side_stream(torch.device("cuda", torch.cuda.current_device()))
 
 
 def test_harmonics_may_begin_anywhere_in_memory():

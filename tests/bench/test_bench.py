@@ -2,6 +2,7 @@ import dataclasses
 import functools
 import json
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from warpgs.bench.measure import STAGES, time_in_turn
 from warpgs.bench.run_bench import bench
 from warpgs.bench.scenes import SCENES, Scene, in_disc, random_splats
 from warpgs.bench.training import measure_steps, plain_phase, random_scene
-from warpgs.bench.workloads import graphed, make_workload, parameter_names, sh_degree_of
+from warpgs.bench.workloads import OTHERS, graphed, make_workload, parameter_names, sh_degree_of
 from warpgs.cli import main
 from warpgs.config import RenderSettings
 from warpgs.config.presets import PRESETS
@@ -133,6 +134,21 @@ def test_spherical_harmonics_of_any_degree_can_be_measured(degree, tmp_path, cap
     assert difference < 1e-6 if degree == 0 else 1e-3 < difference < 0.1
     *_, v_sh = workload.forward_backward()
     assert v_sh[:, -1].any()
+
+
+@pytest.mark.parametrize(("sh_degree", "channels"), [(None, (3,)), (2, (9, 3))])
+def test_gsplat_gets_colours_or_harmonics_of_the_same_degree(monkeypatch, sh_degree, channels):
+    calls = []
+
+    def rasterization(*args, **options):
+        calls.append((args[4].shape[1:], options["sh_degree"]))
+        return torch.zeros(1, 32, 48, 3), None, None
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    workload = tiny_workload(sh_degree)
+    (image,) = OTHERS["gsplat"](workload, TINY.make("none", "cpu")[1], False).render()
+    assert calls == [(channels, sh_degree)]
+    assert image.shape == workload.render()[0].shape
 
 
 def test_a_workload_renders_the_given_parameters():

@@ -90,6 +90,18 @@ def test_outputs_that_are_not_used_have_no_gradient():
     assert torch.equal(alone, beside)
 
 
+@pytest.mark.parametrize("num", [0, 5])
+def test_all_gradients_in_half_precision_have_the_scale_of_the_largest_one(num):
+    small, large = torch.ones(num, 3), torch.full((num, 2), -1e5)
+    scaled, unscale = mlp._scaled((small, large), (64, 8))
+    assert scaled.isfinite().all()
+    assert scaled.shape == (64, 8)
+    assert not scaled[num:].any()
+    assert not scaled[:, 5:].any()
+    expected = torch.cat([small, large], 1)
+    assert torch.allclose(scaled[:num, :5].float() * unscale, expected, rtol=1e-3)
+
+
 def test_inputs_get_no_gradient():
     shapes = make_shapes(3, 0)
     inputs = random_inputs(4, 0).requires_grad_()

@@ -433,7 +433,7 @@ def test_a_fit_of_the_deformation_which_takes_a_while_is_announced(data, tmp_pat
     trainer, logger = tiny.trainer(data, tmp_path / "run", config), Mock(spec=TrainingLogger)
     assert trainer._add_dynamic_gaussians(logger=logger)
     lines = [call.args[0] for call in logger.log.call_args_list]
-    assert lines == ["first, 2 steps fit the deformation to points on what moves"] * (steps > 0)
+    assert lines == ["before stage I, 2 steps fit the deformation to points on what moves"] * (steps > 0)
 
 
 def test_if_everything_is_assumed_static_there_are_no_dynamic_gaussians():

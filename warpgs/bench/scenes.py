@@ -95,7 +95,8 @@ def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> 
 def with_harmonics(splats: Splats, degree: int) -> Splats:
     """The splats with spherical harmonics of a degree whose mean over all directions is their colour."""
     assert splats.colors is not None
-    sh = SH_NOISE * torch.randn(len(splats.means), num_bases(degree), 3, generator=torch.Generator().manual_seed(SEED))
+    generator = torch.Generator().manual_seed(SEED + 2)
+    sh = SH_NOISE * torch.randn(len(splats.means), num_bases(degree), 3, generator=generator)
     sh[:, 0] = (splats.colors - 0.5) / SH_C0
     return dataclasses.replace(splats, colors=None, sh=sh)
 

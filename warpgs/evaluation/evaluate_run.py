@@ -65,8 +65,8 @@ def evaluate_run(
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
-    values = {**evaluation.summary(), **_of_run(scene, capture)}
-    write_json(folder / "metrics.json", {**trial, **values, "device": device_name(scene.device), "commit": commit()})
+    values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
+    write_json(folder / "metrics.json", {**trial, **values, "commit": commit()})
     write_views(folder / "views.csv", evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     return _summary(values)

@@ -55,7 +55,7 @@ class Trunk(nn.Module):
         return [Layer(weight[:r, :c], bias[:r]) for (weight, bias), (r, c) in zip(layers, self.sizes, strict=True)]
 
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> tuple[Tensor, ...]:
-        """[N, number] for each of ``outputs``, at N positions and one time in [0, 1].
+        """Evaluates the network at N positions and one time in [0, 1]: [N, number] for each of ``outputs``.
 
         No gradient flows to the positions.
         """

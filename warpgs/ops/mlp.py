@@ -89,7 +89,7 @@ def perceptron(
         num_rows: N, the number of inputs to return the outputs of; the others are padding. All by default.
 
     Returns:
-        [N, number] for each number of outputs: separate tensors, so that neither they nor their gradients are copied.
+        [N, number] for each number of outputs: contiguous tensors, whose gradients autograd need not join.
 
     Raises:
         ValueError: In half precision, if the sizes do not fit, or MPS limits the multiprocessors of this process.

@@ -81,5 +81,5 @@ def sh_bwd(
 
 
 def _in_fours(sh: Tensor) -> int:
-    """Whether the kernels may access four bases at once: all begin at multiples of 16 bytes, and so does new memory."""
-    return int(sh.shape[1] % 4 == 0 and sh.data_ptr() % 16 == 0)
+    """Whether kernels access four bases at once: on CUDA, if those of all Gaussians begin at multiples of 16 bytes."""
+    return int(sh.is_cuda and sh.shape[1] % 4 == 0 and sh.data_ptr() % 16 == 0)

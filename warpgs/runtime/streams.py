@@ -21,7 +21,8 @@ def side_stream(device: torch.device) -> torch.cuda.Stream:
     Each thread has its own, because another thread may be capturing a graph, and so has each current stream, because
     freed memory is reused by work that waits for only one of them.
     """
-    key = f"{torch.cuda.current_stream(device).cuda_stream} on {device}"
+    current = torch.cuda.current_stream(device)
+    key = f"{current.cuda_stream} on {current.device}"  # ``device`` may have no index
     streams = _streams.__dict__
     if key not in streams:
         streams[key] = torch.cuda.Stream(device)

@@ -239,7 +239,8 @@ class Trainer:
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None, logger: TrainingLogger | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
         if logger is not None and self.protocol.fits_motion:
-            logger.log(f"first, {self.config.schedule.fit_motion:,} steps fit the deformation to points on what moves")
+            steps = self.config.schedule.fit_motion
+            logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.protocol, self.capture, self.views, self.alignments, self.scene.deformation)
         found = initialize.dynamic_gaussians(
