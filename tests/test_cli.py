@@ -100,6 +100,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["export", "--fromat", "ply"], "warpgs export: there is no option --fromat; did you mean --format?"),
         (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
         (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),
+        (["train", "--quiet"], "warpgs train: there is no option --quiet; warpgs train --help lists all"),
         (["render", "r", "--zzz"], "warpgs render: there is no option --zzz; warpgs render --help lists all"),
         (["\x1b[2J"], "warpgs: there is no command \\x1b[2J; warpgs --help lists all"),
         (["export", "--\x1b[2J"], "warpgs export: there is no option --\\x1b[2J; "),
