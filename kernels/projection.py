@@ -215,7 +215,7 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         height: int,
         compensate: int,
         rows: wp.array2d[wp.vec4],
-        gradients: wp.array3d[wp.vec4],
+        gradients: wp.array2d[wp.vec4],
         imagegrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],

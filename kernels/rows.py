@@ -61,15 +61,6 @@ def row_load(rows: wp.array2d[wp.vec4], i: int, part: int) -> wp.vec4: ...
 def row_store(rows: wp.array2d[wp.vec4], i: int, part: int, value: wp.vec4): ...
 
 
-@wp.func_native(
-    native(
-        "const float4 v = *(const float4*)&wp::index(gradients, shard, i, part); return wp::vec4(v.x, v.y, v.z, v.w);",
-        "return wp::index(gradients, shard, i, part);",
-    )
-)
-def gradients_load(gradients: wp.array3d[wp.vec4], shard: int, i: int, part: int) -> wp.vec4: ...
-
-
 @wp.func
 def is_culled(rows: wp.array2d[wp.vec4], i: int) -> bool:
     return row_load(rows, i, 1)[1] == CULLED_LOG2_OPACITY
@@ -146,7 +137,7 @@ sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)
 def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that turns a gradient row into the gradients of a splat, features and ``screen_offsets``.
 
-    ``gradients`` has one slice for each CPU shard; on CUDA there is a single slice. ``v_screen_offsets``, which may be
+    ``gradients`` has the rows of all splats once for each CPU shard; on CUDA, once. ``v_screen_offsets``, which may be
     missing, is the gradient of the mean in halves of the image size; that of the images alone if ``imagegrad`` is 1.
     """
     num_channels = num_features + int(with_depth)
@@ -155,7 +146,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     def unpack_splat(
         i: int,
         rows: wp.array2d[wp.vec4],
-        gradients: wp.array3d[wp.vec4],
+        gradients: wp.array2d[wp.vec4],
         width: int,
         height: int,
         imagegrad: int,
@@ -166,8 +157,8 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
         s = sums_vector()
         for part in range(wp.static(gradient_stride(num_channels) // 4)):
             total = wp.vec4(0.0)
-            for shard in range(gradients.shape[0]):
-                total += gradients_load(gradients, shard, i, part)
+            for row in range(i, gradients.shape[0], rows.shape[0]):  # of each shard
+                total += row_load(gradients, row, part)
             for k in range(4):
                 if part * 4 + k < wp.static(num_features):
                     v_features[i, part * 4 + k] = total[k]

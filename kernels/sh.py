@@ -107,7 +107,7 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
     native(
         """
         const float4* pieces = (const float4*)&wp::index(coefficients, i, first);
-        mat43 four;
+        wp::mat_t<4, 3, float> four;
         float* v = &four.data[0][0];
         for (int k = 0; k < 3; ++k) {
             const float4 p = pieces[k];
@@ -116,12 +116,12 @@ def direction_from(mean: wp.vec3, origin: wp.vec3) -> wp.vec3:
         return four;
         """,
         """
-        mat43 four;
+        wp::mat_t<4, 3, float> four;
         for (int k = 0; k < 4; ++k)
             for (int c = 0; c < 3; ++c) four.data[k][c] = wp::index(coefficients, i, first + k)[c];
         return four;
         """,
-    ).replace("mat43", "wp::mat_t<4, 3, wp::float32>")
+    )
 )
 def load_four(coefficients: wp.array2d[wp.vec3], i: int, first: int) -> mat43: ...
 

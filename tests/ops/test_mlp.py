@@ -91,7 +91,7 @@ def test_outputs_that_are_not_used_have_no_gradient():
 
 
 @pytest.mark.parametrize("num", [0, 5])
-def test_all_gradients_in_half_precision_have_the_scale_of_the_largest_one(num):
+def test_gradients_in_half_precision_are_scaled_by_their_common_maximum(num):
     small, large = torch.ones(num, 3), torch.full((num, 2), -1e5)
     scaled, unscale = mlp._scaled((small, large), (64, 8))
     assert scaled.isfinite().all()

@@ -26,7 +26,8 @@ def random_features(num=NUM, channels=CHANNELS) -> torch.Tensor:
 
 
 def pack(features, with_depth=False):
-    return project_fwd(geometry_and_view(len(features))[0], features, geometry_and_view()[1], 0.01, False, with_depth)
+    geometry, view = geometry_and_view(len(features))
+    return project_fwd(geometry, features, view, 0.01, False, with_depth)
 
 
 @pytest.mark.parametrize("with_depth", [False, True])

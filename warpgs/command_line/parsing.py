@@ -73,7 +73,8 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in known and not name.startswith("--tyro"):
-            close = difflib.get_close_matches(name[2:], [option[2:] for option in known], 1)  # dashes are no likeness
+            # Without the dashes, which would make all short options similar.
+            close = difflib.get_close_matches(name[2:], [option[2:] for option in known], 1)
             advice = f"did you mean --{close[0]}?" if close else f"{prog} --help lists all"
             sys.stderr.write(f"{prog}: there is no option {visible(name)}; {advice}\n")
             raise SystemExit(FAILED)

@@ -192,9 +192,9 @@ def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor
     """The outputs' gradients in half precision, beside each other, scaled and padded, and the inverse of the scale."""
     norms = [torch.linalg.vector_norm(v, torch.inf) for v in gradients if len(v)] or [gradients[0].new_zeros(())]
     largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
-    scaled, begin = gradients[0].new_zeros(shape, dtype=torch.float16), 0
+    scale, scaled, begin = MAX_GRADIENT / largest, gradients[0].new_zeros(shape, dtype=torch.float16), 0
     for v in gradients:
-        torch.mul(v, MAX_GRADIENT / largest, out=scaled[: len(v), begin : begin + v.shape[1]])
+        torch.mul(v, scale, out=scaled[: len(v), begin : begin + v.shape[1]])
         begin += v.shape[1]
     return scaled, largest / MAX_GRADIENT
 
