@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
+from tests.ops.test_mlp import LAYERS, random_layer
 from tests.ops.test_sort import CASES, random_keys, sorted_pairs
 from tests.ops.test_tiles import binned, projected
 from tests.reference.depth_error import random_inputs
@@ -26,6 +27,7 @@ from warpgs.config import RenderSettings
 from warpgs.kernels.constants import CULLED_DEPTH
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
+from warpgs.ops.mlp import layer_backward
 from warpgs.ops.projection import Geometry, View, project_fwd
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import reset_budgets
@@ -113,6 +115,19 @@ def test_every_image_equals_that_of_its_splats_rendered_alone(size):
             alone = render(dataclasses.replace(splats, **fields), camera).joint
             assert relative_error(layer.image, alone.image) < 1e-5
             assert relative_error(layer.alpha, alone.alpha) < 1e-5
+
+
+@pytest.mark.parametrize("sizes", [*LAYERS, (4992, 256, 256, (88, 0)), (50_048, 56, 256, (0, 88))])
+def test_the_gradient_before_a_layer_equals_that_on_cpu(sizes):
+    layer = random_layer(*sizes)
+    results = []
+    for device in ("cpu", "cuda", "cuda"):
+        inputs = [tensor.to(device, copy=True) for tensor in layer]
+        results.append((layer_backward(*inputs).cpu(), inputs[-1].cpu()))
+    expected, actual, again = results
+    for own, wanted, same in zip(actual, expected, again, strict=True):
+        assert relative_error(own, wanted) < 1e-4
+        assert torch.equal(own, same)
 
 
 def test_an_empty_scene_is_background():

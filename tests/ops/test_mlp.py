@@ -1,4 +1,4 @@
-"""The multilayer perceptron, and the backward pass of ReLU and bias in half precision."""
+"""The multilayer perceptron, and the backward pass of a layer in half precision."""
 
 import pytest
 import torch
@@ -6,7 +6,7 @@ import torch
 from tests.reference import mlp as reference
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.ops import mlp
-from warpgs.ops.mlp import MAX_CHUNKS, ROWS_PER_CHUNK, num_sums, num_values, perceptron, relu_backward, split
+from warpgs.ops.mlp import layer_backward, num_tiles, num_values, perceptron, split
 
 COLUMNS, WIDTH, OUTPUTS = 6, 16, (3, 1, 1)
 LAYOUTS = [(9, 4), (4, 2), (4, 1), (5, 0), (2, 0)]
@@ -139,53 +139,81 @@ def random_half(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed)).half()
 
 
-def empty_sums(gradients):
-    return torch.full((num_sums(len(gradients)), gradients.shape[1]), torch.nan)
+def empty_sums(num, columns):
+    return torch.full((num_tiles(num), columns), torch.nan)
 
 
-@pytest.mark.parametrize(
-    ("num", "columns", "extra"), [(1, 8, 0), (37, 16, 24), (MAX_CHUNKS * ROWS_PER_CHUNK + 3, 8, 0)]
-)
-def test_gradients_pass_where_features_are_positive_and_are_summed(num, columns, extra):
-    features = random_half(num, columns + extra)
-    features[:, :columns].clamp_min_(0.0)
+LAYERS = [
+    (1, 8, 8, (0, 0)),
+    (37, 8, 24, (16, 8)),
+    (128, 32, 128, (0, 0)),
+    (300, 40, 136, (0, 88)),
+    (150, 104, 264, (8, 0)),
+]
+"""Rows, outputs, columns of the gradient, and further columns of the weights and of the features."""
+
+
+def random_layer(num, outputs, columns, more):
+    """Gradient of the outputs, weights, features, and unwritten sums."""
+    v_outputs, weight = random_half(num, outputs), random_half(outputs, columns + more[0], seed=1)
+    features = random_half(num, columns + more[1], seed=2)
     features[0, 0] = 0.0
-    gradients = random_half(num, columns, seed=1)
-    expected, _ = reference.relu_backward(features[:, :columns], gradients)
-    sums = empty_sums(gradients)
-    relu_backward(features, gradients, sums)
-    assert torch.equal(gradients, expected)
-    assert torch.allclose(sums.double().sum(0), expected.double().sum(0), rtol=1e-6, atol=1e-5)
+    return v_outputs, weight, features, empty_sums(num, columns)
+
+
+@pytest.mark.parametrize("sizes", LAYERS)
+def test_the_gradient_before_a_layer_is_masked_and_summed(sizes):
+    v_outputs, weight, features, sums = random_layer(*sizes)
+    actual, columns = layer_backward(v_outputs, weight, features, sums), sizes[2]
+    expected = reference.layer_backward(v_outputs.double(), weight[:, :columns].double(), features[:, :columns])
+    assert actual.shape == expected.shape
+    assert torch.equal(actual == 0, expected == 0)
+    assert error(actual, expected) <= 2**-11 * expected.abs().max()  # rounded to half precision
+    assert torch.allclose(sums.double().sum(0), actual.double().sum(0), rtol=1e-6, atol=1e-4)
 
 
 def test_tiny_features_and_nan_count_as_positive():
-    features = torch.tensor([[6e-8, 0.0, torch.nan, torch.inf, 1.0, 0.0, 0.0, 0.0]]).half()
-    gradients = torch.arange(1, 9).half()[None]
-    relu_backward(features, gradients, empty_sums(gradients))
-    assert gradients.tolist() == [[1, 0, 3, 4, 5, 0, 0, 0]]
+    features = torch.tensor([[6e-8, 0.0, torch.nan, torch.inf, 1.0, -1.0, -0.0, -torch.inf]]).half()
+    v_outputs, weight = torch.eye(8)[:1].half(), torch.zeros(8, 8).half()
+    weight[0] = torch.arange(1, 9)
+    assert layer_backward(v_outputs, weight, features, empty_sums(1, 8)).tolist() == [[1, 0, 3, 4, 5, 0, 0, 0]]
 
 
-def test_no_rows_have_no_partial_sums():
-    assert num_sums(0) == 0
-    relu_backward(random_half(0, 8), random_half(0, 8), torch.zeros(0, 8))
+def test_nan_passes_a_layer_backward():
+    v_outputs, weight, features = torch.ones(2, 8).half(), torch.ones(8, 8).half(), torch.ones(2, 8).half()
+    v_outputs[1, 3] = torch.nan
+    sums = empty_sums(2, 8)
+    actual = layer_backward(v_outputs, weight, features, sums)
+    assert actual[0].eq(8.0).all()
+    assert actual[1].isnan().all()
+    assert sums.isnan().all()
 
 
-def test_sums_of_a_wrong_size_are_refused():
-    with pytest.raises(ValueError, match="sums must"):
-        relu_backward(random_half(9, 8), random_half(9, 8), torch.zeros(2, 8))
+def test_no_rows_have_no_tiles():
+    assert num_tiles(0) == 0
+    v_inputs = layer_backward(random_half(0, 8), random_half(8, 16), random_half(0, 16), torch.zeros(0, 16))
+    assert v_inputs.shape == (0, 16)
+
+
+LAYER = {"v_outputs": (3, 8), "weight": (8, 16), "features": (3, 24)}
 
 
 @pytest.mark.parametrize(
-    ("features", "gradients", "words"),
+    ("changed", "shape_of_sums", "words"),
     [
-        (random_half(3, 8), random_half(3, 12), "multiple of 8"),
-        (random_half(3, 8), random_half(3, 16), "at most"),
-        (random_half(4, 8), random_half(3, 8), "gradients must"),
-        (random_half(3, 8).float(), random_half(3, 8), "features must"),
-        (random_half(3, 8), random_half(8, 3).T, "gradients must"),
+        ({}, (2, 16), "sums must"),
+        ({}, (1, 12), "multiples of 8"),
+        ({"v_outputs": random_half(3, 12), "weight": random_half(12, 16)}, (1, 16), "multiples of 8"),
+        ({"weight": random_half(16, 16)}, (1, 16), "weight must"),
+        ({"weight": random_half(16, 8).T}, (1, 16), "weight must be contiguous"),
+        ({"features": random_half(4, 16)}, (1, 16), "features must"),
+        ({"features": random_half(3, 16).float()}, (1, 16), "features must"),
+        ({}, (1, 24), "at least as many columns"),
+        ({"weight": random_half(8, 32)}, (1, 32), "at least as many columns"),
     ],
 )
 @pytest.mark.usefixtures("contracts_off")
-def test_relu_backward_refuses_inputs_that_do_not_fit(features, gradients, words):
+def test_a_layer_backward_refuses_inputs_that_do_not_fit(changed, shape_of_sums, words):
+    inputs = {name: random_half(*shape) for name, shape in LAYER.items()} | changed
     with pytest.raises(ValueError, match=words):
-        relu_backward(features, gradients, empty_sums(gradients))
+        layer_backward(**inputs, sums=torch.zeros(shape_of_sums))

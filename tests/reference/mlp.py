@@ -16,7 +16,6 @@ def perceptron(encoding: Tensor, layers: list[tuple[Tensor, Tensor]], skip: int)
     return values
 
 
-def relu_backward(features: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of the inputs of ReLU, and their sum over the rows, given its outputs and their gradients."""
-    masked = torch.where(features > 0, gradients, 0.0)
-    return masked, masked.sum(0)
+def layer_backward(v_outputs: Tensor, weight: Tensor, features: Tensor) -> Tensor:
+    """Gradients of the inputs of the ReLU before a layer, given its outputs' gradients, weights and inputs."""
+    return torch.where(features > 0, v_outputs @ weight, 0.0)

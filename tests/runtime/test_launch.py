@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.scenes import as_leaves, generator, gradients, make_camera, make_splats
-from warpgs.kernels.mlp import relu_bwd
+from warpgs.kernels.mlp import make_layer_bwd
 from warpgs.kernels.projection import make_project_fwd
 from warpgs.ops.rows import new_order, new_rows
 from warpgs.rendering import render
@@ -48,20 +48,20 @@ def test_a_tensor_in_the_place_of_a_number_is_refused():
 
 
 def test_a_wrong_number_of_arguments_is_refused():
-    features, gradients = torch.zeros(2, 6, 8).half()
-    launching.launch(relu_bwd, 2, features, gradients, torch.zeros(2, 8))
+    matrices = torch.zeros(4, 8, 8).half()
+    launching.launch(make_layer_bwd(False), 1, *matrices, torch.zeros(1, 8))
     with pytest.raises(ValueError, match="shorter"):
-        launching.launch(relu_bwd, 2, features, gradients)
+        launching.launch(make_layer_bwd(False), 1, *matrices)
 
 
 def test_leading_axes_of_a_kernel_argument_are_flattened():
-    features, gradients = torch.randn(2, 6, 8, generator=generator()).half()
-    expected, sums = torch.zeros(2, 2, 8)
-    launching.launch(relu_bwd, 2, features, gradients.clone(), expected)
+    v_outputs, weight, features, v_inputs = torch.randn(4, 8, 8, generator=generator()).half()
+    expected, sums = torch.zeros(2, 1, 8)
+    launching.launch(make_layer_bwd(False), 1, v_outputs, weight, features, v_inputs, expected)
     assert expected.any()
-    odd = features.view(3, 1, 2, 8).transpose(1, 2)  # contiguous, whatever the stride of an axis of size one is
+    odd = features.view(4, 1, 2, 8).transpose(1, 2)  # contiguous, whatever the stride of an axis of size one is
     assert odd.is_contiguous()
-    launching.launch(relu_bwd, 2, odd, gradients.view(1, 6, 8), sums)
+    launching.launch(make_layer_bwd(False), 1, v_outputs.view(1, 8, 8), weight, odd, v_inputs, sums)
     assert torch.equal(sums, expected)
 
 

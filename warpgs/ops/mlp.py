@@ -32,12 +32,6 @@ the largest number, 65504, and with 34 bits until a gradient underflows."""
 MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 """Variable that limits the multiprocessors of a process; what it breaks is in docs/design/half-precision.md."""
 
-MAX_CHUNKS = 4096
-"""Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
-
-ROWS_PER_CHUNK = 4
-"""Minimum number of rows of a partial sum."""
-
 
 class Layer(NamedTuple):
     """Parameters of one layer, as views.
@@ -166,20 +160,19 @@ class _Perceptron(torch.autograd.Function):
         torch.cat([v.sum(0) for v in gradients], out=v_head_bias[used])
         if is_half:
             gradient, unscale = _scaled(gradients, shape)
-            sums = v_values.new_empty(len(layers) - 1, num_sums(len(gradient)), len(layers[0].bias))
+            sums = v_values.new_empty(len(layers) - 1, num_tiles(len(gradient)), len(layers[0].bias))
         else:
             gradient = v_values.new_zeros(shape)
             torch.cat(gradients, 1, out=gradient[: len(gradients[0]), used])
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
-            if k > 0:
+            if k > 0 and is_half:
+                gradient = layer_backward(gradient, layers[k].weight, layer_inputs[k], sums[k - 1])
+            elif k > 0:
                 gradient = torch.mm(gradient, layers[k].weight[:, : len(layers[k - 1].bias)])
-                if is_half:
-                    relu_backward(layer_inputs[k], gradient, sums[k - 1])
-                else:
-                    features = layer_inputs[k][:, : gradient.shape[1]]
-                    torch.ops.aten.threshold_backward(gradient, features, 0, grad_input=gradient)
-                    torch.sum(gradient, 0, out=v_layers[k - 1].bias)
+                features = layer_inputs[k][:, : gradient.shape[1]]
+                torch.ops.aten.threshold_backward(gradient, features, 0, grad_input=gradient)
+                torch.sum(gradient, 0, out=v_layers[k - 1].bias)
         if is_half:
             v_biases = v_values[-len(v_head_bias) - sums.shape[0] * sums.shape[2] : -len(v_head_bias)]
             torch.sum(sums, 1, out=v_biases.view(sums.shape[0], sums.shape[2]))
@@ -215,37 +208,47 @@ def _product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
     return torch.ops.aten.mm.dtype_out(a, b, torch.float32, out=out)
 
 
-def num_sums(num_rows: int) -> int:
-    """Number of partial sums that ``relu_backward`` writes for a number of rows."""
-    return min(MAX_CHUNKS, -(-num_rows // ROWS_PER_CHUNK))
+def num_tiles(size: int) -> int:
+    """Number of tiles along an axis of the matrix that ``layer_backward`` returns."""
+    return -(-size // kernels.TILE)
 
 
-def relu_backward(
-    features: Float16[Tensor, "N read"],
-    gradients: Float16[Tensor, "N columns"],
-    sums: Float32[Tensor, "chunks columns"],
-) -> None:
-    """Sets gradients to zero, in place, where features are not positive, and sums them over the rows.
+def layer_backward(
+    v_outputs: Float16[Tensor, "N outputs"],
+    weight: Float16[Tensor, "outputs weight_columns"],
+    features: Float16[Tensor, "N feature_columns"],
+    sums: Float32[Tensor, "tiles columns"],
+) -> Float16[Tensor, "N columns"]:
+    """Backward pass of a layer and of the ReLU before it.
 
     Args:
-        features: [N, ≥ columns] output of ReLU, in the first columns.
-        gradients: [N, columns] its gradient; the number of columns is a multiple of 8.
-        sums: [num_sums(N), columns] output: partial sums of the masked gradients, whose sum over the first axis is the
-            gradient of the bias.
+        v_outputs: [N, outputs] gradient of the layer's outputs.
+        weight: [outputs, ≥ columns] its weights.
+        features: [N, ≥ columns] its inputs, the output of ReLU in the first columns.
+        sums: [num_tiles(N), columns] output: partial sums of the result, whose sum over the first axis is the gradient
+            of the bias before ReLU.
+
+    Returns:
+        [N, columns] gradient of the inputs of ReLU: v_outputs · weight, and zero where features are not positive.
 
     Raises:
-        ValueError: On a wrong shape, dtype or device, or a tensor that is not contiguous.
+        ValueError: On a wrong shape, dtype or device, a number of columns that is not a multiple of 8, or a tensor that
+            is not contiguous.
     """
-    sizes: dict[str, int] = {"chunks": num_sums(len(gradients))}
-    check_tensor("features", features, ("N", "read"), sizes, (torch.float16,))
-    check_tensor("gradients", gradients, ("N", "columns"), sizes, (torch.float16,))
-    check_tensor("sums", sums, ("chunks", "columns"), sizes)
-    check_same_device({"features": features, "gradients": gradients, "sums": sums})
-    columns = gradients.shape[1]
-    if columns % kernels.PIECE or columns > features.shape[1]:
-        raise ValueError(
-            f"gradients must have a multiple of {kernels.PIECE} columns, "
-            f"{features.shape[1]} at most as features have, got {columns}"
-        )
-    pieces = columns // kernels.PIECE
-    launch(kernels.relu_bwd, len(sums) * pieces, features, gradients, sums, work=ROWS_PER_CHUNK)
+    tensors = {"v_outputs": v_outputs, "weight": weight, "features": features, "sums": sums}
+    sizes: dict[str, int] = {"tiles": num_tiles(len(v_outputs))}
+    check_tensor("v_outputs", v_outputs, ("N", "outputs"), sizes, (torch.float16,))
+    check_tensor("weight", weight, ("outputs", "weight_columns"), sizes, (torch.float16,))
+    check_tensor("features", features, ("N", "feature_columns"), sizes, (torch.float16,))
+    check_tensor("sums", sums, ("tiles", "columns"), sizes)
+    check_same_device(tensors)
+    if any(tensor.shape[1] % kernels.PIECE for tensor in tensors.values()):
+        raise ValueError(f"all numbers of columns must be multiples of {kernels.PIECE}, got {sizes}")
+    if sizes["columns"] > min(sizes["weight_columns"], sizes["feature_columns"]):
+        raise ValueError(f"weight and features must have at least as many columns as sums, got {sizes}")
+    v_inputs = v_outputs.new_empty(len(v_outputs), sums.shape[1])
+    kernel = kernels.make_layer_bwd(v_outputs.is_cuda)
+    threads = num_tiles(len(v_inputs)) * num_tiles(sums.shape[1]) * (kernels.BLOCK_DIM if v_outputs.is_cuda else 1)
+    arguments = (v_outputs, weight, features, v_inputs, sums)
+    launch(kernel, threads, *arguments, block_dim=kernels.BLOCK_DIM, work=kernels.TILE**2)
+    return v_inputs
