@@ -2,6 +2,8 @@
 
     y = W h,   h = max(0, x),   v_x = (v_y W) · [h > 0],   v_bias = Σ over rows of v_x
 
+The gradient of the last layer is scaled to the range of half precision before (``scale_gradients``).
+
 The product is masked and summed before it is stored; ReLU on its own would read and write the whole matrix again. A
 tile of ``TILE`` by ``TILE`` elements of v_x is computed at once: on CPU by a thread, on CUDA by a block of four warps,
 which multiply 64 by 64 elements each on tensor cores, with sums in single precision. Sums over rows are taken per tile
@@ -243,3 +245,27 @@ def make_layer_bwd(on_cuda: bool) -> wp.Kernel:
         multiply_tile((first + wp.tid()) / wp.static(threads), v_y, w, h, v_x, sums)
 
     return layer_bwd
+
+
+@wp.kernel(enable_backward=False)
+def scale_gradients(
+    first: int,
+    gradients: wp.array2d[float],
+    scale: wp.array[float],
+    begin: int,
+    scaled: wp.array2d[wp.float16],
+    sums: wp.array2d[float],
+):
+    """Thread (chunk, column): scales rows chunk, chunk + chunks, … of one column, and sums them unscaled.
+
+    Column k of ``gradients`` becomes column ``begin`` + k of ``scaled`` and of ``sums`` [chunks, columns].
+    """
+    thread = first + wp.tid()
+    chunk = thread // gradients.shape[1]
+    column = thread - chunk * gradients.shape[1]
+    sum = float(0.0)
+    for row in range(chunk, gradients.shape[0], sums.shape[0]):
+        value = gradients[row, column]
+        scaled[row, begin + column] = wp.float16(value * scale[0])
+        sum += value
+    sums[chunk, begin + column] = sum

@@ -23,7 +23,7 @@ def assert_compiles(module, folder, arch=ARCH):
     assert f".target sm_{arch}" in ptx.read_text()
 
 
-MODULES = ["activation", "adam", "depth_error", "raytrace", "sh", "tiles"]
+MODULES = ["activation", "adam", "depth_error", "mlp", "raytrace", "sh", "tiles"]
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -93,13 +93,15 @@ def test_outputs_that_are_not_used_have_no_gradient():
 @pytest.mark.parametrize("num", [0, 5])
 def test_gradients_in_half_precision_are_scaled_by_their_common_maximum(num):
     small, large = torch.ones(num, 3), torch.full((num, 2), -1e5)
-    scaled, unscale = mlp._scaled((small, large), (64, 8))
+    scaled, unscale, sums = mlp._scaled((small, large), (64, 8))
     assert scaled.isfinite().all()
     assert scaled.shape == (64, 8)
     assert not scaled[num:].any()
     assert not scaled[:, 5:].any()
     expected = torch.cat([small, large], 1)
     assert torch.allclose(scaled[:num, :5].float() * unscale, expected, rtol=1e-3)
+    assert torch.equal(sums.sum(0)[:5], expected.sum(0))
+    assert not sums[:, 5:].any()
 
 
 def test_inputs_get_no_gradient():

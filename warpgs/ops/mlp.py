@@ -32,6 +32,12 @@ the largest number, 65504, and with 34 bits until a gradient underflows."""
 MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 """Variable that limits the multiprocessors of a process; what it breaks is in docs/design/half-precision.md."""
 
+MAX_CHUNKS = 4096
+"""Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
+
+ROWS_PER_CHUNK = 4
+"""Minimum number of rows of a partial sum."""
+
 
 class Layer(NamedTuple):
     """Parameters of one layer, as views.
@@ -156,14 +162,13 @@ class _Perceptron(torch.autograd.Function):
         v_values = torch.empty_like(copy, dtype=torch.float32)
         v_layers = split(v_values, ctx.shapes)
         shape = len(layer_inputs[0]), len(layers[-1].bias)
-        v_head_bias, used = v_values.new_zeros(shape[1]), slice(sum(v.shape[1] for v in gradients))
-        torch.cat([v.sum(0) for v in gradients], out=v_head_bias[used])
         if is_half:
-            gradient, unscale = _scaled(gradients, shape)
+            gradient, unscale, head_sums = _scaled(gradients, shape)
             sums = v_values.new_empty(len(layers) - 1, num_tiles(len(gradient)), len(layers[0].bias))
         else:
             gradient = v_values.new_zeros(shape)
-            torch.cat(gradients, 1, out=gradient[: len(gradients[0]), used])
+            torch.cat(gradients, 1, out=gradient[: len(gradients[0]), : sum(v.shape[1] for v in gradients)])
+            torch.sum(gradient, 0, out=v_layers[-1].bias)
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0 and is_half:
@@ -174,22 +179,27 @@ class _Perceptron(torch.autograd.Function):
                 torch.ops.aten.threshold_backward(gradient, features, 0, grad_input=gradient)
                 torch.sum(gradient, 0, out=v_layers[k - 1].bias)
         if is_half:
-            v_biases = v_values[-len(v_head_bias) - sums.shape[0] * sums.shape[2] : -len(v_head_bias)]
+            v_biases = v_values[-shape[1] - sums.shape[0] * sums.shape[2] : -shape[1]]
             torch.sum(sums, 1, out=v_biases.view(sums.shape[0], sums.shape[2]))
             v_values *= unscale
-        v_layers[-1].bias.copy_(v_head_bias)
+            torch.sum(head_sums, 0, out=v_layers[-1].bias)
         return None, v_values, None, None, None, None
 
 
-def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The outputs' gradients in half precision, beside each other, scaled and padded, and the inverse of the scale."""
+def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """The outputs' gradients in half precision, beside each other, scaled and padded.
+
+    Also the inverse of the scale, and partial sums over rows of what is not scaled.
+    """
     norms = [torch.linalg.vector_norm(v, torch.inf) for v in gradients if len(v)] or [gradients[0].new_zeros(())]
     largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
-    scale, scaled, begin = MAX_GRADIENT / largest, gradients[0].new_zeros(shape, dtype=torch.float16), 0
+    scale, scaled = (MAX_GRADIENT / largest)[None], gradients[0].new_zeros(shape, dtype=torch.float16)
+    sums = scaled.new_zeros(min(MAX_CHUNKS, -(-len(gradients[0]) // ROWS_PER_CHUNK)), shape[1], dtype=torch.float32)
+    begin = 0
     for v in gradients:
-        torch.mul(v, scale, out=scaled[: len(v), begin : begin + v.shape[1]])
+        launch(kernels.scale_gradients, len(sums) * v.shape[1], v.contiguous(), scale, begin, scaled, sums)
         begin += v.shape[1]
-    return scaled, largest / MAX_GRADIENT
+    return scaled, largest / MAX_GRADIENT, sums
 
 
 def _copy_columns(source: Tensor, target: Tensor) -> None:
