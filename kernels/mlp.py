@@ -258,14 +258,15 @@ def scale_gradients(
 ):
     """Thread (chunk, column): scales rows chunk, chunk + chunks, … of one column, and sums them unscaled.
 
-    Column k of ``gradients`` becomes column ``begin`` + k of ``scaled`` and of ``sums`` [chunks, columns].
+    Column k of ``gradients`` becomes column ``begin`` + k of ``scaled``, and row ``begin`` + k of ``sums`` [columns,
+    chunks].
     """
     thread = first + wp.tid()
     chunk = thread // gradients.shape[1]
     column = thread - chunk * gradients.shape[1]
     sum = float(0.0)
-    for row in range(chunk, gradients.shape[0], sums.shape[0]):
+    for row in range(chunk, gradients.shape[0], sums.shape[1]):
         value = gradients[row, column]
         scaled[row, begin + column] = wp.float16(value * scale[0])
         sum += value
-    sums[chunk, begin + column] = sum
+    sums[begin + column, chunk] = sum

@@ -100,8 +100,8 @@ def test_gradients_in_half_precision_are_scaled_by_their_common_maximum(num):
     assert not scaled[:, 5:].any()
     expected = torch.cat([small, large], 1)
     assert torch.allclose(scaled[:num, :5].float() * unscale, expected, rtol=1e-3)
-    assert torch.equal(sums.sum(0)[:5], expected.sum(0))
-    assert not sums[:, 5:].any()
+    assert torch.equal(sums.sum(1)[:5], expected.sum(0))
+    assert not sums[5:].any()
 
 
 def test_inputs_get_no_gradient():

@@ -32,7 +32,7 @@ the largest number, 65504, and with 34 bits until a gradient underflows."""
 MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 """Variable that limits the multiprocessors of a process; what it breaks is in docs/design/half-precision.md."""
 
-MAX_CHUNKS = 4096
+MAX_CHUNKS = 16384
 """Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
 
 ROWS_PER_CHUNK = 4
@@ -182,7 +182,7 @@ class _Perceptron(torch.autograd.Function):
             v_biases = v_values[-shape[1] - sums.shape[0] * sums.shape[2] : -shape[1]]
             torch.sum(sums, 1, out=v_biases.view(sums.shape[0], sums.shape[2]))
             v_values *= unscale
-            torch.sum(head_sums, 0, out=v_layers[-1].bias)
+            torch.sum(head_sums, 1, out=v_layers[-1].bias)
         return None, v_values, None, None, None, None
 
 
@@ -194,10 +194,11 @@ def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor
     norms = [torch.linalg.vector_norm(v, torch.inf) for v in gradients if len(v)] or [gradients[0].new_zeros(())]
     largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
     scale, scaled = (MAX_GRADIENT / largest)[None], gradients[0].new_zeros(shape, dtype=torch.float16)
-    sums = scaled.new_zeros(min(MAX_CHUNKS, -(-len(gradients[0]) // ROWS_PER_CHUNK)), shape[1], dtype=torch.float32)
+    chunks = min(MAX_CHUNKS, -(-len(gradients[0]) // ROWS_PER_CHUNK))
+    sums = scaled.new_zeros(shape[1], chunks, dtype=torch.float32)
     begin = 0
     for v in gradients:
-        launch(kernels.scale_gradients, len(sums) * v.shape[1], v.contiguous(), scale, begin, scaled, sums)
+        launch(kernels.scale_gradients, chunks * v.shape[1], v.contiguous(), scale, begin, scaled, sums)
         begin += v.shape[1]
     return scaled, largest / MAX_GRADIENT, sums
 
