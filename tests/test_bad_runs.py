@@ -64,7 +64,7 @@ def test_a_bad_run_ends_a_command_with_one_line(finished_run, tmp_path, capsys, 
     if command == "view":
         pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
     run = shutil.copytree(finished_run, tmp_path / "run")
-    beginning = f"warpgs: {damage(run)}"
+    beginning = f"warpgs {command}: {damage(run)}"
     assert main([*COMMANDS[command], str(run)]) == 2
     error = capsys.readouterr().err
     assert error.startswith(beginning)

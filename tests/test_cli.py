@@ -134,14 +134,33 @@ def test_positional_arguments_have_names(command, metavars, capsys):
     ],
 )
 def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):
-    try:
-        code = main(arguments)
-    except SystemExit as end:
-        code = end.code
+    assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert code == 2
     assert error.startswith(message)
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["prepare", "gone", "capture"],
+        ["import", "gone", "capture"],
+        ["check", "gone"],
+        ["train", "--data", "gone"],
+        ["sweep", "gone.toml", "--data", "gone"],
+        ["eval", "gone"],
+        ["render", "gone"],
+        ["export", "gone"],
+        ["report", "gone"],
+    ],
+)
+def test_a_line_about_wrong_input_begins_as_one_about_a_wrong_option(arguments, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for options in ([], ["--zzz"]):
+        assert main([*arguments, *options]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"warpgs {arguments[0]}: ")
+        assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
@@ -175,4 +194,4 @@ def test_ctrl_c_during_imports_is_one_line_and_exit_code_130(arguments, capsys, 
     monkeypatch.setattr(Command, "load", interrupted)
     monkeypatch.setattr("importlib.import_module", interrupted)
     assert main(arguments) == 130
-    assert capsys.readouterr().err == "warpgs: stopped\n"
+    assert capsys.readouterr().err == f"warpgs {arguments[0]}: stopped\n"

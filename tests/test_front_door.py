@@ -118,12 +118,14 @@ def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_
     (tmp_path / "sitecustomize.py").write_text(restore)
     path = os.pathsep.join([str(tmp_path), str(Path(warpgs.__file__).parents[1])])
     program = [sys.executable, "-m", "warpgs", *command.split()]
-    ended = subprocess.run(program, capture_output=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path})
-    assert (ended.returncode, ended.stdout, ended.stderr) == (130, b"", b"warpgs: stopped\n")
+    ended = subprocess.run(
+        program, capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", f"warpgs {command.split()[0]}: stopped\n")
 
 
 def test_a_command_refuses_wrong_input_in_one_line(tmp_path):
     ended = run("-m", "warpgs", "eval", str(tmp_path))
     assert ended.returncode == 2
-    assert ended.stderr.strip().splitlines()[-1].startswith("warpgs: ")
+    assert ended.stderr.strip().splitlines()[-1].startswith("warpgs eval: ")
     assert "Traceback" not in ended.stderr

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from .command_line.version import version
-from .errors import FAILED, ending_at_once, program, run_command, visible
+from .errors import FAILED, ending_at_once, program, run_command, say, visible
 
 
 class Command(NamedTuple):
@@ -69,16 +69,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, 1)
         advice = f"did you mean {close[0]}?" if close else "warpgs --help lists all"
-        sys.stderr.write(f"warpgs: there is no command {visible(name)}; {advice}\n")
+        say(f"there is no command {visible(name)}; {advice}")
         return FAILED
-    if name == "train":
-        return train(rest, "warpgs train")
+    prog = f"warpgs {name}"
+    return train(rest, prog) if name == "train" else run_command(lambda: _run(name, rest, prog), prog)
+
+
+def _run(name: str, arguments: Sequence[str], prog: str) -> object:
     with ending_at_once():
         from .command_line.parsing import parse  # imports tyro
 
         command = COMMANDS[name].load()
-    options = parse(command, rest, f"warpgs {name}")
-    return run_command(options.run)
+    return parse(command, arguments, prog).run()
 
 
 @program
@@ -86,7 +88,11 @@ def train(arguments: Sequence[str], prog: str) -> int:
     """``warpgs train`` and ``train.py``: trains, then evaluates; returns the exit code."""
     if "--version" in arguments:
         return main(["--version"])
-    with ending_at_once(prog):
+    return run_command(lambda: _train(arguments, prog), prog)
+
+
+def _train(arguments: Sequence[str], prog: str) -> int:
+    with ending_at_once():
         from .command_line.parsing import described
         from .training import command as training
 

@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
 from typing import ParamSpec
@@ -39,6 +40,14 @@ OUT_OF_MEMORY = re.compile(
 )
 """Messages of errors that mean lack of memory, but whose types do not say so."""
 
+_prog: ContextVar[str] = ContextVar("prog", default="warpgs")
+"""What the user started, as they typed it: ``warpgs``, ``warpgs render``, ``train.py``."""
+
+
+def say(message: str) -> None:
+    """Writes a line on stderr that begins with the program and its command."""
+    sys.stderr.write(f"{_prog.get()}: {message}\n")
+
 
 def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str = ADVICE) -> int:
     """Runs a command and returns its exit code: the int that it returns, 0 if it returns something else.
@@ -48,23 +57,24 @@ def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str
 
     Args:
         command: The command.
-        prog: Name of the program, which the line starts with.
+        prog: The program and its command, ``warpgs render``: what this line and later ones of the program begin with.
         advice: What to do without enough memory.
     """
+    _prog.set(prog)
     try:
         code = command()
     except (ValueError, ImportError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _is_output_closed():
             raise  # to ``program``
-        sys.stderr.write(f"{prog}: {one_line(error)}\n")
+        say(one_line(error))
         return FAILED
     except KeyboardInterrupt as stop:
-        sys.stderr.write(f"{prog}: {str(stop) or 'stopped'}\n")
+        say(str(stop) or "stopped")
         return INTERRUPTED
     except Exception as error:
         if not is_out_of_memory(error):
             raise
-        sys.stderr.write(f"{prog}: out of memory ({one_line(error)[:200]}); {advice}\n")
+        say(f"out of memory ({one_line(error)[:200]}); {advice}")
         return FAILED
     return code if type(code) is int else 0
 
@@ -85,15 +95,12 @@ def _is_output_closed() -> bool:
 
 
 @contextlib.contextmanager
-def ending_at_once(prog: str = "warpgs") -> Iterator[None]:
+def ending_at_once() -> Iterator[None]:
     """While it lasts, Ctrl-C ends the process with one line and ``INTERRUPTED``, and runs nothing else of it.
 
     For imports: a KeyboardInterrupt in the middle of one is swallowed by some packages, and others turn it into an
     ImportError or a RecursionError. Where Ctrl-C is ignored or handled already, and outside of the main thread, which
     alone handles it, it does nothing.
-
-    Args:
-        prog: Name of the program, which the line starts with.
     """
     is_main = threading.current_thread() is threading.main_thread()
     if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -101,7 +108,7 @@ def ending_at_once(prog: str = "warpgs") -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(2, f"{prog}: stopped\n".encode())
+        os.write(2, f"{_prog.get()}: stopped\n".encode())
         os._exit(INTERRUPTED)
 
     signal.signal(signal.SIGINT, end)
@@ -139,6 +146,7 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
 
     @functools.wraps(main)
     def run(*args: P.args, **kwargs: P.kwargs) -> int:
+        before = _prog.set("warpgs")
         try:
             if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
                 sys.stdout.reconfigure(errors="backslashreplace")
@@ -151,8 +159,10 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
                 os.dup2(nowhere.fileno(), sys.stdout.fileno())
             return CLOSED
         except KeyboardInterrupt:
-            sys.stderr.write("warpgs: stopped\n")
+            say("stopped")
             return INTERRUPTED
+        finally:
+            _prog.reset(before)
 
     return run
 

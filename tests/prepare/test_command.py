@@ -13,7 +13,7 @@ def test_a_wrong_source_ends_with_exit_code_2_and_one_line(tmp_path, capsys):
     assert main(["prepare", str(tmp_path / "notes.txt"), str(tmp_path / "captures" / "capture")]) == 2
     assert not (tmp_path / "captures").exists()
     written = capsys.readouterr()
-    assert written.err.startswith("warpgs: ")
+    assert written.err.startswith("warpgs prepare: ")
     assert written.err.count("\n") == 1
     assert "is not a video" in written.err
 
@@ -36,7 +36,7 @@ def test_sigterm_ends_with_one_line_while_colmap_runs(tmp_path):
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert errors == "warpgs: interrupted; run the same command again to continue\n"
+    assert errors == "warpgs prepare: interrupted; run the same command again to continue\n"
 
 
 def test_only_existing_contact_sheets_are_mentioned(tmp_path, capsys, monkeypatch):

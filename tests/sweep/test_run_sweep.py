@@ -83,7 +83,7 @@ def test_a_sweep_without_ray_is_one_line_and_leaves_no_folder(sweep, tmp_path, m
     monkeypatch.setattr(module, "RayPool", missing)
     assert sweep()[0] == 2
     printed = capsys.readouterr()
-    assert (printed.out, printed.err) == ("", f"warpgs: {error}\n")
+    assert (printed.out, printed.err) == ("", f"warpgs sweep: {error}\n")
     assert not (tmp_path / "out").exists()
 
 
@@ -131,7 +131,7 @@ def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, tmp_path,
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
-        (KeyboardInterrupt(), 130, "warpgs: stopped; the same command continues"),
+        (KeyboardInterrupt(), 130, "warpgs sweep: stopped; the same command continues"),
         (ClusterGoneError("the Ray cluster at h:1 is gone"), 2, "warpgs sweep: the Ray cluster at h:1 is gone;"),
         (OSError("studio cannot be kept in /cache: No space left"), 2, "sweep: studio cannot be kept in /cache"),
     ],
@@ -156,7 +156,7 @@ def test_sigterm_stops_a_sweep_as_ctrl_c_does(sweep, tmp_path, capsys):
         return sweep.finish(job)
 
     assert sweep(by=stop) == (130, ["as-full-seed0", "as-plain-seed0"])
-    assert capsys.readouterr().err == "warpgs: stopped; the same command continues\n"
+    assert capsys.readouterr().err == "warpgs sweep: stopped; the same command continues\n"
     assert "| full | 20.00 | 1.0 | 1 of 2 |" in (tmp_path / "out/table.md").read_text()
 
 
@@ -180,7 +180,7 @@ def test_a_full_disk_stops_no_training_and_the_table_is_printed(sweep, tmp_path,
     assert (code, len(trained)) == (2, 4)
     printed = capsys.readouterr()
     assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed.out
-    assert printed.err == f"warpgs: {tmp_path}/out/{file} could not be written: No space left on device\n"
+    assert printed.err == f"warpgs sweep: {tmp_path}/out/{file} could not be written: No space left on device\n"
 
 
 @needs_dev_full
@@ -192,7 +192,7 @@ def test_tables_of_a_finished_sweep_are_printed_on_a_full_disk(sweep, tmp_path, 
     assert sweep("--tables-only") == (2, [])
     printed = capsys.readouterr()
     assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed.out
-    assert printed.err == f"warpgs: {tmp_path}/out/table.md could not be written: No space left on device\n"
+    assert printed.err == f"warpgs sweep: {tmp_path}/out/table.md could not be written: No space left on device\n"
 
 
 def test_results_of_other_options_are_never_mixed_in(sweep, capsys):
@@ -368,7 +368,7 @@ def test_a_folder_without_weights_of_lpips_is_refused_before_anything_is_trained
 def test_a_wrong_type_names_the_file_and_the_whole_option(sweep, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text("variants.a.optim.means = 'x'")
     assert sweep() == (2, [])
-    assert capsys.readouterr().err == f"warpgs: {tmp_path}/mine.toml: variant a: optim.means cannot be 'x'\n"
+    assert capsys.readouterr().err == f"warpgs sweep: {tmp_path}/mine.toml: variant a: optim.means cannot be 'x'\n"
 
 
 def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, tmp_path):

@@ -336,6 +336,6 @@ def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypat
     monkeypatch.setattr(render_run, "render_run", fail)
     assert main(["render", str(run)]) == 2
     message = capsys.readouterr().err
-    assert message.startswith("warpgs: out of memory (")
+    assert message.startswith("warpgs render: out of memory (")
     assert "smaller images or fewer Gaussians" in message
     assert message.count("\n") == 1

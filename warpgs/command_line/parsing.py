@@ -21,8 +21,6 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
-from warpgs.errors import FAILED, visible
-
 Options = TypeVar("Options")
 
 RunFolder = Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
@@ -56,7 +54,8 @@ def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Option
     """The options of a command line.
 
     Raises:
-        SystemExit: After ``--help``, or with ``FAILED`` after one line about a wrong option.
+        ValueError: If an option is wrong.
+        SystemExit: After ``--help``.
     """
     with one_line_errors(options, arguments, prog), described(options):
         return tyro.cli(options, args=list(arguments), prog=prog)
@@ -64,10 +63,10 @@ def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Option
 
 @contextlib.contextmanager
 def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Iterator[None]:
-    """Refuses options that do not exist, and turns tyro's boxes about other wrong options into one line on stderr.
+    """Refuses options that do not exist, and turns tyro's boxes about other wrong options into errors of one line.
 
     Raises:
-        SystemExit: With ``FAILED``.
+        ValueError: If an option is wrong.
     """
     known = {*flags(options), "--help"}
     for argument in arguments:
@@ -76,16 +75,14 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
             # Without the dashes, which would make all short options similar.
             close = difflib.get_close_matches(name[2:], [option[2:] for option in known], 1)
             advice = f"did you mean --{close[0]}?" if close else f"{prog} --help lists all"
-            sys.stderr.write(f"{prog}: there is no option {visible(name)}; {advice}\n")
-            raise SystemExit(FAILED)
+            raise ValueError(f"there is no option {name}; {advice}")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
             yield
     except SystemExit as end:
         if end.code:
-            sys.stderr.write(f"{prog}: {visible(_unboxed(box.getvalue()))}\n")
-            raise SystemExit(FAILED) from None
+            raise ValueError(_unboxed(box.getvalue())) from None
         raise
     sys.stderr.write(box.getvalue())
 

@@ -27,7 +27,8 @@ def main(arguments: Sequence[str], parent: int) -> int:
     from warpgs.command_line.parsing import parse
     from warpgs.evaluation.command import Eval
 
-    return run_command(parse(Eval, rest, "warpgs eval").run, "warpgs eval")
+    prog = "warpgs eval"
+    return run_command(lambda: parse(Eval, rest, prog).run(), prog)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from warpgs.errors import FAILED, INTERRUPTED
+from warpgs.errors import FAILED, INTERRUPTED, say
 
 TIMEOUT_MINUTES = 10
 """How long a rank waits for the others, as for callbacks and checkpoints of rank 0, before it gives up [minutes]."""
@@ -82,7 +82,8 @@ def _end(error: BaseException) -> None:
         is_first = dist.distributed_c10d._get_default_store().add(REPORTED, 1) == 1
     if isinstance(error, RankLostError) and torch.cuda.is_initialized():
         # The GPU still waits for the lost rank; an orderly exit would wait for the GPU.
-        sys.stderr.write(f"warpgs train: {error}\n" if is_first else "")
+        if is_first:
+            say(str(error))
         sys.stderr.flush()
         os._exit(code)
     if not is_first:
