@@ -124,6 +124,24 @@ def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", f"warpgs {command.split()[0]}: stopped\n")
 
 
+@pytest.mark.parametrize("program", [["-m", "warpgs"], [str(Path(__file__).parents[1] / "train.py")]])
+@pytest.mark.parametrize(("arguments", "code"), [(["--version"], 0), (["--zzz"], 2), (["--help"], 0)])
+def test_ctrl_c_while_python_ends_leaves_the_exit_code_and_the_output_as_they_are(program, arguments, code, tmp_path):
+    """Python calls what is registered for its end, gives signals back to the system, then deletes objects."""
+    interrupt = (
+        "import atexit, os, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "class Last:\n    def __del__(self, kill=os.kill, process=os.getpid()):\n        kill(process, 2)\n"
+        "last = Last()\natexit.register(os.kill, os.getpid(), signal.SIGINT)\n"
+    )
+    (tmp_path / "sitecustomize.py").write_text(interrupt)
+    expected = run(*program, *arguments)
+    path = os.pathsep.join([str(tmp_path), str(Path(warpgs.__file__).parents[1])])
+    environment = {**os.environ, "PYTHONPATH": path}
+    ended = subprocess.run([sys.executable, *program, *arguments], capture_output=True, text=True, env=environment)
+    assert ended.returncode == expected.returncode == code
+    assert (ended.stdout, ended.stderr) == (expected.stdout, expected.stderr)
+
+
 def test_a_command_refuses_wrong_input_in_one_line(tmp_path):
     ended = run("-m", "warpgs", "eval", str(tmp_path))
     assert ended.returncode == 2

@@ -1,5 +1,6 @@
 """Errors of commands: one line on stderr and an exit code."""
 
+import atexit
 import contextlib
 import difflib
 import functools
@@ -141,7 +142,8 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
 
     It ends with one line after Ctrl-C also while it imports and reads its options, and without one if nobody reads its
     output any more. Characters that standard output cannot represent (outside of terminals on Windows) are escaped, as
-    those of standard error are.
+    those of standard error are. While Python ends, which takes a second after torch was imported, Ctrl-C is ignored: it
+    would end the process without the exit code of the command.
     """
 
     @functools.wraps(main)
@@ -163,8 +165,14 @@ def program(main: Callable[P, int]) -> Callable[P, int]:
             return INTERRUPTED
         finally:
             _prog.reset(before)
+            atexit.unregister(_ignore_interrupts)
+            atexit.register(_ignore_interrupts)  # the last that is registered is the first that is called
 
     return run
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def one_line(error: BaseException) -> str:
