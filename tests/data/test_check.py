@@ -141,6 +141,21 @@ def test_every_damaged_file_is_named(root):
     assert " readable frames have masks" in texts(report, "note")
 
 
+@pytest.mark.parametrize("damaged", ["rgb/1x/{}.png", "resized_mask/1x/{}.png.png"])
+def test_a_damaged_evaluation_frame_is_a_warning_that_names_it_and_what_fails(root, damaged):
+    ids = json.loads((root / "dataset.json").read_text())["train_ids"]
+    held_out = ids.pop(7)
+    edit_json(root / "dataset.json", train_ids=ids, val_ids=[held_out])
+    path = root / damaged.format(held_out)
+    path.write_bytes(path.read_bytes()[:-20])
+    report = check_capture(root)
+    assert report.is_fit
+    (warning,) = [f.text for f in report.findings if f.level == "warning"]
+    assert str(path) in warning
+    assert "training does without this evaluation frame, but the evaluation after it fails" in warning
+    assert "epipolar lines" in texts(report, "note")  # the training frames are checked as ever
+
+
 def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):
     report = check_capture(tmp_path)
     assert not report.is_fit

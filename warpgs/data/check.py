@@ -173,7 +173,7 @@ def _files(capture: Capture) -> Iterator[Finding]:
         try:
             frame = capture.frame(name)
         except ValueError as error:
-            yield Finding("error", "files", str(error))
+            yield Finding("error", "files", str(error)) if name in capture.train else _unread_evaluation_frame(error)
             continue
         num_read += 1
         num_depths += frame.inverse_depth is not None
@@ -196,6 +196,11 @@ def _files(capture: Capture) -> Iterator[Finding]:
         text = f"the masks mark {mean:.1%} of the pixels as dynamic on average, {max(dynamic):.1%} at most"
         yield Finding("warning" if mean > MAX_DYNAMIC_FRACTION else "note", "masks", text)
         yield from _dynamic_depth(trained)
+
+
+def _unread_evaluation_frame(error: ValueError) -> Finding:
+    text = "training does without this evaluation frame, but the evaluation after it fails until the file is repaired"
+    return Finding("warning", "files", f"{error}; {text}")
 
 
 class _DynamicCounts(NamedTuple):
