@@ -1,5 +1,6 @@
 """Findings of the check in captures that are fit to train on and in captures that are not."""
 
+import contextlib
 import json
 import shutil
 import time
@@ -19,6 +20,7 @@ from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
+from warpgs.training.stored_views import ViewReader
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +130,31 @@ def test_missing_masks_are_an_error_that_says_how_to_make_them(root):
     assert not report.is_fit
     assert "no masks: make them with warpgs prepare CAPTURE --add masks" in texts(report, "error")
     assert "cameras" in {finding.topic for finding in report.findings}
+
+
+@pytest.mark.parametrize(
+    ("masked", "text"),
+    [
+        ([0, 8], "9 of 11 training frames, such as frame_00001, have no masks: make them with"),
+        ([4], "the training frames have no masks: make them with"),
+        ([k for k in range(12) if k != 4], ""),
+    ],
+    ids=["two frames", "the evaluation frame", "the training frames"],
+)
+def test_training_frames_need_masks_and_evaluation_frames_do_not_as_in_training(tmp_path, masked, text):
+    root = layouts.write_colmap(tmp_path / "scene")
+    names = sorted((root / "masks").iterdir())
+    for k in {*range(12)} - {*masked}:
+        names[k].unlink()
+    report = check_capture(root)
+    assert report.is_fit == (text == "")
+    assert texts(report, "error").startswith(text)
+    assert f"{len(masked)} of 12 frames have masks" in texts(report, "note")
+    views = ViewReader(load_capture(root), 0.0, None, pinned=False)
+    refused = pytest.raises(ValueError, match="has no mask") if text else contextlib.nullcontext()
+    with refused:
+        for k in range(11):
+            views.read(k)
 
 
 def test_every_damaged_file_is_named(root):

@@ -167,8 +167,8 @@ def _counts(capture: Capture) -> Iterator[Finding]:
 
 
 def _files(capture: Capture) -> Iterator[Finding]:
-    """Reads every frame; counts and checks masks and depth."""
-    dynamic, trained, num_read, num_depths = [], [], 0, 0
+    """Reads every frame; counts masks and depth, and checks the masks of the training frames."""
+    trained, unmasked, num_read, num_masks, num_depths = [], [], 0, 0, 0
     for name in (*capture.train, *capture.val):
         try:
             frame = capture.frame(name)
@@ -177,17 +177,29 @@ def _files(capture: Capture) -> Iterator[Finding]:
             continue
         num_read += 1
         num_depths += frame.inverse_depth is not None
-        if frame.static_mask is not None and capture.assumption == "masks":
-            dynamic.append(1.0 - float(frame.static_mask.float().mean()))
-            if name in capture.train:
-                trained.append(_dynamic_counts(frame))
+        has_mask = frame.static_mask is not None and capture.assumption == "masks"
+        num_masks += has_mask
+        if name in capture.train and has_mask:
+            trained.append(_dynamic_counts(frame))
+        elif name in capture.train:
+            unmasked.append(name)
     frames = "frames" if num_read == len(capture.train) + len(capture.val) else "readable frames"
-    yield Finding("note", "files", f"{len(dynamic)} of {num_read} {frames} have masks, {num_depths} have depth")
+    yield Finding("note", "files", f"{num_masks} of {num_read} {frames} have masks, {num_depths} have depth")
     if capture.assumption == "dynamic":
         yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
-    elif not dynamic:
-        yield Finding("error", "masks", f"the capture has no masks: make them {MASKS_REMEDY}")
-    elif max(dynamic) == 0.0:
+        return
+    if unmasked:
+        some = f"{len(unmasked)} of {len(unmasked) + len(trained)} training frames, such as {unmasked[0]},"
+        which = some if trained else "the training frames"
+        yield Finding("error", "masks", f"{which} have no masks: make them {MASKS_REMEDY}")
+    if trained:
+        yield from _masks(trained)
+
+
+def _masks(frames: list[_DynamicCounts]) -> Iterator[Finding]:
+    """Checks the masks of training frames."""
+    dynamic = [frame.fraction for frame in frames]
+    if max(dynamic) == 0.0:
         yield Finding("warning", "masks", "the masks mark nothing as dynamic")
     elif min(dynamic) == 1.0:
         yield Finding("error", "masks", "the masks mark everything as dynamic: 0 must mean dynamic, 255 static")
@@ -195,7 +207,7 @@ def _files(capture: Capture) -> Iterator[Finding]:
         mean = float(np.mean(dynamic))
         text = f"the masks mark {mean:.1%} of the pixels as dynamic on average, {max(dynamic):.1%} at most"
         yield Finding("warning" if mean > MAX_DYNAMIC_FRACTION else "note", "masks", text)
-        yield from _dynamic_depth(trained)
+        yield from _dynamic_depth(frames)
 
 
 def _unread_evaluation_frame(error: ValueError) -> Finding:
@@ -204,11 +216,16 @@ def _unread_evaluation_frame(error: ValueError) -> Finding:
 
 
 class _DynamicCounts(NamedTuple):
-    """Numbers of a frame: dynamic regions, those that the border cuts off, dynamic pixels, those with depth."""
+    """Numbers of dynamic regions, of those that the border cuts off, of dynamic pixels, and of those with depth.
+
+    Attributes:
+        fraction: Dynamic pixels as a fraction of all pixels of the frame.
+    """
 
     regions: int
     cut: int
     pixels: int
+    fraction: float
     with_depth: int
 
 
@@ -216,7 +233,8 @@ def _dynamic_counts(frame: Frame) -> _DynamicCounts:
     assert frame.static_mask is not None
     regions, is_dynamic = dynamic_regions(frame), ~frame.static_mask
     with_depth = 0 if frame.inverse_depth is None else int((frame.inverse_depth.isfinite() & is_dynamic).sum())
-    return _DynamicCounts(len(regions), sum(map(is_cut, regions)), int(is_dynamic.sum()), with_depth)
+    pixels = int(is_dynamic.sum())
+    return _DynamicCounts(len(regions), sum(map(is_cut, regions)), pixels, pixels / is_dynamic.numel(), with_depth)
 
 
 def _dynamic_depth(frames: list[_DynamicCounts]) -> Iterator[Finding]:
