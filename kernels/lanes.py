@@ -22,6 +22,24 @@ def native(cuda: str, cpu: str) -> str:
     return f"\n#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{cpu}\n#endif\n"
 
 
+def warp_reduce(intrinsic: str, combine: str) -> str:
+    """CUDA code that combines ``x`` of all lanes and returns the result; ``combine`` is an expression of x and other.
+
+    The intrinsic needs compute capability 8.0.
+    """
+    return f"""
+        #if __CUDA_ARCH__ >= 800
+        return {intrinsic}(0xffffffffu, x);
+        #else
+        for (int o = 16; o > 0; o >>= 1) {{
+            const auto other = __shfl_xor_sync(0xffffffffu, x, o);
+            x = {combine};
+        }}
+        return x;
+        #endif
+        """
+
+
 def warp_prefix_sum(value_type: str, name: str) -> str:
     """CUDA code that turns a variable of each lane into its inclusive prefix sum over the warp; it reads ``lane``."""
     return f"""
@@ -54,11 +72,11 @@ def lane_ballot(x: int) -> wp.uint32:
 def lane_any(x: int) -> int: ...
 
 
-@wp.func_native(native("return __reduce_max_sync(0xffffffffu, x);", "return x;"))
+@wp.func_native(native(warp_reduce("__reduce_max_sync", "other > x ? other : x"), "return x;"))
 def lane_max(x: int) -> int: ...
 
 
-@wp.func_native(native("return __reduce_or_sync(0xffffffffu, x);", "return x;"))
+@wp.func_native(native(warp_reduce("__reduce_or_sync", "x | other"), "return x;"))
 def lane_or(x: int) -> int: ...
 
 

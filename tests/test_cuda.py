@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils.checkpoint import checkpoint
 
-from tests.ops.test_mlp import LAYERS, random_layer
+from tests.ops.test_mlp import LAYERS, assert_nan_stays_in_its_row, random_layer
 from tests.ops.test_sort import CASES, random_keys, sorted_pairs
 from tests.ops.test_tiles import binned, projected
 from tests.reference.depth_error import random_inputs
@@ -27,7 +27,7 @@ from warpgs.config import RenderSettings
 from warpgs.kernels.constants import CULLED_DEPTH
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
-from warpgs.ops.mlp import layer_backward
+from warpgs.ops.mlp import layer_bwd
 from warpgs.ops.projection import Geometry, View, project_fwd
 from warpgs.ops.ssim import l1_and_ssim, ssim_map
 from warpgs.ops.tiles import reset_budgets
@@ -122,12 +122,26 @@ def test_the_gradient_before_a_layer_equals_that_on_cpu(sizes):
     layer = random_layer(*sizes)
     results = []
     for device in ("cpu", "cuda", "cuda"):
-        inputs = [tensor.to(device, copy=True) for tensor in layer]
-        results.append((layer_backward(*inputs).cpu(), inputs[-1].cpu()))
+        v_outputs, weight, features, sums = (tensor.to(device, copy=True) for tensor in layer)
+        weight = torch.nn.functional.pad(weight, (0, 0, 0, 32), value=torch.nan)[
+            : len(weight)
+        ]  # NaN after the last row
+        results.append((layer_bwd(v_outputs, weight, features, sums).cpu(), sums.cpu()))
     expected, actual, again = results
     for own, wanted, same in zip(actual, expected, again, strict=True):
         assert relative_error(own, wanted) < 1e-4
         assert torch.equal(own, same)
+
+
+def test_nan_passes_the_backward_pass_of_a_layer():
+    assert_nan_stays_in_its_row("cuda")
+
+
+def test_matrices_that_start_anywhere_are_refused():
+    v_outputs, features = (torch.zeros(8, 8, dtype=torch.float16, device="cuda") for _ in range(2))
+    shifted = torch.zeros(65, dtype=torch.float16, device="cuda")[1:].view(8, 8)
+    with pytest.raises(ValueError, match=r"weight must start at a multiple of 16 bytes"):
+        layer_bwd(v_outputs, shifted, features, torch.zeros(1, 8, device="cuda"))
 
 
 def test_an_empty_scene_is_background():

@@ -6,7 +6,7 @@ import torch
 from tests.reference import mlp as reference
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.ops import mlp
-from warpgs.ops.mlp import layer_backward, num_tiles, num_values, perceptron, split
+from warpgs.ops.mlp import layer_bwd, num_tiles, num_values, perceptron, split
 
 COLUMNS, WIDTH, OUTPUTS = 6, 16, (3, 1, 1)
 LAYOUTS = [(9, 4), (4, 2), (4, 1), (5, 0), (2, 0)]
@@ -104,6 +104,13 @@ def test_gradients_in_half_precision_are_scaled_by_their_common_maximum(num):
     assert not sums[5:].any()
 
 
+def test_gradients_that_are_all_zero_stay_zero_in_half_precision():
+    scaled, unscale, sums = mlp._scaled((torch.zeros(5, 3),), (64, 8))
+    assert not scaled.any()
+    assert not sums.any()
+    assert unscale.isfinite()
+
+
 def test_inputs_get_no_gradient():
     shapes = make_shapes(3, 0)
     inputs = random_inputs(4, 0).requires_grad_()
@@ -156,36 +163,34 @@ LAYERS = [
 
 
 def random_layer(num, outputs, columns, more):
-    """Gradient of the outputs, weights, features, and unwritten sums."""
+    """Gradient of the outputs, weights, features, and unwritten sums; what must not be read is NaN."""
     v_outputs, weight = random_half(num, outputs), random_half(outputs, columns + more[0], seed=1)
     features = random_half(num, columns + more[1], seed=2)
-    features[0, 0] = 0.0
+    features[0, :8] = torch.tensor([6e-8, 0.0, torch.nan, torch.inf, 1.0, -1.0, -0.0, -torch.inf])
+    weight[:, columns:], features[:, columns:] = torch.nan, torch.nan
     return v_outputs, weight, features, empty_sums(num, columns)
 
 
 @pytest.mark.parametrize("sizes", LAYERS)
 def test_the_gradient_before_a_layer_is_masked_and_summed(sizes):
     v_outputs, weight, features, sums = random_layer(*sizes)
-    actual, columns = layer_backward(v_outputs, weight, features, sums), sizes[2]
-    expected = reference.layer_backward(v_outputs.double(), weight[:, :columns].double(), features[:, :columns])
+    actual, columns = layer_bwd(v_outputs, weight, features, sums), sizes[2]
+    expected = reference.layer_bwd(v_outputs.double(), weight[:, :columns].double(), features[:, :columns])
     assert actual.shape == expected.shape
     assert torch.equal(actual == 0, expected == 0)
     assert error(actual, expected) <= 2**-11 * expected.abs().max()  # rounded to half precision
     assert torch.allclose(sums.double().sum(0), actual.double().sum(0), rtol=1e-6, atol=1e-4)
 
 
-def test_tiny_features_and_nan_count_as_positive():
-    features = torch.tensor([[6e-8, 0.0, torch.nan, torch.inf, 1.0, -1.0, -0.0, -torch.inf]]).half()
-    v_outputs, weight = torch.eye(8)[:1].half(), torch.zeros(8, 8).half()
-    weight[0] = torch.arange(1, 9)
-    assert layer_backward(v_outputs, weight, features, empty_sums(1, 8)).tolist() == [[1, 0, 3, 4, 5, 0, 0, 0]]
+def test_nan_passes_the_backward_pass_of_a_layer():
+    assert_nan_stays_in_its_row("cpu")
 
 
-def test_nan_passes_a_layer_backward():
-    v_outputs, weight, features = torch.ones(2, 8).half(), torch.ones(8, 8).half(), torch.ones(2, 8).half()
+def assert_nan_stays_in_its_row(device):
+    v_outputs, weight, features = (torch.ones(shape).half().to(device) for shape in ((2, 8), (8, 8), (2, 8)))
     v_outputs[1, 3] = torch.nan
-    sums = empty_sums(2, 8)
-    actual = layer_backward(v_outputs, weight, features, sums)
+    sums = empty_sums(2, 8).to(device)
+    actual = layer_bwd(v_outputs, weight, features, sums)
     assert actual[0].eq(8.0).all()
     assert actual[1].isnan().all()
     assert sums.isnan().all()
@@ -193,7 +198,7 @@ def test_nan_passes_a_layer_backward():
 
 def test_no_rows_have_no_tiles():
     assert num_tiles(0) == 0
-    v_inputs = layer_backward(random_half(0, 8), random_half(8, 16), random_half(0, 16), torch.zeros(0, 16))
+    v_inputs = layer_bwd(random_half(0, 8), random_half(8, 16), random_half(0, 16), torch.zeros(0, 16))
     assert v_inputs.shape == (0, 16)
 
 
@@ -204,18 +209,21 @@ LAYER = {"v_outputs": (3, 8), "weight": (8, 16), "features": (3, 24)}
     ("changed", "shape_of_sums", "words"),
     [
         ({}, (2, 16), "sums must"),
-        ({}, (1, 12), "multiples of 8"),
-        ({"v_outputs": random_half(3, 12), "weight": random_half(12, 16)}, (1, 16), "multiples of 8"),
+        ({}, (1, 12), "sums must have a multiple of 8"),
+        ({"v_outputs": random_half(3, 12), "weight": random_half(12, 16)}, (1, 16), "v_outputs must have a multiple"),
+        ({"weight": random_half(8, 20)}, (1, 16), "weight must have a multiple"),
+        ({"features": random_half(3, 20)}, (1, 16), "features must have a multiple"),
         ({"weight": random_half(16, 16)}, (1, 16), "weight must"),
         ({"weight": random_half(16, 8).T}, (1, 16), "weight must be contiguous"),
         ({"features": random_half(4, 16)}, (1, 16), "features must"),
         ({"features": random_half(3, 16).float()}, (1, 16), "features must"),
-        ({}, (1, 24), "at least as many columns"),
-        ({"weight": random_half(8, 32)}, (1, 32), "at least as many columns"),
+        ({"features": torch.empty(3, 24, dtype=torch.float16, device="meta")}, (1, 16), "one device"),
+        ({}, (1, 24), "weight must .* at least 24, got 16"),
+        ({"weight": random_half(8, 32)}, (1, 32), "features must .* at least 32, got 24"),
     ],
 )
 @pytest.mark.usefixtures("contracts_off")
-def test_a_layer_backward_refuses_inputs_that_do_not_fit(changed, shape_of_sums, words):
+def test_the_backward_pass_of_a_layer_refuses_inputs_that_do_not_fit(changed, shape_of_sums, words):
     inputs = {name: random_half(*shape) for name, shape in LAYER.items()} | changed
     with pytest.raises(ValueError, match=words):
-        layer_backward(**inputs, sums=torch.zeros(shape_of_sums))
+        layer_bwd(**inputs, sums=torch.zeros(shape_of_sums))

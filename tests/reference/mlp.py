@@ -16,6 +16,6 @@ def perceptron(encoding: Tensor, layers: list[tuple[Tensor, Tensor]], skip: int)
     return values
 
 
-def layer_backward(v_outputs: Tensor, weight: Tensor, features: Tensor) -> Tensor:
+def layer_bwd(v_outputs: Tensor, weight: Tensor, features: Tensor) -> Tensor:
     """Gradients of the inputs of the ReLU before a layer, given its outputs' gradients, weights and inputs."""
-    return torch.where(features > 0, v_outputs @ weight, 0.0)
+    return torch.where(features <= 0, 0.0, v_outputs @ weight)

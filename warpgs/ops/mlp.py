@@ -33,10 +33,11 @@ MPS_LIMIT = "CUDA_MPS_ACTIVE_THREAD_PERCENTAGE"
 """Variable that limits the multiprocessors of a process; what it breaks is in docs/design/half-precision.md."""
 
 MAX_CHUNKS = 16384
-"""Maximum number of partial sums over rows: enough threads to saturate memory, few enough to be added up quickly."""
+"""Maximum number of partial sums over rows of the outputs' gradients: enough threads to saturate memory, few enough to
+be added up quickly."""
 
 ROWS_PER_CHUNK = 4
-"""Minimum number of rows of a partial sum."""
+"""Minimum number of rows of such a partial sum."""
 
 
 class Layer(NamedTuple):
@@ -172,7 +173,7 @@ class _Perceptron(torch.autograd.Function):
         for k in reversed(range(len(layers))):
             _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0 and is_half:
-                gradient = layer_backward(gradient, layers[k].weight, layer_inputs[k], sums[k - 1])
+                gradient = layer_bwd(gradient, layers[k].weight, layer_inputs[k], sums[k - 1])
             elif k > 0:
                 gradient = torch.mm(gradient, layers[k].weight[:, : len(layers[k - 1].bias)])
                 features = layer_inputs[k][:, : gradient.shape[1]]
@@ -187,9 +188,11 @@ class _Perceptron(torch.autograd.Function):
 
 
 def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """The outputs' gradients in half precision, beside each other, scaled and padded.
+    """Scales the outputs' gradients to half precision.
 
-    Also the inverse of the scale, and partial sums over rows of what is not scaled.
+    Returns:
+        [rows, columns] gradients beside each other, scaled and padded with zeros; the inverse of the scale; and
+        [columns, chunks] partial sums over the rows of the gradients before they are scaled.
     """
     norms = [torch.linalg.vector_norm(v, torch.inf) for v in gradients if len(v)] or [gradients[0].new_zeros(())]
     largest = torch.stack(norms).amax().clamp_min(torch.finfo(torch.float32).tiny * MAX_GRADIENT)
@@ -220,17 +223,17 @@ def _product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
 
 
 def num_tiles(size: int) -> int:
-    """Number of tiles along an axis of the matrix that ``layer_backward`` returns."""
+    """Number of tiles along an axis of the matrix that ``layer_bwd`` returns."""
     return -(-size // kernels.TILE)
 
 
-def layer_backward(
+def layer_bwd(
     v_outputs: Float16[Tensor, "N outputs"],
     weight: Float16[Tensor, "outputs weight_columns"],
     features: Float16[Tensor, "N feature_columns"],
     sums: Float32[Tensor, "tiles columns"],
 ) -> Float16[Tensor, "N columns"]:
-    """Backward pass of a layer and of the ReLU before it.
+    """Backward pass of a layer and of the ReLU before it. All numbers of columns are multiples of 8.
 
     Args:
         v_outputs: [N, outputs] gradient of the layer's outputs.
@@ -240,23 +243,33 @@ def layer_backward(
             of the bias before ReLU.
 
     Returns:
-        [N, columns] gradient of the inputs of ReLU: v_outputs · weight, and zero where features are not positive.
+        [N, columns] gradient of the inputs of ReLU: v_outputs · weight, summed in single precision, and zero where
+        features are not positive.
 
     Raises:
-        ValueError: On a wrong shape, dtype or device, a number of columns that is not a multiple of 8, or a tensor that
-            is not contiguous.
+        ValueError: On a wrong shape, dtype or device, a number of columns that is not a multiple of 8, weights or
+            features with fewer columns than ``sums``, or a tensor that is not contiguous or, on CUDA, does not start at
+            a multiple of 16 bytes.
     """
-    tensors = {"v_outputs": v_outputs, "weight": weight, "features": features, "sums": sums}
+    matrices = {"v_outputs": v_outputs, "weight": weight, "features": features}
+    axes = {
+        "v_outputs": ("N", "outputs"),
+        "weight": ("outputs", "weight_columns"),
+        "features": ("N", "feature_columns"),
+    }
     sizes: dict[str, int] = {"tiles": num_tiles(len(v_outputs))}
-    check_tensor("v_outputs", v_outputs, ("N", "outputs"), sizes, (torch.float16,))
-    check_tensor("weight", weight, ("outputs", "weight_columns"), sizes, (torch.float16,))
-    check_tensor("features", features, ("N", "feature_columns"), sizes, (torch.float16,))
+    for name, matrix in matrices.items():
+        check_tensor(name, matrix, axes[name], sizes, (torch.float16,))
     check_tensor("sums", sums, ("tiles", "columns"), sizes)
-    check_same_device(tensors)
-    if any(tensor.shape[1] % kernels.PIECE for tensor in tensors.values()):
-        raise ValueError(f"all numbers of columns must be multiples of {kernels.PIECE}, got {sizes}")
-    if sizes["columns"] > min(sizes["weight_columns"], sizes["feature_columns"]):
-        raise ValueError(f"weight and features must have at least as many columns as sums, got {sizes}")
+    check_same_device(matrices | {"sums": sums})
+    for name, matrix in (*matrices.items(), ("sums", sums)):
+        least = 0 if name == "v_outputs" else sizes["columns"]
+        if matrix.shape[1] % ALIGNMENT or matrix.shape[1] < least:
+            raise ValueError(
+                f"{name} must have a multiple of {ALIGNMENT} columns, at least {least}, got {matrix.shape[1]}"
+            )
+        if matrix.is_cuda and matrix.data_ptr() % 16:
+            raise ValueError(f"{name} must start at a multiple of 16 bytes; call .clone() on it")
     v_inputs = v_outputs.new_empty(len(v_outputs), sums.shape[1])
     kernel = kernels.make_layer_bwd(v_outputs.is_cuda)
     threads = num_tiles(len(v_inputs)) * num_tiles(sums.shape[1]) * (kernels.BLOCK_DIM if v_outputs.is_cuda else 1)
