@@ -251,28 +251,29 @@ def layer_bwd(
             features with fewer columns than ``sums``, or a tensor that is not contiguous or, on CUDA, does not start at
             a multiple of 16 bytes.
     """
-    matrices = {"v_outputs": v_outputs, "weight": weight, "features": features}
-    axes = {
-        "v_outputs": ("N", "outputs"),
-        "weight": ("outputs", "weight_columns"),
-        "features": ("N", "feature_columns"),
-    }
-    sizes: dict[str, int] = {"tiles": num_tiles(len(v_outputs))}
-    for name, matrix in matrices.items():
-        check_tensor(name, matrix, axes[name], sizes, (torch.float16,))
-    check_tensor("sums", sums, ("tiles", "columns"), sizes)
-    check_same_device(matrices | {"sums": sums})
-    for name, matrix in (*matrices.items(), ("sums", sums)):
-        least = 0 if name == "v_outputs" else sizes["columns"]
-        if matrix.shape[1] % ALIGNMENT or matrix.shape[1] < least:
-            raise ValueError(
-                f"{name} must have a multiple of {ALIGNMENT} columns, at least {least}, got {matrix.shape[1]}"
-            )
-        if matrix.is_cuda and matrix.data_ptr() % 16:
-            raise ValueError(f"{name} must start at a multiple of 16 bytes; call .clone() on it")
+    _check_layer({"v_outputs": v_outputs, "weight": weight, "features": features}, sums)
     v_inputs = v_outputs.new_empty(len(v_outputs), sums.shape[1])
     kernel = kernels.make_layer_bwd(v_outputs.is_cuda)
     threads = num_tiles(len(v_inputs)) * num_tiles(sums.shape[1]) * (kernels.BLOCK_DIM if v_outputs.is_cuda else 1)
     arguments = (v_outputs, weight, features, v_inputs, sums)
     launch(kernel, threads, *arguments, block_dim=kernels.BLOCK_DIM, work=kernels.TILE**2)
     return v_inputs
+
+
+def _check_layer(matrices: dict[str, Tensor], sums: Tensor) -> None:
+    axes = {
+        "v_outputs": ("N", "outputs"),
+        "weight": ("outputs", "weight_columns"),
+        "features": ("N", "feature_columns"),
+    }
+    sizes: dict[str, int] = {"tiles": num_tiles(len(matrices["v_outputs"]))}
+    for name, matrix in matrices.items():
+        check_tensor(name, matrix, axes[name], sizes, (torch.float16,))
+    check_tensor("sums", sums, ("tiles", "columns"), sizes)
+    check_same_device(matrices | {"sums": sums})
+    for name, matrix in (*matrices.items(), ("sums", sums)):
+        least, columns = 0 if name == "v_outputs" else sums.shape[1], matrix.shape[1]
+        if columns % ALIGNMENT or columns < least:
+            raise ValueError(f"{name} must have a multiple of {ALIGNMENT} columns, at least {least}, got {columns}")
+        if matrix.is_cuda and matrix.data_ptr() % 16:
+            raise ValueError(f"{name} must start at a multiple of 16 bytes; call .clone() on it")
