@@ -107,6 +107,7 @@ PAPER = {
         "model.dropout": 0.0,
         "schedule.settle": 0,
         "loss.squared": 0.0,
+        "loss.hidden_appearance": True,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,
     },

@@ -125,6 +125,18 @@ def test_opacities_are_constant_without_appearance_opacity():
     assert torch.equal(splats["opacities"], make_scene().static.opacities)
 
 
+def test_the_appearance_network_gets_no_gradient_from_hidden_gaussians():
+    scene, is_hidden = make_scene(appearance_opacity=True), torch.arange(NUM_STATIC) < 3
+    splats = scene.splats(TIME, is_hidden=is_hidden)
+    assert not differing(static_part(splats), static_part(scene.splats(TIME)))
+    weights = scene.appearance.trunk.values
+    for changes in (splats.sh, splats.opacities):
+        (hidden,) = torch.autograd.grad(changes[:3].square().sum(), weights, retain_graph=True)
+        (others,) = torch.autograd.grad(changes[3:NUM_STATIC].square().sum(), weights, retain_graph=True)
+        assert not hidden.any()
+        assert others.any()
+
+
 def test_without_use_appearance_the_appearance_network_does_not_matter():
     scene, plain = make_scene(appearance_opacity=True), make_scene(trained=False)
     assert not differing(

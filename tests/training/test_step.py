@@ -186,6 +186,35 @@ def test_densification_looks_at_the_terms_of_depth_only_if_asked_to(data, tmp_pa
     assert (relative_error(with_depth, without) < 1e-6) == (not depth_gradients)
 
 
+@pytest.mark.parametrize("hidden_appearance", [True, False])
+def test_the_joint_image_trains_hidden_appearance_only_if_asked_to(data, tmp_path, monkeypatch, hidden_appearance):
+    loss = dataclasses.replace(tiny.CONFIG.loss, branches_in_stage2="no", hidden_appearance=hidden_appearance)
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, loss=loss))
+    trainer._add_dynamic_gaussians()
+    plan, appearance = trainer.protocol.at(trainer.protocol.stage2.start), trainer.scene.appearance.trunk.values
+    for is_hidden in (True, False):
+        all_of_them = torch.full((len(trainer.scene.static),), is_hidden)
+        monkeypatch.setattr(trainer.step, "_is_hidden", lambda view, all_of_them=all_of_them: all_of_them)
+        before = appearance.detach().clone()
+        trainer.step(plan, trainer._sample(plan))
+        assert torch.equal(appearance, before) == (is_hidden and not hidden_appearance)
+
+
+def test_gaussians_behind_dynamic_pixels_are_hidden(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path)
+    trainer.views._all.static_mask[0, :, :10] = False
+    view, means = trainer.views[0], trainer.scene.static.means
+    camera, generator = view.camera, torch.Generator().manual_seed(0)
+    row, column, depth = (torch.randint(-5, 40, (len(means),), generator=generator) for _ in range(3))
+    means.data = camera.unproject(row, column, depth + 0.5)
+    expected = []
+    for y, x, z in zip(row.tolist(), column.tolist(), depth.tolist(), strict=True):
+        is_inside = z >= 0 and 0 <= x < camera.width and 0 <= y < camera.height
+        expected.append(is_inside and not view.static_mask[y, x])
+    assert trainer.step._is_hidden(view).tolist() == expected
+    assert 0 < sum(expected) < len(expected)
+
+
 def test_every_parameter_group_has_a_learning_rate(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path)
     assert [group["name"] for group in trainer.step.optimizer.param_groups] == list(GROUPS)

@@ -21,6 +21,9 @@ class LossConfig:
     squared: float = 0.0
     """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
     paper. Large errors vanish sooner and fewer remain."""
+    hidden_appearance: bool = True
+    """Whether the joint image also trains how static Gaussians change over time while something dynamic hides them, as
+    in the paper. No object is quite opaque, so that what it hides takes its colour."""
     dynamic_background: Literal["black", "random"] = "random"
     """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
     depth: float = 2.0

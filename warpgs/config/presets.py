@@ -52,6 +52,7 @@ BEST = TrainConfig(
     ),
     loss=LossConfig(
         squared=15.0,
+        hidden_appearance=False,
         dynamic_background="black",
         depth=0.5,
         depth_dynamic=4.0,

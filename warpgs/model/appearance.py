@@ -2,7 +2,8 @@
 
 import dataclasses
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
@@ -22,13 +23,15 @@ class AppearanceField(nn.Module):
         self.trunk = Trunk(config, center, half_size, outputs)
 
     def forward(
-        self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]
+        self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"], is_fixed: Bool[Tensor, " N"] | None = None
     ) -> tuple[Float[Tensor, "N bases 3"], Float[Tensor, " N"] | None]:
-        """Residuals at N positions and one time in [0, 1].
+        """Residuals at N positions and one time in [0, 1]; no gradient flows from those that are fixed.
 
         Returns:
             [N, bases, 3] residuals of the SH coefficients of the lowest degrees, and [N] residuals of the opacities'
             logits, or None if the network does not change opacities.
         """
         residuals, *logits = self.trunk(means, time)
+        if is_fixed is not None:
+            residuals, *logits = (torch.where(is_fixed[:, None], r.detach(), r) for r in (residuals, *logits))
         return residuals.unflatten(1, (self.bases, 3)), logits[0][:, 0] if logits else None

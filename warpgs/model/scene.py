@@ -1,7 +1,7 @@
 """The scene of the paper: static Gaussians whose appearance changes, dynamic Gaussians that are deformed (Eq. 5)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
@@ -59,6 +59,7 @@ class SplitScene(nn.Module):
         use_appearance: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, "1"] | None = None,
+        is_hidden: Bool[Tensor, " num_static"] | None = None,
     ) -> Splats:
         """The activated Gaussians at a time, static ones first.
 
@@ -68,6 +69,7 @@ class SplitScene(nn.Module):
             use_appearance: Whether the appearance network changes the static ones (paper Eq. 8).
             sh_degree: Maximum degree of spherical harmonics to use; all if None.
             time_noise: Added to the time that the deformation network sees (annealed smoothing of Deformable-3DGS).
+            is_hidden: Static Gaussians from which the appearance network gets no gradient; none if None.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = None
@@ -75,7 +77,7 @@ class SplitScene(nn.Module):
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
-                    residuals, logit_residuals = self.appearance(static.means, time)
+                    residuals, logit_residuals = self.appearance(static.means, time, is_hidden)
                 sh = join_sh(static.raw(), dynamic.raw(), residuals)
             if use_deformation and len(dynamic):
                 offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)

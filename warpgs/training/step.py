@@ -5,7 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import mse_loss
 
@@ -147,7 +147,8 @@ class Step:
         self._choose_trained(phase)
         view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise)
+        is_hidden = self._is_hidden(view) if phase.use_appearance and not self.config.loss.hidden_appearance else None
+        splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise, is_hidden)
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
@@ -165,6 +166,12 @@ class Step:
         self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
+
+    @torch.no_grad()
+    def _is_hidden(self, view: View) -> Bool[Tensor, " N"]:
+        """Static Gaussians whose centres the mask says to be behind something dynamic."""
+        row, column, _, is_inside = view.camera.project(self.scene.static.means)
+        return is_inside & ~view.static_mask[row, column]
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
         """Alignment of the depth of the selected view, and how much it is trusted."""
