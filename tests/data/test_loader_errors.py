@@ -87,7 +87,10 @@ def test_a_missing_mask_of_a_training_frame_is_refused_on_opening(root):
         ("..", "has no dataset.json and the files of no other layout .*colmap.*; warpgs prepare makes a capture"),
         ("rgb", "rgb is a part of a capture: give "),
         ("rgb/1x", "1x is a part of a capture: give "),
-        ("scene.json", "scene.json is a file: give the folder of the capture"),
+        (
+            "scene.json",
+            "is a file: give the folder of the capture; warpgs prepare .*scene.json CAPTURE --holdout 8 makes",
+        ),
         ("nowhere", "nowhere does not exist"),
     ],
 )

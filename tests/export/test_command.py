@@ -268,6 +268,15 @@ def test_y_is_up_in_gltf(run, tmp_path):
     assert gltf_of(tmp_path / "out" / "scene.glb").means == pytest.approx(clouds_of(run).at(0.0).means * [1, -1, -1])
 
 
+@pytest.mark.parametrize(("background", "color"), [("black", "#000000"), ([0.2, 0.4, 1.0], "#3366ff")])
+def test_the_summary_names_the_background_of_training_unless_the_file_has_it(run, tmp_path, background, color):
+    folder = shutil.copytree(run, tmp_path / "run")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**config, "background": background}))
+    assert f"was {color} in training" in export(folder, tmp_path, time=0.5)
+    assert "in training" not in export(folder, tmp_path, format="html", keys=1)
+
+
 def test_without_a_capture_the_summary_says_what_is_up(stranded, tmp_path):
     assert "\n-y is taken as up (otherwise give --up), because the capture" in export(stranded, tmp_path, up="capture")
 

@@ -102,6 +102,18 @@ def test_the_command_reports_an_interrupted_training_with_exit_code_130(config, 
     assert f"stopped after iteration 5 of {tiny.LENGTH}; continue with warpgs train --resume {config.out}" in stderr
 
 
+def test_a_resumed_training_says_after_which_iteration_it_begins(config, monkeypatch):
+    lines = []
+    pressing_in_step(monkeypatch, number=5, presses=1)
+    with pytest.raises(TrainingInterrupted):
+        script.train(config, log=lines.append)
+    assert not any("after iteration" in line for line in lines)
+    pressing_in_step(monkeypatch, number=1, presses=1)
+    with pytest.raises(TrainingInterrupted):
+        script.train(command.parse(["--resume", str(config.out)]), log=lines.append)
+    assert any(line.endswith(f"after iteration 5 of {tiny.LENGTH}") for line in lines)
+
+
 def test_a_second_ctrl_c_stops_at_once_and_leaves_whole_checkpoints(config, monkeypatch):
     pressing_in_step(monkeypatch, number=10, presses=2)
     with pytest.raises(KeyboardInterrupt):

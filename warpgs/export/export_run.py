@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from warpgs.data.capture import background_color
 from warpgs.runs.run import Run
 from warpgs.video.camera_paths import MAX_FRAMES
 
@@ -35,7 +36,14 @@ def export_run(options: Export) -> str:
     if options.max_gaussians is not None:
         cameras = sample_cameras(job.clouds, job.capture)
         job.clouds = job.clouds.most_visible(options.max_gaussians, cameras, options.quiet)
-    return WRITERS[options.format].write(job)
+    summary = WRITERS[options.format].write(job)
+    return summary if options.format == "html" else f"{summary}\n{_background_note(run)}"
+
+
+def _background_note(run: Run) -> str:
+    """A line about the colour behind everything, which only a page stores."""
+    color = "#" + "".join(f"{round(255 * value):02x}" for value in background_color(run.config.background))
+    return f"behind the Gaussians was {color} in training: give the viewer this background, as gaps show it"
 
 
 def _check_format(options: Export) -> None:

@@ -40,7 +40,8 @@ class Render:
     write: Literal["both", "png", "mp4", "gif", "webp"] = "both"
     """Numbered PNG files, a video (MP4, GIF or WebP), or both PNG files and MP4."""
     layers: Literal["joint", "static", "dynamic", "all", "depth", "alpha"] = "joint"
-    """What to show: one of the layers, all three side by side, depth in colours (red is near), or opacity in grey."""
+    """What to show: one of the layers, all three side by side, depth in colours (red is near, black is empty), or
+    opacity in grey."""
     transparent: bool = False
     """Leave pixels transparent where the layer is; for PNG, GIF and WebP."""
     truth: bool = False

@@ -118,7 +118,8 @@ def require_capture(root: Path) -> None:
     if not root.exists():
         raise ValueError(missing_capture(root))
     if root.is_file():
-        raise ValueError(f"{root} is a file: give the folder of the capture")
+        made = command("prepare", root, "CAPTURE", "--holdout", "8")
+        raise ValueError(f"{root} is a file: give the folder of the capture; {made} makes one of a video")
     if (root / "config.json").exists():
         raise ValueError(
             f"{root} is a run folder: give the capture that it was trained on; "
