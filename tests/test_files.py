@@ -7,6 +7,8 @@ import os
 import struct
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -158,6 +160,24 @@ def test_a_file_larger_than_the_maximum_is_refused(path):
     assert read_bounded(path, 3) == b"old"
     with pytest.raises(ValueError, match=rf"{path} has 3 bytes, more than the maximum of 2"):
         read_bounded(path, 2)
+
+
+def test_headers_of_arrays_are_parsed_by_one_thread_at_a_time(tmp_path, monkeypatch):
+    running, most, whole = [], [], np.load
+
+    def load(*arguments, **options):
+        running.append(1)
+        time.sleep(0.01)
+        most.append(len(running))
+        running.pop()
+        return whole(*arguments, **options)
+
+    np.save(tmp_path / "a.npy", np.arange(6.0))
+    monkeypatch.setattr(np, "load", load)
+    with ThreadPoolExecutor(4) as pool:
+        arrays = list(pool.map(lambda _: read_array(tmp_path / "a.npy", 6), range(8)))
+    assert all(np.array_equal(array, np.arange(6.0)) for array in arrays)
+    assert max(most) == 1
 
 
 @pytest.mark.parametrize("read", [read_bounded, read_array])

@@ -13,6 +13,7 @@ import reprlib
 import shutil
 import stat
 import tempfile
+import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count
@@ -272,6 +273,10 @@ def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str
     return value
 
 
+_parsing_headers = threading.Lock()
+"""Python before 3.11.8 and 3.12.2 counts the recursion of all parsers together: two at once end in a SystemError."""
+
+
 def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
     """A .npy file of at most ``max_values`` numbers of up to 8 bytes; pickled objects are refused.
 
@@ -280,7 +285,8 @@ def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
     """
     require_file(path, MAX_NPY_HEADER + 8 * max_values)
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # allocates nothing, whatever the header claims
+        with _parsing_headers:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)  # allocates nothing, whatever the header claims
     except (ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError) as error:
         raise ValueError(f"{path} is damaged or not a .npy file of numbers") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
