@@ -123,9 +123,8 @@ def test_the_gradient_before_a_layer_equals_that_on_cpu(sizes):
     results = []
     for device in ("cpu", "cuda", "cuda"):
         v_outputs, weight, features, sums = (tensor.to(device, copy=True) for tensor in layer)
-        weight = torch.nn.functional.pad(weight, (0, 0, 0, 32), value=torch.nan)[
-            : len(weight)
-        ]  # NaN after the last row
+        padded = torch.nn.functional.pad(weight, (0, 0, 0, 32), value=torch.nan)  # what must not be read
+        weight = padded[: len(weight)]
         results.append((layer_bwd(v_outputs, weight, features, sums).cpu(), sums.cpu()))
     expected, actual, again = results
     for own, wanted, same in zip(actual, expected, again, strict=True):

@@ -170,18 +170,19 @@ def _files(capture: Capture) -> Iterator[Finding]:
     """Reads every frame; counts masks and depth, and checks the masks of the training frames."""
     trained, unmasked, num_read, num_masks, num_depths = [], [], 0, 0, 0
     for name in (*capture.train, *capture.val):
+        is_trained = name in capture.train
         try:
             frame = capture.frame(name)
         except ValueError as error:
-            yield Finding("error", "files", str(error)) if name in capture.train else _unread_evaluation_frame(error)
+            yield Finding("error", "files", str(error)) if is_trained else _unread_evaluation_frame(error)
             continue
         num_read += 1
         num_depths += frame.inverse_depth is not None
         has_mask = frame.static_mask is not None and capture.assumption == "masks"
         num_masks += has_mask
-        if name in capture.train and has_mask:
+        if is_trained and has_mask:
             trained.append(_dynamic_counts(frame))
-        elif name in capture.train:
+        elif is_trained:
             unmasked.append(name)
     frames = "frames" if num_read == len(capture.train) + len(capture.val) else "readable frames"
     yield Finding("note", "files", f"{num_masks} of {num_read} {frames} have masks, {num_depths} have depth")

@@ -36,12 +36,13 @@ def export_run(options: Export) -> str:
     if options.max_gaussians is not None:
         cameras = sample_cameras(job.clouds, job.capture)
         job.clouds = job.clouds.most_visible(options.max_gaussians, cameras, options.quiet)
-    summary = WRITERS[options.format].write(job)
-    return summary if options.format == "html" else f"{summary}\n{_background_note(run)}"
+    writer = WRITERS[options.format]
+    summary = writer.write(job)
+    return summary if writer.has_background else f"{summary}\n{_background_note(run)}"
 
 
 def _background_note(run: Run) -> str:
-    """A line about the colour behind everything, which only a page stores."""
+    """A line about the colour behind everything, for files that do not have it."""
     color = "#" + "".join(f"{round(255 * value):02x}" for value in background_color(run.config.background))
     return f"behind the Gaussians was {color} in training: give the viewer this background, as gaps show it"
 

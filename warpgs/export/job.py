@@ -98,8 +98,10 @@ class Writer(NamedTuple):
         write: Writes the files and returns a summary to print.
         options: Names of those options of ``Export`` that apply to this format but not to every other.
         suffix: End of its file names, with the dot; ``--out`` may be such a file. Empty if it has to be a folder.
+        has_background: Whether its files have the colour behind the Gaussians; the summary names it otherwise.
     """
 
     write: Callable[[Job], str]
     options: tuple[str, ...]
     suffix: str = ""
+    has_background: bool = False
