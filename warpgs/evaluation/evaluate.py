@@ -5,7 +5,7 @@ import io
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -141,15 +141,14 @@ def evaluate(
         as_taken: Whether to distort a wider rendering as the lens does instead of undistorting (resampling) frames.
     """
     device = scene.device
-    read_taken = capture.read_taken if as_taken else None
     views = []
-    names = progress(capture.val, "evaluating", quiet)
-    for index, (name, frame) in enumerate(zip(names, capture.frames(capture.val), strict=True)):
+    indices = progress(range(len(capture.val)), "evaluating", quiet)
+    for index, (frame, taken) in zip(indices, read_views(capture, as_taken), strict=True):
         camera = frame.camera.to(device) if align is None else align(frame)
-        if read_taken is None:
+        if taken is None:
             rendering = scene.render(camera, branches=True)
         else:
-            frame, rendering = _as_taken(scene, read_taken(name), camera)
+            frame, rendering = _as_taken(scene, taken, camera)
         truth = frame.image.to(device).float() / 255.0
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
@@ -158,6 +157,18 @@ def evaluate(
     frames: Frames = "as taken" if as_taken or capture.read_taken is None else "undistorted"
     net, fps = lpips.net if lpips else None, frame_rate(scene.play, cameras)
     return Evaluation(views, _flicker(scene, cameras, quiet), fps, net, frames)
+
+
+def read_views(capture: Capture, as_taken: bool = False) -> Iterator[tuple[Frame, TakenFrame | None]]:
+    """Reads every evaluation frame, and once more as it was taken if that is asked for and differs, else None.
+
+    Raises:
+        ValueError: If a file of a frame is missing, damaged or of another size; the message names it. With
+            ``as_taken``, also if a lens is a fisheye or its distortion cannot be inverted.
+    """
+    read_taken = capture.read_taken if as_taken else None
+    for name, frame in zip(capture.val, capture.frames(capture.val), strict=True):
+        yield frame, None if read_taken is None else read_taken(name)
 
 
 def _as_taken(scene: Renderer, taken: TakenFrame, camera: Camera) -> tuple[Frame, Rendering]:
