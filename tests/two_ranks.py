@@ -153,10 +153,11 @@ def fail_in_step(folder: Path, config: TrainConfig, how: str) -> int:
             raise ValueError("rank 1 has a reason")
 
     Step.__call__ = step
-    return command_with(config)
+    return by_command(folder, config)
 
 
-def command_with(config: TrainConfig) -> int:
+def by_command(folder: Path, config: TrainConfig) -> int:
+    """Trains by the command."""
     command.parse = lambda *_: config
     return command.main([], "warpgs train")
 
@@ -168,7 +169,7 @@ def with_differences(folder: Path, config: TrainConfig, what: str) -> int:
     elif os.environ["RANK"] == "1":
         whole = script.open_capture
         script.open_capture = lambda *_: dataclasses.replace(c := whole(*_), points=c.points + 1e-3)
-    return command_with(config)
+    return by_command(folder, config)
 
 
 def try_masks(folder: Path, config: TrainConfig) -> None:

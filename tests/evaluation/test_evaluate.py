@@ -259,6 +259,25 @@ def test_a_frame_as_it_was_taken_is_rendered_from_the_aligned_camera():
     assert aligned.views[0].psnr < evaluate.evaluate(pattern_scene(), distorted_capture(), **options).views[0].psnr - 10
 
 
+def test_the_check_of_the_views_keeps_none_in_memory():
+    read, here = [], capture()
+    frames = here.read
+    here = dataclasses.replace(here, read=lambda name: read.append(name) or frames(name))
+    evaluate.check_views(here)
+    assert sorted(read) == sorted(VAL)
+    assert [here.frame(name).name for name in VAL] == read[len(VAL) :] == list(VAL)
+
+
+def test_the_check_of_the_views_finds_a_lens_without_frames_as_they_were_taken():
+    def read_taken(name):
+        raise ValueError(f"frame {name} was taken by a fisheye lens")
+
+    here = dataclasses.replace(distorted_capture(), read_taken=read_taken)
+    evaluate.check_views(here)
+    with pytest.raises(ValueError, match="frame a was taken by a fisheye lens"):
+        evaluate.check_views(here, as_taken=True)
+
+
 def gray(value):
     return torch.full((H, W, 3), value)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -176,6 +177,16 @@ def test_ranks_with_different_options_or_captures_are_refused_in_one_line(data, 
     assert two_ranks.start(tmp_path, two_ranks.with_differences, config_of(data, tmp_path), what) == [2, 2]
     (line,) = two_ranks.errors(tmp_path, 0) + two_ranks.errors(tmp_path, 1)
     assert line == f"warpgs train: expected {what} to be the same on all ranks, rank 1 has another than rank 0"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_damaged_evaluation_frame_is_refused_in_one_line_of_the_rank_that_evaluates(data, tmp_path):
+    data = shutil.copytree(data, tmp_path / "damaged")
+    path = data / f"rgb/1x/{json.loads((data / 'dataset.json').read_text())['val_ids'][0]}.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    assert two_ranks.start(tmp_path, two_ranks.by_command, config_of(data, tmp_path)) == [2, 2]
+    assert two_ranks.errors(tmp_path, 0) == [f"warpgs train: {path} is truncated: its last chunk is cut off"]
+    assert two_ranks.errors(tmp_path, 1) == []
     assert not (tmp_path / "run").exists()
 
 

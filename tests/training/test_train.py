@@ -356,14 +356,50 @@ def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
         warpgs.train(given)
 
 
-def test_a_damaged_evaluation_frame_leaves_a_trained_run_and_says_how_to_evaluate_it(config, tmp_path):
-    data, lines = shutil.copytree(config.data, tmp_path / "damaged"), []
-    name = json.loads((data / "dataset.json").read_text())["val_ids"][0]
-    frame = data / f"rgb/1x/{name}.png"
+def cut_off(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def shrink(path):
+    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[1:])
+
+
+@pytest.fixture
+def held_out(config, tmp_path):
+    """The config of a run on a capture of its own, and the image and the mask of its last evaluation frame."""
+    data = shutil.copytree(config.data, tmp_path / "damaged")
+    name = json.loads((data / "dataset.json").read_text())["val_ids"][-1]
+    files = {"image": data / f"rgb/1x/{name}.png", "mask": data / f"resized_mask/1x/{name}.png.png"}
+    return dataclasses.replace(config, data=data), files
+
+
+@pytest.mark.parametrize("is_resumed", [False, True], ids=["new", "resumed"])
+@pytest.mark.parametrize(
+    ("damage", "text"), [(cut_off, "is truncated"), (shrink, "expected 32×24")], ids=["truncated", "size"]
+)
+@pytest.mark.parametrize("kind", ["image", "mask"])
+def test_a_damaged_evaluation_frame_is_refused_before_training(held_out, kind, damage, text, is_resumed, monkeypatch):
+    given, files = held_out
+    if is_resumed:
+        script.make_trainer(given).save()
+        given = TrainConfig(resume=given.out)
+    damage(files[kind])
+    monkeypatch.setattr(script, "Trainer", Mock(side_effect=AssertionError("training has begun")))
+    with pytest.raises(ValueError, match=f"^{files[kind]}.* {text}"):
+        warpgs.train(given)
+    assert is_resumed or not given.out.exists()
+
+
+def test_an_evaluation_frame_damaged_in_training_leaves_a_trained_run_and_says_how_to_evaluate_it(held_out):
+    config, files = held_out
+    frame, lines = files["image"], []
     whole = frame.read_bytes()
-    frame.write_bytes(whole[: len(whole) // 2])
+
+    def damage(progress):
+        frame.write_bytes(whole[: len(whole) // 2])
+
     with pytest.raises(ValueError, match=f"{frame} is truncated"):
-        warpgs.train(dataclasses.replace(config, data=data), log=lines.append)
+        warpgs.train(config, log=lines.append, callbacks=[damage])
     assert lines[-1].endswith(f"failed with the error below; once that is solved, run it with warpgs eval {config.out}")
     frame.write_bytes(whole)
     assert evaluate_run.evaluate_run(config.out, quiet=True)

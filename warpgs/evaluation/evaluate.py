@@ -171,6 +171,12 @@ def read_views(capture: Capture, as_taken: bool = False) -> Iterator[tuple[Frame
         yield frame, None if read_taken is None else read_taken(name)
 
 
+def check_views(capture: Capture, as_taken: bool = False) -> None:
+    """Reads every evaluation frame as ``evaluate`` does and keeps none in memory; raises as ``read_views``."""
+    for _ in read_views(replace(capture, cache_frames=0), as_taken):
+        pass
+
+
 def _as_taken(scene: Renderer, taken: TakenFrame, camera: Camera) -> tuple[Frame, Rendering]:
     """A frame as it was taken, and the scene from the pose of a camera as the frame's lens shows it."""
     wide = replace(taken.frame.camera.to(scene.device), viewmat=camera.viewmat)

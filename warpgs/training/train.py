@@ -12,6 +12,7 @@ from warpgs.data.check import Finding, quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import recognize
 from warpgs.errors import command
+from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
@@ -290,10 +291,11 @@ def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
 
 
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
-    """The capture, after logging its warnings.
+    """The capture, after logging its warnings and reading its evaluation frames.
 
     Raises:
         UnfitCaptureError: If it has errors that would make training useless.
+        ValueError: If an evaluation frame, or one of three training frames, cannot be read; the message names its file.
     """
     findings = quick_findings(capture.assuming(config.assume))
     errors = [finding for finding in findings if finding.level == "error"]
@@ -302,4 +304,6 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
             log(str(finding))
     if errors:
         raise UnfitCaptureError(errors)
+    if ranks.is_first():  # which evaluates when training is done: too late to learn that it cannot read a file
+        check_views(capture, config.as_taken)
     return capture
