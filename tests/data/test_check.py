@@ -169,17 +169,16 @@ def test_every_damaged_file_is_named(root):
 
 
 @pytest.mark.parametrize("damaged", ["rgb/1x/{}.png", "resized_mask/1x/{}.png.png"])
-def test_a_damaged_evaluation_frame_is_a_warning_that_names_it_and_what_fails(root, damaged):
+def test_a_damaged_evaluation_frame_is_an_error_that_names_it(root, damaged):
     ids = json.loads((root / "dataset.json").read_text())["train_ids"]
     held_out = ids.pop(7)
     edit_json(root / "dataset.json", train_ids=ids, val_ids=[held_out])
     path = root / damaged.format(held_out)
     path.write_bytes(path.read_bytes()[:-20])
     report = check_capture(root)
-    assert report.is_fit
-    (warning,) = [f.text for f in report.findings if f.level == "warning"]
-    assert str(path) in warning
-    assert "training does without this evaluation frame, but the evaluation after it fails" in warning
+    assert not report.is_fit
+    assert texts(report, "error") == f"{path} is truncated: its last chunk is cut off"
+    assert texts(report, "warning") == ""
     assert "epipolar lines" in texts(report, "note")  # the training frames are checked as ever
 
 

@@ -122,7 +122,7 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
     except ValueError as error:
         return Report(root, [Finding("error", "files", str(error))])
     findings = [Finding("note", "layout", f"read as {dataset or recognize(root)}"), *_counts(capture), *_files(capture)]
-    if not any(f.level == "error" and f.topic != "masks" for f in findings):
+    if not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings):
         findings += [*_geometry(capture, SAMPLES), *_turning(capture), *_depth(capture), *_motion(capture)]
     return Report(root, findings)
 
@@ -174,7 +174,8 @@ def _files(capture: Capture) -> Iterator[Finding]:
         try:
             frame = capture.frame(name)
         except ValueError as error:
-            yield Finding("error", "files", str(error)) if is_trained else _unread_evaluation_frame(error)
+            # The other checks read training frames only.
+            yield Finding("error", "files" if is_trained else "evaluation", str(error))
             continue
         num_read += 1
         num_depths += frame.inverse_depth is not None
@@ -209,11 +210,6 @@ def _masks(frames: list[_DynamicCounts]) -> Iterator[Finding]:
         text = f"the masks mark {mean:.1%} of the pixels as dynamic on average, {max(dynamic):.1%} at most"
         yield Finding("warning" if mean > MAX_DYNAMIC_FRACTION else "note", "masks", text)
         yield from _dynamic_depth(frames)
-
-
-def _unread_evaluation_frame(error: ValueError) -> Finding:
-    text = "training does without this evaluation frame, but the evaluation after it fails until the file is repaired"
-    return Finding("warning", "files", f"{error}; {text}")
 
 
 class _DynamicCounts(NamedTuple):
