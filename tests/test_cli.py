@@ -141,6 +141,35 @@ def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):
 
 
 @pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["train", "--preset", "bets"], "best"),
+        (["train", "--data", "builtin:studo"], "builtin:studio"),
+        (["train", "--data", "builtin:studio?depth=netwrk"], "builtin:studio?depth=network"),
+        (["train", "--data", "captures/hnd"], "captures/hand"),
+        (["train", "--resume", "rnus/hand"], "runs/hand"),
+        (["import", "captures/hand", "out", "--dataset", "blendr"], "blender"),
+        (["prepare", "captures/hnd", "out"], "captures/hand"),
+        (["prepare", "captures", "out", "--masks", "moton"], "motion"),
+        (["prepare", "captures", "out", "--depth", "anythin"], "anything"),
+        (["prepare", "captures/hand", "--add", "depth", "--depth", "flwo"], "flow"),
+        (["render", "runs/hnd"], "runs/hand"),
+        (["export", "runs/hand", "--format", "plt"], "ply"),
+        (["sweep", "ablations"], "ablation"),
+        (["sweep", "ablation", "--preset", "bets"], "best"),
+    ],
+)
+def test_a_misspelt_value_is_told_the_similar_one(arguments, meant, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("captures", "runs"):
+        (tmp_path / folder / "hand").mkdir(parents=True)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.endswith(f"; did you mean {meant}?\n")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
     "arguments",
     [
         ["prepare", "gone", "capture"],

@@ -1,7 +1,6 @@
 """The ``warpgs`` command."""
 
 import contextlib
-import difflib
 import importlib
 import sys
 import textwrap
@@ -9,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from .command_line.version import version
-from .errors import FAILED, ending_at_once, program, run_command, say, visible
+from .errors import FAILED, ending_at_once, program, run_command, say, suggestion, visible
 
 
 class Command(NamedTuple):
@@ -67,9 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name.startswith("--tyro"):
         return _print_completion(arguments)
     if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, 1)
-        advice = f"did you mean {close[0]}?" if close else "warpgs --help lists all"
-        say(f"there is no command {visible(name)}; {advice}")
+        advice = suggestion(name, COMMANDS) or "; warpgs --help lists all"
+        say(f"there is no command {visible(name)}{advice}")
         return FAILED
     prog = f"warpgs {name}"
     return train(rest, prog) if name == "train" else run_command(lambda: _run(name, rest, prog), prog)

@@ -11,7 +11,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
@@ -185,13 +185,32 @@ def command(*words: object) -> str:
     return shlex.join(["warpgs", *map(str, words)])
 
 
-def missing(path: Path) -> str:
-    """Message that a path does not exist, and what in its folder has a similar name."""
+def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] = str) -> str:
+    """The end of a message about something unknown, "; did you mean X?"; empty if nothing that is known is similar.
+
+    Args:
+        given: What is unknown.
+        known: What may be meant.
+        shown: How the message writes what may be meant.
+    """
+    close = difflib.get_close_matches(given, known, 1)
+    return f"; did you mean {shown(close[0])}?" if close else ""
+
+
+def similar_path(path: Path) -> str:
+    """The suggestion of a path that exists and differs from a missing one in the first part that does not exist."""
+    wrong = next((part for part in (path, *path.parents) if os.path.exists(part.parent)), path)
+    rest = path.relative_to(wrong)
     try:
-        close = difflib.get_close_matches(path.name, sorted({*os.listdir(path.parent)} - {path.name}), 1)
-    except OSError:  # no such folder
-        close = []
-    return f"{path} does not exist" + (f"; did you mean {path.parent / close[0]}?" if close else "")
+        names = [name for name in os.listdir(wrong.parent) if os.path.exists(wrong.parent / name / rest)]
+    except OSError:  # no folder, or one that cannot be read
+        names = []
+    return suggestion(wrong.name, names, lambda name: wrong.parent / name / rest)
+
+
+def missing(path: Path) -> str:
+    """Message that a path does not exist, and a similar one that does."""
+    return f"{path} does not exist{similar_path(path)}"
 
 
 def visible(text: str) -> str:

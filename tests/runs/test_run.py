@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -246,6 +247,13 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
 
     edit(run, rename)
     assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
+
+
+def test_a_misspelt_capture_of_a_run_is_told_the_similar_one(run, tmp_path):
+    meant = tmp_path / "elsewhere"
+    meant.mkdir()
+    with pytest.raises(ValueError, match=rf"give it by --data; did you mean {re.escape(str(meant))}\?$"):
+        Run.open(run, data=tmp_path / "elswhere").open_capture()
 
 
 def test_a_run_without_a_checkpoint_has_no_scene(run):

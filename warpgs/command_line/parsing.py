@@ -7,7 +7,6 @@ Help texts are the docstrings of fields. Tyro keeps their line breaks, which are
 import ast
 import contextlib
 import dataclasses
-import difflib
 import inspect
 import io
 import re
@@ -21,6 +20,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
+from warpgs.errors import suggestion
+
 Options = TypeVar("Options")
 
 RunFolder = Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
@@ -32,7 +33,8 @@ METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH
 def _choices(match: re.Match[str]) -> str:
     """One message for those of tyro and of argparse, which quotes the choices in some versions of Python."""
     choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
-    return f"{match['option']} must be one of {', '.join(choices)}, got {match['given']}"
+    close = suggestion(match["given"].strip("'"), choices)
+    return f"{match['option']} must be one of {', '.join(choices)}, got {match['given']}{close}"
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -73,9 +75,8 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in known and not name.startswith("--tyro"):
             # Without the dashes, which would make all short options similar.
-            close = difflib.get_close_matches(name[2:], [option[2:] for option in known], 1)
-            advice = f"did you mean --{close[0]}?" if close else f"{prog} --help lists all"
-            raise ValueError(f"there is no option {name}; {advice}")
+            close = suggestion(name[2:], [option[2:] for option in known], "--{}".format)
+            raise ValueError(f"there is no option {name}{close or f'; {prog} --help lists all'}")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):

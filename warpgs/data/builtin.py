@@ -3,10 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+from warpgs.errors import suggestion
+
 PREFIX = "builtin:"
 
-NAMES = ("builtin:room", "builtin:balls", "builtin:studio", "builtin:studio?depth=exact", "…=network", "…=none")
 DEPTHS = ("exact", "network", "none")
+NAMES = ("builtin:room", "builtin:balls", "builtin:studio", *(f"builtin:studio?depth={depth}" for depth in DEPTHS))
 
 
 def is_builtin(data: Path | str) -> bool:
@@ -20,11 +22,13 @@ def parse_builtin(data: Path | str) -> tuple[str, str]:
     Raises:
         ValueError: If there is no such capture.
     """
-    name, mark, query = str(data).removeprefix(PREFIX).partition("?")
-    queries = {"room": ("",), "balls": ("",), "studio": ("", *(f"depth={depth}" for depth in DEPTHS))}
-    if query not in queries.get(name, ()) or (mark and not query):
-        raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}")
-    return name, query.removeprefix("depth=") or "exact"
+    given = str(data).removeprefix(PREFIX)
+    if str(data) not in NAMES:
+        # Without the prefix, which would make all names similar.
+        close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
+        raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}{close}")
+    name, _, depth = given.partition("?depth=")
+    return name, depth or "exact"
 
 
 def require_factor(data: Path | str, factor: int | None) -> None:

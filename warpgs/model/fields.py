@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
+from warpgs.errors import suggestion
 
 from .mlp_deformation import MlpDeformation
 from .spline_deformation import SplineDeformation
@@ -33,6 +34,6 @@ def make_deformation(config: ModelConfig, center: Float[Tensor, "3"], half_size:
         ValueError: If there is no deformation model of this name.
     """
     if config.deformation not in FIELDS:
-        known = ", ".join(sorted(FIELDS))
+        known = ", ".join(sorted(FIELDS)) + suggestion(config.deformation, FIELDS)
         raise ValueError(f"there is no deformation model {config.deformation!r}; model.deformation is one of: {known}")
     return FIELDS[config.deformation](config, center, half_size)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from warpgs.data.loaders import is_capture
 from warpgs.data.writer import check_holdout, held_out
-from warpgs.errors import command
+from warpgs.errors import command, suggestion
 
 from .depth import DEPTHS
 from .frames import check_selection
@@ -38,9 +38,13 @@ def check_options(source: Path, root: Path, options: Options) -> None:
         )
     check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
-        raise ValueError(f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder")
+        close = suggestion(options.masks, MASKERS)
+        raise ValueError(
+            f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder{close}"
+        )
     if options.depth_method not in DEPTHS:
-        raise ValueError(f"--depth must be one of {', '.join(DEPTHS)}, got {options.depth}")
+        close = suggestion(options.depth_method, DEPTHS)
+        raise ValueError(f"--depth must be one of {', '.join(DEPTHS)}, got {options.depth}{close}")
     if options.camera != "moving" and options.depth == "flow":
         raise ValueError(
             f"--depth flow needs a camera that moves, with --camera {options.camera} there is no parallax: use --depth "

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
+from warpgs.errors import similar_path
 from warpgs.files import natural_order, read_json, write_json, write_png
 
 from .images import resize_to_side, sharpness
@@ -113,7 +114,7 @@ def take_frames(
     """
     check_selection(selection)
     if not source.exists():
-        raise ValueError(f"{source} is missing: expected a video or a folder of images")
+        raise ValueError(f"{source} is missing: expected a video or a folder of images{similar_path(source)}")
     notes = [] if notes is None else notes
     images = read_folder(source, selection, quiet) if source.is_dir() else read_video(source, selection, quiet, notes)
     taken: list[SourceFrame] = []

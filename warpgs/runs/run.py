@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import is_builtin
 from warpgs.data.capture import Capture, extent_of
-from warpgs.errors import command
+from warpgs.errors import command, similar_path
 from warpgs.files import partial_path
 from warpgs.model.trunk import in_single_precision
 from warpgs.ops.mlp import limit_of_multiprocessors
@@ -112,6 +112,7 @@ class Run:
         if data is not None and not is_builtin(data) and not data.exists():
             raise ValueError(
                 f"the capture of {self.folder}, {data}, does not exist; if it was moved, give it by --data"
+                f"{similar_path(data)}"
             )
         return open_capture(self.config, quiet)
 

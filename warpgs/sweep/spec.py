@@ -24,6 +24,7 @@ from typing import Any
 
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
+from warpgs.errors import suggestion
 from warpgs.files import read_bounded
 
 if sys.version_info >= (3, 11):
@@ -103,7 +104,8 @@ def read_spec(name: str) -> SweepSpec:
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not name.endswith(".toml") and name not in shipped():
-        raise ValueError(f"there is no sweep {name!r}, expected {', '.join(shipped())} or a .toml file")
+        known = f"{', '.join(shipped())} or a .toml file"
+        raise ValueError(f"there is no sweep {name!r}, expected {known}{suggestion(name, shipped())}")
     try:
         values = tomllib.loads(read_bounded(path, MAX_BYTES).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
