@@ -61,6 +61,21 @@ def test_images_are_rendered_as_the_config_says(trained):
         assert not torch.equal(own, render(trained.splats(0.0), scenes.camera(), settings=other).joint.image)
 
 
+def test_depth_is_that_along_the_z_axis_weighted_by_contribution_and_0_where_nothing_is(trained):
+    trained.metadata = dataclasses.replace(trained.metadata, use_deformation=False)
+    for gaussians, z in ((trained.scene.static, 1.0), (trained.scene.dynamic, -1.0)):  # the camera is at -3
+        gaussians.means[:, 2] = z
+    joint, static, dynamic = trained.render(scenes.camera(), branches=True, depth=True)[:3]
+    for layer, depth in ((static, 4.0), (dynamic, 2.0)):
+        assert 0 < int((layer.alpha == 0).sum()) < layer.alpha.numel()
+        assert torch.allclose(layer.depth, depth * (layer.alpha > 0))
+    mean = (2.0 * dynamic.alpha + 4.0 * (joint.alpha - dynamic.alpha)) / joint.alpha.clamp_min(1e-6)
+    assert torch.allclose(joint.depth, mean, rtol=1e-4)
+    plain = trained.render(scenes.camera()).joint
+    assert plain.depth is None
+    assert torch.equal(plain.image, joint.image)
+
+
 def test_each_size_is_captured_once(trained, captured):
     sizes = [(64, 48), (32, 24)]
     assert not trained.is_captured(sizes[0])

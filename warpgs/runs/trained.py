@@ -93,15 +93,21 @@ class TrainedScene:
         splats = self.scene.splats(time, *flags, self.metadata.sh_degree)
         return replace(splats, background=self.background)
 
-    def render(self, camera: Camera, time: float | None = None, branches: bool = False) -> Rendering:
+    def render(
+        self, camera: Camera, time: float | None = None, branches: bool = False, depth: bool = False
+    ) -> Rendering:
         """Renders the scene through a camera.
 
         Args:
             camera: The camera, on any device.
             time: Time in [0, 1]; ``camera.time`` if None.
             branches: Whether to render the static and the dynamic image as well.
+            depth: Whether to render depth as well, as ``depth`` [H, W] of each layer: the mean depth of its Gaussians
+                along the camera's z axis, weighted by their contribution [scene units]. Where alpha is 0, it is 0;
+                where alpha is low, it is that of the little that is there.
         """
-        return self._render(camera.to(self.device), self._on_device(camera.time if time is None else time), branches)
+        at = self._on_device(camera.time if time is None else time)
+        return self._render(camera.to(self.device), at, branches, depth)
 
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The joint image at the camera's time, as fast as possible.
@@ -120,9 +126,9 @@ class TrainedScene:
         return self._graphs.run(camera.size, partial(self._render_inputs, inputs, camera.size))[0]
 
     def _render_inputs(self, inputs: _Inputs, size: tuple[int, int]) -> tuple[Float[Tensor, "H W 3"]]:
-        return (self._render(Camera(inputs.viewmat, inputs.K, *size), inputs.time, False).joint.image,)
+        return (self._render(Camera(inputs.viewmat, inputs.K, *size), inputs.time, False, False).joint.image,)
 
     @torch.no_grad()
-    def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool) -> Rendering:
-        settings = replace(self.config.render_settings, branches=branches)
+    def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool, depth: bool) -> Rendering:
+        settings = replace(self.config.render_settings, branches=branches, depth=depth)
         return render(self._splats(time), camera, settings=settings)

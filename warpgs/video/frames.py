@@ -1,7 +1,6 @@
 """The images along a camera path: layers side by side, supersampled, beside the ground truth, or transparent."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.rendering import Layer, render
+from warpgs.rendering import Layer
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.depth import depth_bounds, depth_image
 from warpgs.visualize.images import averaged, to_bytes
@@ -91,11 +90,9 @@ def _depth_image(scene: TrainedScene, camera: Camera, depths: tuple[float, float
     return torch.from_numpy(image).to(scene.device).float() / 255.0
 
 
-@torch.no_grad()
 def _inverse_depth(scene: TrainedScene, camera: Camera) -> Float[np.ndarray, "H W"]:
     """[H, W], NaN where empty."""
-    settings = replace(scene.config.render_settings, depth=True)
-    return render(scene.splats(camera.time), camera, settings=settings).joint.inverse_depth.cpu().numpy()
+    return scene.render(camera, depth=True).joint.inverse_depth.cpu().numpy()
 
 
 def fitted(image: Float[Tensor, "H W 3"], camera: Camera) -> Float[Tensor, "h w 3"]:
