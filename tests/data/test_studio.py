@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rich
 import torch
 
 from warpgs.data import studio
@@ -122,6 +123,17 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch, cap
     assert builtin_folder("builtin:studio").name == "studio"
     assert capsys.readouterr().err == ""
     assert load_capture("builtin:studio?depth=network").frame("left_000000").inverse_depth is not None
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_terminal_shows_progress_while_it_is_made_unless_quiet(tmp_path, monkeypatch, capsys, quiet):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr(rich.get_console(), "is_interactive", True)  # it asked before
+    studio_capture("exact", tmp_path, SMALL, quiet=quiet)
+    shown = capsys.readouterr()
+    assert ("creating builtin:studio, once for all runs" in shown.out) is not quiet
+    assert ("making the built-in capture" in shown.err) is not quiet
 
 
 @pytest.mark.parametrize(
