@@ -237,6 +237,11 @@ def test_iterations_do_what_the_schedule_says(name, changes, expected):
     assert iterations_where(name, **changes) == expected
 
 
+@pytest.mark.parametrize("changes", [changes for name, changes, _ in ACTIONS.values() if name == "use_appearance"])
+def test_iterations_with_the_appearance_network_are_counted(changes):
+    assert protocol(**changes).appearance_iterations == len(iterations_where("use_appearance", **changes))
+
+
 def rising_from(first):
     """Rises linearly from 0 at an iteration to 1 at the end of the run."""
     return [0.0] * first + [k / (END - first) for k in range(END - first)]

@@ -17,6 +17,7 @@ from rich.text import Text
 from warpgs.training.logger import LINE
 
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
+from .order import longest_first
 from .scheduler import Event
 from .worker import STARTED, Job, last_lines
 
@@ -75,7 +76,7 @@ class Board:
                     self.states[name] = state
 
     def jobs(self, device: str) -> list[Job]:
-        """What is left to do, in order."""
+        """What is left to do, in the order in which it starts."""
         return [
             Job(
                 name=cell.name,
@@ -87,11 +88,11 @@ class Board:
                 evaluation=tuple(evaluation_arguments(cell.config)),
                 is_trained=cell.name in self.metrics,
             )
-            for cell in self.unfinished()
+            for cell in longest_first(self.unfinished())
         ]
 
     def unfinished(self) -> list[Cell]:
-        """The cells to train or to evaluate, in order."""
+        """The cells to train or to evaluate, in the order of the tables."""
         return [cell for cell in self.cells if self.states[cell.name] != "finished"]
 
     @property

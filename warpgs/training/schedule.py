@@ -146,6 +146,12 @@ class Protocol:
         self._settle_from = stage1 + stage2 - schedule.settle
         self._reseed_from = self._network_starts["deformation"] + schedule.warmup
 
+    @property
+    def appearance_iterations(self) -> int:
+        """Number of iterations in which the appearance network is in use: the last ones of the run."""
+        first = self.stage1.start + self._network_starts["appearance"]
+        return self.num_iterations - first if self.config.app else 0
+
     def stage_at(self, iteration: int) -> Stage:
         """The stage that an iteration belongs to."""
         return next(stage for stage in (self.pretrain, self.stage1, self.stage2) if iteration < stage.end)
