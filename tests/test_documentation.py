@@ -180,6 +180,11 @@ def test_images_link_to_their_files(pages):
     assert pages.on_page_content(f"<p>{image}</p>") == f'<p><a href="../images/a.jpg">{image}</a></p>'
 
 
+def test_every_page_is_in_the_navigation_of_the_site():
+    listed = re.findall(r"\S+\.md$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted(str(page.relative_to(ROOT / "docs")) for page in PAGES[1:])
+
+
 SITE = ("mkdocs", "material", "mkdocstrings")
 
 
