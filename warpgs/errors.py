@@ -197,6 +197,12 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
     return f"; did you mean {shown(close[0])}?" if close else ""
 
 
+def not_one_of(name: str, given: object, known: Iterable[str]) -> str:
+    """Message that the value of an option is not one of those that are known, and the similar one."""
+    known = list(known)
+    return f"{name} must be one of {', '.join(known)}, got {given!r}{suggestion(str(given), known)}"
+
+
 def similar_path(path: Path) -> str:
     """The suggestion of a path that exists and differs from a missing one in the first part that does not exist."""
     wrong = next((part for part in (path, *path.parents) if os.path.exists(part.parent)), path)

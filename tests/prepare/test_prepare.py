@@ -406,7 +406,7 @@ def test_inputs_are_never_replaced(shots, tmp_path, monkeypatch):
         ({"holdout": -2}, "--holdout"),
         ({"focal": -1.0}, "--focal must be positive"),
         ({"masks": "nowhere"}, "--masks must be motion, sam2, none or a folder of masks; nowhere is not a folder"),
-        ({"depth": "lidar"}, "--depth must be one of flow, anything, none, got lidar"),
+        ({"depth": "lidar"}, "--depth must be one of flow, anything, none, got 'lidar'"),
         ({"selection": Selection(count=1)}, "--count"),
         ({"camera": "turning", "depth": "flow"}, "--depth flow needs a camera that moves, with --camera turning there"),
         ({"camera": "turning", "lens": "OPENCV_FISHEYE"}, "--lens OPENCV_FISHEYE needs a camera that moves"),

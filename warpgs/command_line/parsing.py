@@ -20,7 +20,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
-from warpgs.errors import suggestion
+from warpgs.errors import not_one_of, suggestion
 
 Options = TypeVar("Options")
 
@@ -33,8 +33,7 @@ METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH
 def _choices(match: re.Match[str]) -> str:
     """One message for those of tyro and of argparse, which quotes the choices in some versions of Python."""
     choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
-    close = suggestion(match["given"].strip("'"), choices)
-    return f"{match['option']} must be one of {', '.join(choices)}, got {match['given']}{close}"
+    return not_one_of(match["option"], match["given"].strip("'"), choices)
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from warpgs.data.capture import background_color
-from warpgs.errors import suggestion
+from warpgs.errors import not_one_of
 from warpgs.runs.run import Run
 from warpgs.video.camera_paths import MAX_FRAMES
 
@@ -51,8 +51,7 @@ def _background_note(run: Run) -> str:
 def _check_format(options: Export) -> None:
     """Refuses an unknown format, and options that do not apply to the format."""
     if options.format not in WRITERS:
-        close = suggestion(options.format, WRITERS)
-        raise ValueError(f"--format must be one of {', '.join(WRITERS)}, got {options.format!r}{close}")
+        raise ValueError(not_one_of("--format", options.format, WRITERS))
     specific = {name for writer in WRITERS.values() for name in writer.options}
     for field in dataclasses.fields(Export):
         if field.name not in specific or field.name in WRITERS[options.format].options:

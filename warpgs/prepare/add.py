@@ -24,7 +24,7 @@ from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize, r
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.errors import suggestion
+from warpgs.errors import not_one_of
 from warpgs.files import read_json, write_json
 
 from .cameras import are_apart, camera_centers
@@ -92,8 +92,7 @@ def _check_options(options: AddOptions) -> None:
     for name, value, methods in (("masks", options.masks, MASKERS), ("depth", options.depth, DEPTHS)):
         known = [method for method, implementation in methods.items() if implementation is not None]
         if value not in known:
-            close = suggestion(value, known)
-            raise ValueError(f"--{name} must be one of {', '.join(known)} to add it, got {value}{close}")
+            raise ValueError(not_one_of(f"to add {name}, --{name}", value, known))
 
 
 class _Depth(NamedTuple):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from warpgs.data.loaders import is_capture
 from warpgs.data.writer import check_holdout, held_out
-from warpgs.errors import command, suggestion
+from warpgs.errors import command, not_one_of, suggestion
 
 from .depth import DEPTHS
 from .frames import check_selection
@@ -43,8 +43,7 @@ def check_options(source: Path, root: Path, options: Options) -> None:
             f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder{close}"
         )
     if options.depth_method not in DEPTHS:
-        close = suggestion(options.depth_method, DEPTHS)
-        raise ValueError(f"--depth must be one of {', '.join(DEPTHS)}, got {options.depth}{close}")
+        raise ValueError(not_one_of("--depth", options.depth_method, DEPTHS))
     if options.camera != "moving" and options.depth == "flow":
         raise ValueError(
             f"--depth flow needs a camera that moves, with --camera {options.camera} there is no parallax: use --depth "

@@ -11,7 +11,7 @@ from typing import Any
 
 from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import builtin_folder, is_builtin
-from warpgs.errors import FAILED, one_line, suggestion
+from warpgs.errors import FAILED, not_one_of, one_line
 from warpgs.evaluation.lpips import locate
 from warpgs.files import kept_if_used, read_json, write_json
 from warpgs.runs.run import LOCK, lock_folder
@@ -85,8 +85,7 @@ def _spec(options: Sweep) -> SweepSpec:
     """The sweep's file, changed by the command line."""
     spec = read_spec(options.sweep)
     if options.preset is not None and options.preset not in PRESETS:
-        close = suggestion(options.preset, PRESETS)
-        raise ValueError(f"--preset must be one of {', '.join(PRESETS)}, got {options.preset!r}{close}")
+        raise ValueError(not_one_of("--preset", options.preset, PRESETS))
     if options.tables_only and (options.lpips or options.lpips_net or options.as_taken):
         raise ValueError("--tables-only evaluates nothing: omit --lpips, --lpips-net and --as-taken")
     for name in ("seeds", "per_gpu", "cpus"):

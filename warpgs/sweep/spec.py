@@ -24,7 +24,7 @@ from typing import Any
 
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
-from warpgs.errors import suggestion
+from warpgs.errors import not_one_of, suggestion
 from warpgs.files import read_bounded
 
 if sys.version_info >= (3, 11):
@@ -117,7 +117,7 @@ def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     _check_keys(f"{path}", values, ("title", "preset", "seeds", "data", "options", "variants"))
     preset = values.get("preset", "best")
     if preset not in PRESETS:
-        raise ValueError(f"{path}: preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+        raise ValueError(f"{path}: {not_one_of('preset', preset, PRESETS)}")
     variants = values.get("variants", {"full": {}})
     if not isinstance(variants, dict) or not variants:
         raise ValueError(f"{path}: variants must be tables, one for each line of the result")
