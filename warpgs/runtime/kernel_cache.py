@@ -120,7 +120,9 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
 @functools.cache
 def _announce_compilation() -> None:
     """Says once per process why nothing happens for a while."""
-    sys.stderr.write(f"warpgs: compiling kernels into {wp.config.kernel_cache_dir}: this can take a minute\n")
+    sys.stderr.write(
+        f"warpgs: compiling kernels that are not in {wp.config.kernel_cache_dir} yet: this can take a minute\n"
+    )
 
 
 def _discard(folder: Path, reason: object) -> None:
