@@ -133,7 +133,7 @@ def test_a_spiral_is_closed():
 @pytest.mark.parametrize("stop", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
 def test_time_stops_while_the_camera_swings(stop, frames):
-    path = paths.bullet(camera(), 2.0, stop, frames)
+    path = paths.bullet([camera()], torch.zeros(1, 3), stop, frames)
     assert len(path) == frames
     moved = (positions(path) - camera().position).norm(dim=1) > 1e-4
     assert all(c.time == stop for c, m in zip(path, moved, strict=True) if m)
@@ -142,12 +142,28 @@ def test_time_stops_while_the_camera_swings(stop, frames):
 
 
 def test_bullet_time_runs_from_the_first_time_to_the_last_swings_to_both_sides_and_keeps_its_distance():
-    path = paths.bullet(camera(), 2.0, 0.5, 120)
+    path = paths.bullet([camera()], torch.zeros(1, 3), 0.5, 120)
     assert (path[0].time, path[-1].time) == (0.0, 1.0)
     centers = positions(path)
     assert centers[:, 0].max() == pytest.approx(2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers[:, 0].min() == pytest.approx(-2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
+
+
+@pytest.mark.parametrize("stop", [0.0, 0.3, 1.0])
+def test_bullet_time_follows_a_path_while_time_runs_and_swings_around_where_it_stops(stop):
+    training = [Camera(torch.eye(4), camera().K, 64, 48, k / 4) for k in range(5)]
+    for k, view in enumerate(training):
+        view.viewmat[:3, 3] = torch.tensor([-float(k), 0.0, 2.0])  # at x = k, looking at z = 0 from a distance of 2
+    target = torch.tensor([4 * stop, 0.0, 0.0])
+    path = paths.bullet(training, target[None], stop, 120)
+    running, stopped = [c for c in path if c.time != stop], [c for c in path if c.time == stop]
+    assert len(running) in (59, 60)
+    assert positions(running)[:, 0].tolist() == pytest.approx([4 * c.time for c in running], abs=1e-4)
+    assert max(distance_from_center(c, target) for c in stopped) < 1e-3
+    sides = positions(stopped)[:, 0] - target[0]
+    reach = 2 * math.sin(paths.BULLET_ARC)
+    assert (float(sides.min()), float(sides.max())) == pytest.approx((-reach, reach), rel=0.01)
 
 
 def test_outliers_do_not_enlarge_the_bounding_sphere():

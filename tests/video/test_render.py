@@ -19,6 +19,7 @@ from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video import frames, render_run, writer
+from warpgs.video.camera_paths import training_path
 from warpgs.video.command import Render
 from warpgs.visualize.images import to_bytes
 
@@ -250,6 +251,19 @@ def test_progress_is_hidden_only_if_quiet(run, tmp_path, monkeypatch, quiet):
     monkeypatch.setattr(frames, "progress", lambda steps, name, quiet: calls.append(quiet) or steps)
     render(run, tmp_path, path="fixed", quiet=quiet)
     assert calls == [quiet]
+
+
+def test_bullet_time_follows_the_training_camera_unless_a_view_is_given(run, capture, monkeypatch, tmp_path):
+    options = {"path": "bullet", "frames": 5}
+    with monkeypatch.context() as patch:
+        path = cameras_of(run, patch, tmp_path, **options)
+    with monkeypatch.context() as patch:
+        path_at_view = cameras_of(run, patch, tmp_path, **options, view=capture.train[1])
+    training = training_path(capture, 5)
+    for k in (0, -1):
+        assert path[k].time == training[k].time
+        assert (path[k].position - training[k].position).norm() < 1e-5
+        assert (path_at_view[k].position - capture.cameras[capture.train[1]].position).norm() < 1e-5
 
 
 @pytest.mark.parametrize(

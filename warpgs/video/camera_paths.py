@@ -210,24 +210,30 @@ def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]
     return path
 
 
-def bullet(camera: Camera, distance: float, stop: float, frames: int) -> list[Camera]:
-    """Bullet time: time runs up to ``stop``, stops while the camera swings around a point, and continues.
+def bullet(path: Sequence[Camera], points: Float[Tensor, "P 3"], stop: float, frames: int) -> list[Camera]:
+    """Bullet time: time runs up to ``stop``, stops while the camera swings around what it sees, and continues.
 
     Args:
-        camera: Camera while time runs.
-        distance: Depth of the point to swing around [scene units].
+        path: Cameras while time runs, at evenly spaced times; a single one stays where it is.
+        points: The camera swings around the median depth of those that it sees.
         stop: Time in [0, 1] at which time stops.
         frames: Total number of frames; half of them belong to the swing.
     """
     swing = (frames + 1) // 2
     before = round((frames - swing) * stop)
-    path = at_times(camera, [stop * k / max(1, before) for k in range(before)])
+    after = frames - swing - before
+    times = [stop * k / max(1, before) for k in range(before)] + [stop]
+    times += [stop + (1.0 - stop) * (k + 1) / after for k in range(after)]
+    running = interpolated(path, evenly_spaced(len(path)), times)
+    running = [dataclasses.replace(camera, time=time) for camera, time in zip(running, times, strict=True)]
+    stopped = running[before]
+    distance = focus(stopped, points)
+    swung = []
     for k in range(swing):
         angle = BULLET_ARC * math.sin(2.0 * math.pi * (k + 1) / (swing + 1))
         offset = [distance * math.sin(angle), 0.0, distance * (1.0 - math.cos(angle))]
-        path.append(_aimed(camera, torch.tensor(offset), distance, stop))
-    after = frames - swing - before
-    return path + at_times(camera, [stop + (1.0 - stop) * (k + 1) / after for k in range(after)])
+        swung.append(_aimed(stopped, torch.tensor(offset), distance, stop))
+    return running[:before] + swung + running[before + 1 :]
 
 
 def _aimed(camera: Camera, offset: Float[Tensor, "3"], distance: float, time: float) -> Camera:

@@ -24,13 +24,14 @@ class Render:
     """Run folder."""
     path: PathName | None = None
     """Camera path: the evaluation views (default); a fixed camera over time; the training camera's path at one fixed
-    time; the same path over time; a spiral around the middle view; bullet time around the middle view."""
+    time; the same path over time; a spiral around the middle view; bullet time, which stops on the same path."""
     keyframes: Path | None = None
     """JSON file of keyframes to follow instead (docs/viewing.md)."""
     out: Path | None = None
     """Output folder; RUN/render/PATH by default."""
     view: str | None = None
-    """Id of the start view of fixed, spiral and bullet; the middle evaluation view by default."""
+    """Id of the start view of fixed, spiral and bullet; by default the middle evaluation view, for bullet the training
+    camera's path."""
     time: float | None = None
     """Time in [0, 1] of frozen and spiral, and at which bullet stops; default 0.5, but all times for spiral."""
     frames: int | None = None

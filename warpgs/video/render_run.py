@@ -111,14 +111,16 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         path = camera_paths.training_path(capture, frames)
         frozen = [dataclasses.replace(camera, time=time) for camera in path]
         return _numbered(path if options.path == "moving" else frozen)
+    points = dynamic if len(dynamic) else means
+    if options.path == "bullet":
+        path = [_start_view(options, capture)] if options.view else camera_paths.training_path(capture, frames)
+        return _numbered(camera_paths.bullet(path, points, time, frames))
     camera = _start_view(options, capture)
     if options.path == "fixed":
         return _numbered(camera_paths.at_times(camera, camera_paths.evenly_spaced(frames)))
-    distance = camera_paths.focus(camera, dynamic if len(dynamic) else means)
-    if options.path == "spiral":
-        times = camera_paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
-        return _numbered(camera_paths.spiral(camera, distance, REACH * capture.extent, times))
-    return _numbered(camera_paths.bullet(camera, distance, time, frames))
+    times = camera_paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
+    distance = camera_paths.focus(camera, points)
+    return _numbered(camera_paths.spiral(camera, distance, REACH * capture.extent, times))
 
 
 def _numbered(path: list[Camera]) -> tuple[list[Camera], list[str]]:
@@ -130,7 +132,7 @@ def _number(k: int) -> str:
 
 
 def _start_view(options: Render, capture: Capture) -> Camera:
-    """The camera from which the fixed, spiral and bullet paths start."""
+    """The camera from which the fixed and spiral paths start, and the bullet path with --view."""
     names = capture.val or capture.train
     name = options.view or names[len(names) // 2]
     if name not in capture.cameras:
