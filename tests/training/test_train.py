@@ -390,6 +390,22 @@ def test_a_damaged_evaluation_frame_is_refused_before_training(held_out, kind, d
     assert is_resumed or not given.out.exists()
 
 
+def test_evaluation_frames_are_read_after_what_costs_no_time_and_as_they_were_taken_if_asked_for(held_out, monkeypatch):
+    given, _ = held_out
+    read = Mock(side_effect=ValueError("read"))
+    monkeypatch.setattr(script, "check_views", read)
+    given.out.mkdir()
+    (given.out / "file").touch()
+    with pytest.raises(ValueError, match="is not empty"):
+        script.make_trainer(given)
+    read.assert_not_called()
+    (given.out / "file").unlink()
+    for as_taken in (False, True):
+        with pytest.raises(ValueError, match=r"^read$"):
+            script.make_trainer(dataclasses.replace(given, as_taken=as_taken))
+        assert read.call_args.args[1] is as_taken
+
+
 def test_an_evaluation_frame_damaged_in_training_leaves_a_trained_run_and_says_how_to_evaluate_it(held_out):
     config, files = held_out
     frame, lines = files["image"], []

@@ -171,9 +171,10 @@ def read_views(capture: Capture, as_taken: bool = False) -> Iterator[tuple[Frame
         yield frame, None if read_taken is None else read_taken(name)
 
 
-def check_views(capture: Capture, as_taken: bool = False) -> None:
+def check_views(capture: Capture, as_taken: bool = False, quiet: bool = True) -> None:
     """Reads every evaluation frame as ``evaluate`` does and keeps none in memory; raises as ``read_views``."""
-    for _ in read_views(replace(capture, cache_frames=0), as_taken):
+    frames = read_views(replace(capture, cache_frames=0), as_taken)
+    for _ in zip(progress(capture.val, "reading evaluation frames", quiet), frames, strict=True):
         pass
 
 

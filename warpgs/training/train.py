@@ -224,6 +224,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     capture = check_capture(open_capture(config, quiet), config, log)
     _compare_ranks(config, capture)
     folder = str(new_folder(config, capture)) if ranks.is_first() else ""
+    _read_evaluation_frames(capture, config, quiet)
     if config.device == "cpu" and config.preset in ("best", "paper"):
         log(f"the preset {config.preset} is for a GPU; {_cpu_advice(config)}")
     config, trial = with_trusted_masks(config, capture, log, quiet)
@@ -265,6 +266,7 @@ def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trai
     locate(run.config.lpips, run.config.lpips_net)
     capture = check_capture(run.open_capture(quiet), run.config, log)
     _compare_ranks(run.config, capture)
+    _read_evaluation_frames(capture, run.config, quiet)
     trainer = Trainer(run.config, capture, run.folder)
     trainer.restore_newest(log)
     if trainer.iteration == trainer.protocol.num_iterations:
@@ -290,12 +292,18 @@ def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
     ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
 
 
+def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) -> None:
+    """Raises ValueError if the evaluation will fail to read a file: when training is done, it is too late."""
+    if ranks.is_first():  # which evaluates
+        check_views(capture, config.as_taken, quiet)
+
+
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
-    """The capture, after logging its warnings and reading its evaluation frames.
+    """The capture, after logging its warnings.
 
     Raises:
         UnfitCaptureError: If it has errors that would make training useless.
-        ValueError: If an evaluation frame, or one of three training frames, cannot be read; the message names its file.
+        ValueError: If one of three training frames cannot be read; the message names its file.
     """
     findings = quick_findings(capture.assuming(config.assume))
     errors = [finding for finding in findings if finding.level == "error"]
@@ -304,6 +312,4 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
             log(str(finding))
     if errors:
         raise UnfitCaptureError(errors)
-    if ranks.is_first():  # which evaluates when training is done: too late to learn that it cannot read a file
-        check_views(capture, config.as_taken)
     return capture
