@@ -144,6 +144,8 @@ def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):
     ("arguments", "meant"),
     [
         (["train", "--preset", "bets"], "best"),
+        (["train", "--preset", "BEST"], "best"),
+        (["train", "--preset", "bes't"], "best"),
         (["train", "--data", "builtin:studo"], "builtin:studio"),
         (["train", "--data", "builtin:studio?depth=netwrk"], "builtin:studio?depth=network"),
         (["train", "--data", "captures/hnd"], "captures/hand"),
@@ -151,6 +153,7 @@ def test_a_wrong_option_ends_with_one_line(arguments, message, capsys):
         (["import", "captures/hand", "out", "--dataset", "blendr"], "blender"),
         (["prepare", "captures/hnd", "out"], "captures/hand"),
         (["prepare", "captures", "out", "--masks", "moton"], "motion"),
+        (["prepare", "captures", "out", "--masks", "captures/hnd"], "captures/hand"),
         (["prepare", "captures", "out", "--depth", "anythin"], "anything"),
         (["prepare", "captures/hand", "--add", "depth", "--depth", "flwo"], "flow"),
         (["render", "runs/hnd"], "runs/hand"),

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -137,12 +138,15 @@ def test_a_command_in_a_message_can_be_pasted():
     assert command("prepare", Path("my video.mp4"), "--holdout", 8) == "warpgs prepare 'my video.mp4' --holdout 8"
 
 
-def test_a_missing_path_is_told_a_similar_one_that_exists(tmp_path):
+def test_a_missing_path_is_told_a_similar_one_that_exists(tmp_path, monkeypatch):
     (tmp_path / "hand").mkdir()
     assert missing(tmp_path / "hnd") == f"{tmp_path / 'hnd'} does not exist; did you mean {tmp_path / 'hand'}?"
     (tmp_path / "hand/depth").mkdir()
     assert missing(tmp_path / "hnd/depth").endswith(f"; did you mean {tmp_path / 'hand/depth'}?")
     (tmp_path / "loose").symlink_to(tmp_path / "gone")
+    monkeypatch.setattr("os.listdir", Mock(side_effect=PermissionError))
+    assert missing(tmp_path / "hnd") == f"{tmp_path / 'hnd'} does not exist"
+    monkeypatch.undo()
     for path in (tmp_path / "studio", tmp_path / "nowhere/hand", tmp_path / "hnd/rgb", tmp_path / "loose"):
         assert missing(path) == f"{path} does not exist"
 

@@ -193,8 +193,9 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
         known: What may be meant.
         shown: How the message writes what may be meant.
     """
-    close = difflib.get_close_matches(given, known, 1)
-    return f"; did you mean {shown(close[0])}?" if close else ""
+    by_lower_case = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(given.lower(), by_lower_case, 1)
+    return f"; did you mean {shown(by_lower_case[close[0]])}?" if close else ""
 
 
 def not_one_of(name: str, given: object, known: Iterable[str]) -> str:

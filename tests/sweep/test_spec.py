@@ -41,7 +41,7 @@ def test_a_number_of_seeds_counts_from_0(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("variants.a.losss.ssim = 1", r"rates.toml: variant a: there is no option losss"),
+        ("variants.a.losss.ssim = 1", r"rates.toml: variant a: there is no option losss; did you mean loss\?$"),
         ("variants.a.loss.sim = 1", r"rates.toml: variant a: there is no option loss.sim"),
         ("variants.a.loss = 1", r"rates.toml: variant a: loss must be a table, got 1"),
         ("variants.a.seed = 1", r"variant a: seed is not an option of one training"),
@@ -49,6 +49,7 @@ def test_a_number_of_seeds_counts_from_0(tmp_path):
         ("variants = 3", r"variants must be tables"),
         ("variant.a = {}", r"there is no entry variant, expected title"),
         ("preset = 'worst'", r"preset must be one of paper, .*, got 'worst'"),
+        ("preset = ['best']", r"preset must be one of paper, .*, got \['best'\]"),
         ("seeds = 0", r"seeds must be a number of seeds \(1 to 1000\) or a list of different ones, got 0"),
         ("seeds = 1000000000000", r"seeds must be a number"),
         ("seeds = [1, 1]", r"seeds must be a number"),

@@ -33,7 +33,7 @@ METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH
 def _choices(match: re.Match[str]) -> str:
     """One message for those of tyro and of argparse, which quotes the choices in some versions of Python."""
     choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
-    return not_one_of(match["option"], match["given"].strip("'"), choices)
+    return not_one_of(match["option"], match["given"], choices)
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -42,10 +42,14 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"^Missing from [^:]*: ", "missing: "),
     (r"([A-Z]{2,}) (?:(?!\(required\)).)*\(required\)", r"\1"),
     (
-        r"^invalid choice (?P<given>'.*') for argument '(?P<option>\S+)'\. Expected one of \((?P<choices>.*)\)\.$",
+        r"^invalid choice '(?P<given>.*)' for argument '(?P<option>\S+)'\. Expected one of \((?P<choices>.*)\)\.$",
         _choices,
     ),
-    (r"^argument (?P<option>\S+): invalid choice: (?P<given>'.*') \(choose from (?P<choices>.*)\)$", _choices),
+    # Python quotes a value that has a single quote by double ones.
+    (
+        r"""^argument (?P<option>\S+): invalid choice: ['"](?P<given>.*)['"] \(choose from (?P<choices>.*)\)$""",
+        _choices,
+    ),
     (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
 )
 """Parts of tyro's messages and what is said instead."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from warpgs.data.loaders import is_capture
 from warpgs.data.writer import check_holdout, held_out
-from warpgs.errors import command, not_one_of, suggestion
+from warpgs.errors import command, not_one_of, similar_path, suggestion
 
 from .depth import DEPTHS
 from .frames import check_selection
@@ -38,7 +38,7 @@ def check_options(source: Path, root: Path, options: Options) -> None:
         )
     check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
-        close = suggestion(options.masks, MASKERS)
+        close = suggestion(options.masks, MASKERS) or similar_path(Path(options.masks))
         raise ValueError(
             f"--masks must be {', '.join(MASKERS)} or a folder of masks; {options.masks} is not a folder{close}"
         )

@@ -116,7 +116,7 @@ def read_spec(name: str) -> SweepSpec:
 def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     _check_keys(f"{path}", values, ("title", "preset", "seeds", "data", "options", "variants"))
     preset = values.get("preset", "best")
-    if preset not in PRESETS:
+    if preset not in list(PRESETS):  # which a list of TOML can be compared with
         raise ValueError(f"{path}: {not_one_of('preset', preset, PRESETS)}")
     variants = values.get("variants", {"full": {}})
     if not isinstance(variants, dict) or not variants:
@@ -190,7 +190,7 @@ def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str
     known = {field.name: field for field in fields(cls)}
     for name, value in options.items():
         if name not in known:
-            raise ValueError(f"{where}: there is no option {prefix}{name}")
+            raise ValueError(f"{where}: there is no option {prefix}{name}{suggestion(name, known)}")
         if not prefix and name in RESERVED:
             raise ValueError(f"{where}: {name} is not an option of one training: the sweep sets it")
         default = known[name].default_factory
