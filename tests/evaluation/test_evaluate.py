@@ -29,6 +29,7 @@ from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips
 from warpgs.files import write_json
 from warpgs.rendering import Layer, Rendering
+from warpgs.runs import checkpoint
 from warpgs.runs.run import open_capture
 from warpgs.training.train import train
 
@@ -424,6 +425,14 @@ def test_changed_images_of_a_capture_are_read_again(run, tmp_path, monkeypatch):
         write_png(path, np.zeros((tiny.SCENE.height, tiny.SCENE.width, 3), np.uint8))
     evaluate_run.evaluate_run(copy, open_capture(dataclasses.replace(tiny.CONFIG, data=data)), quiet=True)
     assert json.loads((copy / "metrics.json").read_text())["psnr"] != pytest.approx(before)
+
+
+def test_a_run_is_not_evaluated_at_other_times_than_those_it_was_trained_at(finished_run, tmp_path):
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    path = checkpoint.list_checkpoints(run)[-1]
+    tiny.edit_metadata(path, lambda values: values.update(times=[time / 2 for time in values["times"]]))
+    with pytest.raises(ValueError, match=r"^frame \S+ of builtin had time \S+ in training and has \S+ now: "):
+        evaluate_run.evaluate_run(run, quiet=True)
 
 
 def test_metrics_are_written_even_if_the_video_cannot_be(finished_run, tmp_path, monkeypatch):

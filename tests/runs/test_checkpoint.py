@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import gc
 import json
+import math
 import os
 import pickle
 import resource
@@ -210,6 +211,7 @@ def test_missing_metadata_is_named_with_the_file(path, missing):
 
 WRONG = {"moving": ["yes"], "relit": [1], "sh_degree": [0.5, []], "iteration": [-1, True, 10**400]}
 WRONG |= {"train_seconds": ["1", None], "rollbacks": [-1], "views": [[1]]}
+WRONG |= {"times": [["0"], [1.5], [True], [math.nan]]}
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])
@@ -224,6 +226,11 @@ def test_a_degree_that_the_config_does_not_have_is_damage(tmp_path):
     checkpoint.save(path, tensors_of(scene()), dataclasses.replace(METADATA, sh_degree=3))
     with pytest.raises(ValueError, match=f"{path} is damaged: sh_degree cannot be 3"):
         read_whole(path)
+
+
+def test_checkpoints_without_times_are_read(path):
+    tiny.edit_metadata(path, lambda values: values.pop("times"))
+    assert checkpoint.load(path).metadata.times == ()
 
 
 def test_the_keys_in_the_file_are_those_of_version_2(path):

@@ -285,6 +285,17 @@ def test_a_capture_whose_frames_have_changed_is_refused(data, finished):
         tiny.trainer(data, finished).restore_newest(print)
 
 
+def test_a_capture_whose_times_have_changed_is_refused(data, finished):
+    path = checkpoint.list_checkpoints(finished)[-1]
+    times = checkpoint.load(path).metadata.times
+    assert len(times) > 1
+    assert max(times) <= 1
+    tiny.edit_metadata(path, lambda values: values.update(times=[time / 2 for time in times]))
+    message = rf"frame \S+ of builtin had time {times[1] / 2:.4g} in training and has {times[1]:.4g} now: .*"
+    with pytest.raises(ValueError, match=message):
+        tiny.trainer(data, finished).restore_newest(print)
+
+
 def test_a_run_without_a_checkpoint_starts_from_the_beginning(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path / "run")
     trainer.restore_newest(print)

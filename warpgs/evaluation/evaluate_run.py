@@ -12,6 +12,7 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import read_json, write_json, write_png
 from warpgs.rendering import Rendering
+from warpgs.runs.captures import require_same_times
 from warpgs.runs.run import MASK_TRIAL, Device, Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.writer import Video
@@ -62,6 +63,7 @@ def evaluate_run(
     trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
+    require_same_times(capture, scene.metadata)
     save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)

@@ -8,6 +8,11 @@ from warpgs.data.capture import Background, Capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
 
+from .checkpoint import Metadata
+
+MAX_TIME_CHANGE = 1e-6
+"""Difference of times that is rounding, not another capture."""
+
 
 def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     """The capture of a config, over its background; without one the built-in scene, rendered on the first call.
@@ -34,6 +39,17 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     if config.background == "capture" or config.background == "mean":
         return capture
     return capture.over(config.background)
+
+
+def require_same_times(capture: Capture, metadata: Metadata) -> None:
+    """Raises ValueError if a frame that a checkpoint was trained on has another time now: then all times may differ."""
+    for name, time in zip(metadata.views, metadata.times, strict=False):  # checkpoints of version 0.2 have no times
+        now = capture.cameras[name].time if name in capture.cameras else time
+        if abs(now - time) > MAX_TIME_CHANGE:
+            raise ValueError(
+                f"frame {name} of {capture.name} had time {time:.4g} in training and has {now:.4g} now: the last frame "
+                "has time 1, so it must stay the same (but its image may be replaced by one of the same size)"
+            )
 
 
 def known_background(config: TrainConfig, capture: Capture) -> Background:

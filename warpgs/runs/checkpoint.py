@@ -56,6 +56,7 @@ class Metadata:
         peak_bytes: Peak memory of tensors on the GPU [bytes]; None on CPU.
         rollbacks: Returns to a checkpoint after a loss that was not finite.
         views: Ids of the training frames.
+        times: Their times in [0, 1]; none in checkpoints of version 0.2 and earlier.
     """
 
     iteration: int
@@ -66,10 +67,14 @@ class Metadata:
     peak_bytes: int | None = None
     rollbacks: int = 0
     views: tuple[str, ...] = ()
+    times: tuple[float, ...] = ()
 
 
 FILE_KEYS = {"use_deformation": "moving", "use_appearance": "relit"}
 """Names of fields of ``Metadata`` in the file where they differ: the format is that of version 2."""
+
+LISTS = ("views", "times")
+"""Fields of ``Metadata`` that are lists in the file."""
 
 
 @dataclass(frozen=True)
@@ -178,14 +183,15 @@ def _parse_metadata(path: Path, text: str) -> Metadata:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DamagedCheckpointError(path, error) from error
-    if not isinstance(values, dict) or not isinstance(values.get("views", []), list):
+    if not isinstance(values, dict) or not all(isinstance(values.get(key, []), list) for key in LISTS):
         raise DamagedCheckpointError(path, "expected an object of plain values")
     parsed: dict[str, Any] = {}
+    values = {"times": [], **values}
     for field in fields(Metadata):
         key = FILE_KEYS.get(field.name, field.name)
         if key not in values:
             raise DamagedCheckpointError(path, f"it has no {key}")
-        value = tuple(values[key]) if field.name == "views" else values[key]
+        value = tuple(values[key]) if field.name in LISTS else values[key]
         if not _is_valid(field.name, value):
             raise DamagedCheckpointError(path, f"{key} cannot be {reprlib.repr(value)}")
         parsed[field.name] = value
@@ -195,6 +201,8 @@ def _parse_metadata(path: Path, text: str) -> Metadata:
 def _is_valid(name: str, value: Any) -> bool:
     if name == "views":
         return all(isinstance(view, str) for view in value)
+    if name == "times":
+        return all(type(time) in (int, float) and 0 <= time <= 1 for time in value)
     if name in ("use_deformation", "use_appearance"):
         return isinstance(value, bool)
     if name == "peak_bytes" and value is None:

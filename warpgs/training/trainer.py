@@ -13,7 +13,7 @@ from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
-from warpgs.runs.captures import known_background
+from warpgs.runs.captures import known_background, require_same_times
 from warpgs.runs.trained import TrainedScene
 
 from . import initialize, ranks
@@ -339,6 +339,7 @@ class Trainer:
             peak_bytes=self._peak_bytes(),
             rollbacks=self.rollbacks,
             views=tuple(self.capture.train),
+            times=tuple(self.capture.cameras[name].time for name in self.capture.train),
         )
 
     def _peak_bytes(self) -> int | None:
@@ -357,6 +358,7 @@ class Trainer:
         loaded = checkpoint.load(path)
         if loaded.metadata.views != self.capture.train:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
+        require_same_times(self.capture, loaded.metadata)
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
         if self.views.poses is not None:
             self.views.poses.load_state_dict(checkpoint.load_poses(loaded, self.capture.extent).state_dict())
