@@ -1,9 +1,12 @@
 """Camera paths start and end at the right cameras, keep their target in view and stay in the scene."""
 
+import dataclasses
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
@@ -211,3 +214,25 @@ def test_a_resized_camera_sees_the_same_view(factor):
 def test_an_image_without_pixels_is_refused():
     with pytest.raises(ValueError, match=r"64 × 48 times 0\.001 has no pixels"):
         paths.resized(camera(), 0.001)
+
+
+def ring(num, step, sizes=((64, 48),)):
+    """A capture of cameras that turn around the vertical axis by a step [degrees]."""
+    cameras = {}
+    for k in range(num):
+        turn = torch.from_numpy(Rotation.from_euler("y", k * step, degrees=True).as_matrix()).float()
+        view = camera().resized(*sizes[k % len(sizes)])
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = turn
+        cameras[str(k)] = dataclasses.replace(view, viewmat=viewmat, time=k / (num - 1))
+    return Mock(spec=Capture, cameras=cameras, train=list(cameras))
+
+
+def test_a_training_camera_that_turns_far_between_frames_jumps():
+    assert [paths.jumps(ring(*args)) for args in ((10, 5), (10, 90), (2, 30))] == [False, True, False]
+
+
+def test_a_path_through_cameras_of_two_sizes_has_one_size_and_one_field_of_view():
+    path = paths.training_path(ring(5, 2, ((64, 48), (32, 24))), 9)
+    assert {c.size for c in path} == {(64, 48)}
+    assert [float(c.K[0, 0]) for c in path] == pytest.approx([float(camera().K[0, 0])] * 9)

@@ -123,6 +123,7 @@ def cameras_of(run, monkeypatch, tmp_path, **options):
         ("moving", None, [0.0, 0.5, 1.0]),
         ("spiral", None, [0.0, 0.5, 1.0]),
         ("spiral", 0.2, [0.2, 0.2, 0.2]),
+        ("bullet", 0.2, [0.2, 0.2, 1.0]),
     ],
 )
 def test_cameras_move_and_time_passes_unless_one_is_given(run, monkeypatch, tmp_path, path, time, times):
@@ -259,7 +260,7 @@ def test_bullet_time_follows_the_training_camera_unless_a_view_is_given(run, cap
         path = cameras_of(run, patch, tmp_path, **options)
     with monkeypatch.context() as patch:
         path_at_view = cameras_of(run, patch, tmp_path, **options, view=capture.train[1])
-    training = training_path(capture, 5)
+    training = training_path(capture, render_run.FRAMES)
     for k in (0, -1):
         assert path[k].time == training[k].time
         assert (path[k].position - training[k].position).norm() < 1e-5

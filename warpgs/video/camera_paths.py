@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -48,6 +49,9 @@ SPIRAL_TURNS = 2
 
 BULLET_ARC = math.radians(15.0)
 """Maximum angle of bullet time to either side [rad]: a single camera has not seen the scene from further around."""
+
+MAX_TURN = math.radians(45.0)
+"""Turn between two frames from which a training camera jumps instead of moving [rad]."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +134,27 @@ def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -
 
     If several cameras have the same time, the first one is used.
     """
+    recorded, times = _in_time(capture), evenly_spaced(frames)
+    size = recorded[0].size
+    views = [camera if camera.size == size else filling(camera, size) for camera in recorded]
+    path = interpolated(views, [camera.time for camera in recorded], times)
+    path = _smoothed(path, smoothing * max(1, frames - 1)) if smoothing > 0 and frames > 2 else path
+    return [dataclasses.replace(camera, time=time) for camera, time in zip(path, times, strict=True)]
+
+
+def jumps(capture: Capture) -> bool:
+    """Whether the training camera turns by more than ``MAX_TURN`` between most frames, as in D-NeRF."""
+    rotations = [Rotation.from_matrix(_rotation(camera)) for camera in _in_time(capture)]
+    turns = [(b * a.inv()).magnitude() for a, b in pairwise(rotations)]
+    return bool(turns) and float(np.median(turns)) > MAX_TURN
+
+
+def _in_time(capture: Capture) -> list[Camera]:
+    """The training cameras in the order of their times, one for each time."""
     by_time: dict[float, Camera] = {}
     for name in capture.train:
         by_time.setdefault(capture.cameras[name].time, capture.cameras[name])
-    knots, times = sorted(by_time), evenly_spaced(frames)
-    path = interpolated([by_time[time] for time in knots], knots, times)
-    path = _smoothed(path, smoothing * max(1, frames - 1)) if smoothing > 0 and frames > 2 else path
-    return [dataclasses.replace(camera, time=time) for camera, time in zip(path, times, strict=True)]
+    return [by_time[time] for time in sorted(by_time)]
 
 
 def interpolated(
@@ -230,7 +248,8 @@ def bullet(path: Sequence[Camera], points: Float[Tensor, "P 3"], stop: float, fr
     distance = focus(stopped, points)
     swung = []
     for k in range(swing):
-        angle = BULLET_ARC * math.sin(2.0 * math.pi * (k + 1) / (swing + 1))
+        part = (k + 1) / (swing + 1)
+        angle = BULLET_ARC * math.sin(2.0 * math.pi * part**2 * (3.0 - 2.0 * part))  # slow at both ends
         offset = [distance * math.sin(angle), 0.0, distance * (1.0 - math.cos(angle))]
         swung.append(_aimed(stopped, torch.tensor(offset), distance, stop))
     return running[:before] + swung + running[before + 1 :]

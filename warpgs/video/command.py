@@ -30,8 +30,8 @@ class Render:
     out: Path | None = None
     """Output folder; RUN/render/PATH by default."""
     view: str | None = None
-    """Id of the start view of fixed, spiral and bullet; by default the middle evaluation view, for bullet the training
-    camera's path."""
+    """Id of the start view of fixed, spiral and bullet; by default the middle evaluation view. Without it, bullet
+    follows the training camera, unless that jumps from frame to frame."""
     time: float | None = None
     """Time in [0, 1] of frozen and spiral, and at which bullet stops; default 0.5, but all times for spiral."""
     frames: int | None = None

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
+from warpgs.errors import suggestion
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
@@ -113,7 +114,8 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         return _numbered(path if options.path == "moving" else frozen)
     points = dynamic if len(dynamic) else means
     if options.path == "bullet":
-        path = [_start_view(options, capture)] if options.view else camera_paths.training_path(capture, frames)
+        stays = options.view is not None or camera_paths.jumps(capture)
+        path = [_start_view(options, capture)] if stays else camera_paths.training_path(capture, max(frames, FRAMES))
         return _numbered(camera_paths.bullet(path, points, time, frames))
     camera = _start_view(options, capture)
     if options.path == "fixed":
@@ -136,7 +138,8 @@ def _start_view(options: Render, capture: Capture) -> Camera:
     names = capture.val or capture.train
     name = options.view or names[len(names) // 2]
     if name not in capture.cameras:
-        raise ValueError(f"{capture.name} has no view {name!r}; its first is {names[0]!r}")
+        close = suggestion(name, capture.cameras) or f"; its first is {names[0]!r}"
+        raise ValueError(f"{capture.name} has no view {name!r}{close}")
     return capture.cameras[name]
 
 
