@@ -12,7 +12,17 @@ import pytest
 import torch
 
 from warpgs.data.check import Finding
-from warpgs.errors import ADVICE, CLOSED, command, is_out_of_memory, missing, one_line, run_command, terminable
+from warpgs.errors import (
+    ADVICE,
+    CLOSED,
+    command,
+    is_out_of_memory,
+    missing,
+    one_line,
+    run_command,
+    suggestion,
+    terminable,
+)
 
 
 def failing(error):
@@ -136,6 +146,12 @@ def test_messages_of_lack_of_memory_are_recognized(message):
 
 def test_a_command_in_a_message_can_be_pasted():
     assert command("prepare", Path("my video.mp4"), "--holdout", 8) == "warpgs prepare 'my video.mp4' --holdout 8"
+
+
+def test_a_suggestion_is_written_as_it_is_known_whatever_the_case():
+    assert suggestion("openvc", ["OPENCV", "SIMPLE"]) == "; did you mean OPENCV?"
+    assert suggestion("OPENVC", ["opencv"]) == "; did you mean opencv?"
+    assert suggestion("blender", ["opencv"]) == ""
 
 
 def test_a_missing_path_is_told_a_similar_one_that_exists(tmp_path, monkeypatch):

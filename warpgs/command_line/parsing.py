@@ -33,7 +33,9 @@ METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH
 def _choices(match: re.Match[str]) -> str:
     """One message for those of tyro and of argparse, which quotes the choices in some versions of Python."""
     choices = sorted({choice.strip(" '") for choice in match["choices"].split(",")} - {"None", ""})
-    return not_one_of(match["option"], match["given"], choices)
+    groups = match.groupdict()
+    given = ast.literal_eval(groups["literal"]) if "literal" in groups else groups["given"]
+    return not_one_of(match["option"], given, choices)
 
 
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
@@ -45,9 +47,8 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"^invalid choice '(?P<given>.*)' for argument '(?P<option>\S+)'\. Expected one of \((?P<choices>.*)\)\.$",
         _choices,
     ),
-    # Python quotes a value that has a single quote by double ones.
     (
-        r"""^argument (?P<option>\S+): invalid choice: ['"](?P<given>.*)['"] \(choose from (?P<choices>.*)\)$""",
+        r"""^argument (?P<option>\S+): invalid choice: (?P<literal>'.*'|".*") \(choose from (?P<choices>.*)\)$""",
         _choices,
     ),
     (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),

@@ -190,7 +190,8 @@ def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str
     known = {field.name: field for field in fields(cls)}
     for name, value in options.items():
         if name not in known:
-            raise ValueError(f"{where}: there is no option {prefix}{name}{suggestion(name, known)}")
+            close = suggestion(name, known, f"{prefix}{{}}".format)
+            raise ValueError(f"{where}: there is no option {prefix}{name}{close}")
         if not prefix and name in RESERVED:
             raise ValueError(f"{where}: {name} is not an option of one training: the sweep sets it")
         default = known[name].default_factory

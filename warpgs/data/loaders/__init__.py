@@ -13,7 +13,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.colmap import find_model
 from warpgs.data.masks import check_perturbation
 from warpgs.data.writer import FINISHED, STATE, WORK
-from warpgs.errors import command, missing, suggestion
+from warpgs.errors import command, missing, not_one_of
 from warpgs.files import read_json
 
 from .blender import BlenderLoader
@@ -85,8 +85,7 @@ def load_capture(
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
     """
     if dataset is not None and dataset not in LOADERS:
-        close = suggestion(dataset, LOADERS)
-        raise ValueError(f"unknown dataset {dataset!r}, expected one of {', '.join(LOADERS)}{close}")
+        raise ValueError(not_one_of("dataset", dataset, LOADERS))
     if factor is not None and factor < 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
     perturbation = perturbation or MaskPerturbation()
