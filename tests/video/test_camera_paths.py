@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import pairwise
 from unittest.mock import Mock
 
 import pytest
@@ -103,6 +104,11 @@ def test_the_focus_is_the_median_depth_of_the_visible_points():
     assert paths.focus(camera(), torch.cat([behind, ahead])) == pytest.approx(4.0)
 
 
+def test_the_focus_is_on_the_first_cloud_of_which_any_point_is_visible():
+    empty, behind, near, far = torch.zeros(0, 3), *(torch.tensor([[0.0, 0.0, z]]) for z in (-9.0, 1.0, 5.0))
+    assert paths.focus(camera(), empty, behind, near, far) == pytest.approx(3.0)
+
+
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.tensor([[0.0, 0.0, -9.0]])])
 def test_without_visible_points_the_focus_is_one_unit_away(points):
     assert paths.focus(camera(), points) == 1.0
@@ -136,7 +142,7 @@ def test_a_spiral_is_closed():
 @pytest.mark.parametrize("stop", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("frames", [1, 2, 7, 120])
 def test_time_stops_while_the_camera_swings(stop, frames):
-    path = paths.bullet([camera()], torch.zeros(1, 3), stop, frames)
+    path = paths.bullet([camera()], [torch.zeros(1, 3)], stop, frames)
     assert len(path) == frames
     moved = (positions(path) - camera().position).norm(dim=1) > 1e-4
     assert all(c.time == stop for c, m in zip(path, moved, strict=True) if m)
@@ -145,12 +151,21 @@ def test_time_stops_while_the_camera_swings(stop, frames):
 
 
 def test_bullet_time_runs_from_the_first_time_to_the_last_swings_to_both_sides_and_keeps_its_distance():
-    path = paths.bullet([camera()], torch.zeros(1, 3), 0.5, 120)
+    path = paths.bullet([camera()], [torch.zeros(1, 3)], 0.5, 120)
     assert (path[0].time, path[-1].time) == (0.0, 1.0)
     centers = positions(path)
     assert centers[:, 0].max() == pytest.approx(2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers[:, 0].min() == pytest.approx(-2 * math.sin(paths.BULLET_ARC), rel=0.01)
     assert centers.norm(dim=1).tolist() == pytest.approx([2.0] * 120, abs=1e-4)
+
+
+def test_no_frame_of_bullet_time_is_shown_twice_and_the_swing_begins_and_ends_slowly():
+    path = paths.bullet([camera()], [torch.zeros(1, 3)], 0.5, 120)
+    assert all(a.time < b.time or (a.position - b.position).norm() > 1e-4 for a, b in pairwise(path))
+    steps = [float((b.position - a.position).norm()) for a, b in pairwise(path)]
+    swing = [step for step in steps if step > 1e-4]
+    assert len(swing) == 61  # to the first of 60 frames, and from the last
+    assert max(swing[0], swing[-1]) < 0.2 * max(swing)
 
 
 @pytest.mark.parametrize("stop", [0.0, 0.3, 1.0])
@@ -159,7 +174,7 @@ def test_bullet_time_follows_a_path_while_time_runs_and_swings_around_where_it_s
     for k, view in enumerate(training):
         view.viewmat[:3, 3] = torch.tensor([-float(k), 0.0, 2.0])  # at x = k, looking at z = 0 from a distance of 2
     target = torch.tensor([4 * stop, 0.0, 0.0])
-    path = paths.bullet(training, target[None], stop, 120)
+    path = paths.bullet(training, [target[None]], stop, 120)
     running, stopped = [c for c in path if c.time != stop], [c for c in path if c.time == stop]
     assert len(running) in (59, 60)
     assert positions(running)[:, 0].tolist() == pytest.approx([4 * c.time for c in running], abs=1e-4)

@@ -202,13 +202,13 @@ def _rotation(camera: Camera) -> np.ndarray:
     return camera.viewmat[:3, :3].double().cpu().numpy()
 
 
-def focus(camera: Camera, points: Float[Tensor, "P 3"]) -> float:
-    """Median depth of the points that a camera sees [scene units]; 1 if it sees none."""
-    points = points[torch.isfinite(points).all(1)]
-    if not len(points):
-        return 1.0
-    _, _, depth, inside = camera.project(points)
-    return float(depth[inside].median()) if bool(inside.any()) else 1.0
+def focus(camera: Camera, *clouds: Float[Tensor, "_ 3"]) -> float:
+    """Median depth [scene units] of the points that a camera sees, of the first cloud of which it sees any; else 1."""
+    for points in clouds:
+        _, _, depth, inside = camera.project(points[torch.isfinite(points).all(1)])
+        if bool(inside.any()):
+            return float(depth[inside].median())
+    return 1.0
 
 
 def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]) -> list[Camera]:
@@ -228,12 +228,12 @@ def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]
     return path
 
 
-def bullet(path: Sequence[Camera], points: Float[Tensor, "P 3"], stop: float, frames: int) -> list[Camera]:
+def bullet(path: Sequence[Camera], clouds: Sequence[Float[Tensor, "_ 3"]], stop: float, frames: int) -> list[Camera]:
     """Bullet time: time runs up to ``stop``, stops while the camera swings around what it sees, and continues.
 
     Args:
         path: Cameras while time runs, at evenly spaced times; a single one stays where it is.
-        points: The camera swings around the median depth of those that it sees.
+        clouds: Points at the stop; the camera swings around their ``focus``.
         stop: Time in [0, 1] at which time stops.
         frames: Total number of frames; half of them belong to the swing.
     """
@@ -245,7 +245,7 @@ def bullet(path: Sequence[Camera], points: Float[Tensor, "P 3"], stop: float, fr
     running = interpolated(path, evenly_spaced(len(path)), times)
     running = [dataclasses.replace(camera, time=time) for camera, time in zip(running, times, strict=True)]
     stopped = running[before]
-    distance = focus(stopped, points)
+    distance = focus(stopped, *clouds)
     swung = []
     for k in range(swing):
         part = (k + 1) / (swing + 1)

@@ -49,8 +49,8 @@ def render_run(options: Render) -> str:
     run = Run.open(options.run_folder, options.device, options.data)
     scene = run.trained_scene()
     capture = run.open_corrected_capture(options.quiet)
-    dynamic, static = scene.scene.dynamic.means.cpu(), scene.scene.static.means.cpu()
-    means = torch.cat([dynamic, static])
+    means = scene.splats(_time(options)).means.cpu()
+    dynamic = means[len(scene.scene.static) :]
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
     cameras, names = _cameras(options, capture, dynamic, means)
     camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
@@ -101,7 +101,7 @@ def _video_suffix(options: Render) -> str | None:
 
 def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) -> tuple[list[Camera], list[str]]:
     """The cameras of the path and the name of each image."""
-    frames, time = options.frames or FRAMES, 0.5 if options.time is None else options.time
+    frames, time = options.frames or FRAMES, _time(options)
     if options.keyframes is not None:
         return _numbered(keyframes.read_path(options.keyframes, capture, frames))
     if options.path_name == "views":
@@ -112,17 +112,21 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         path = camera_paths.training_path(capture, frames)
         frozen = [dataclasses.replace(camera, time=time) for camera in path]
         return _numbered(path if options.path == "moving" else frozen)
-    points = dynamic if len(dynamic) else means
     if options.path == "bullet":
         stays = options.view is not None or camera_paths.jumps(capture)
         path = [_start_view(options, capture)] if stays else camera_paths.training_path(capture, max(frames, FRAMES))
-        return _numbered(camera_paths.bullet(path, points, time, frames))
+        return _numbered(camera_paths.bullet(path, (dynamic, means), time, frames))
     camera = _start_view(options, capture)
     if options.path == "fixed":
         return _numbered(camera_paths.at_times(camera, camera_paths.evenly_spaced(frames)))
     times = camera_paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
-    distance = camera_paths.focus(camera, points)
+    distance = camera_paths.focus(camera, dynamic, means)
     return _numbered(camera_paths.spiral(camera, distance, REACH * capture.extent, times))
+
+
+def _time(options: Render) -> float:
+    """Time of the frozen path, and at which the bullet path stops."""
+    return 0.5 if options.time is None else options.time
 
 
 def _numbered(path: list[Camera]) -> tuple[list[Camera], list[str]]:
