@@ -269,6 +269,14 @@ def test_the_check_of_the_views_keeps_none_in_memory():
     assert [here.frame(name).name for name in VAL] == read[len(VAL) :] == list(VAL)
 
 
+@pytest.mark.parametrize("quiet", [True, False])
+def test_the_check_of_the_views_shows_progress_unless_quiet(monkeypatch, quiet):
+    shown = []
+    monkeypatch.setattr(evaluate, "progress", lambda items, label, quiet: shown.append((label, quiet)) or items)
+    evaluate.check_views(capture(), quiet=quiet)
+    assert shown == [("reading evaluation frames", quiet)]
+
+
 def test_the_check_of_the_views_finds_a_lens_without_frames_as_they_were_taken():
     def read_taken(name):
         raise ValueError(f"frame {name} was taken by a fisheye lens")

@@ -401,9 +401,10 @@ def test_evaluation_frames_are_read_after_what_costs_no_time_and_as_they_were_ta
     read.assert_not_called()
     (given.out / "file").unlink()
     for as_taken in (False, True):
-        with pytest.raises(ValueError, match=r"^read$"):
-            script.make_trainer(dataclasses.replace(given, as_taken=as_taken))
-        assert read.call_args.args[1] is as_taken
+        for log in (None, Mock()):
+            with pytest.raises(ValueError, match=r"^read$"):
+                script.make_trainer(dataclasses.replace(given, as_taken=as_taken), log)
+            assert read.call_args.args[1:] == (as_taken, log is None)
 
 
 def test_an_evaluation_frame_damaged_in_training_leaves_a_trained_run_and_says_how_to_evaluate_it(held_out):
