@@ -38,7 +38,9 @@ def test_an_unknown_dataset_is_reported_with_the_known_ones(root, capsys):
     with pytest.raises(SystemExit) as stop:
         check(root, "--dataset", "blend")
     assert stop.value.code == 1
-    assert "dataset must be one of iphone, nerfds, hypernerf, nerfstudio" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "dataset must be one of iphone, nerfds, hypernerf, nerfstudio" in out
+    assert "got 'blend'" in out
 
 
 def test_the_dataset_and_factor_given_are_used(root, capsys):

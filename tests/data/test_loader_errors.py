@@ -137,7 +137,7 @@ def test_the_error_for_a_part_of_a_capture_lists_its_files(root):
     [
         ({"factor": 4}, r"rgb.4x is missing: .* has 1x, --factor"),
         ({"factor": 0}, "factor must be at least 1, got 0"),
-        ({"dataset": "blend"}, "dataset must be one of iphone, nerfds, hypernerf, nerfstudio"),
+        ({"dataset": "blend"}, "dataset must be one of iphone, nerfds, hypernerf, nerfstudio.*, got 'blend'"),
         ({"perturbation": MaskPerturbation(erode=-1)}, "erode"),
     ],
 )
