@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from itertools import pairwise
-from unittest.mock import Mock
 
 import pytest
 import torch
@@ -21,7 +20,11 @@ def camera(x=0.0, time=0.0, focal=50.0, size=(64, 48)):
 
 
 def capture(positions, times):
-    cameras = {f"{k}": camera(x, t) for k, (x, t) in enumerate(zip(positions, times, strict=True))}
+    return capture_of([camera(x, t) for x, t in zip(positions, times, strict=True)])
+
+
+def capture_of(views):
+    cameras = {f"{k}": view for k, view in enumerate(views)}
     return Capture("test", cameras, list(cameras), [], torch.zeros(0, 3), None, lambda name: None)
 
 
@@ -233,14 +236,13 @@ def test_an_image_without_pixels_is_refused():
 
 def ring(num, step, sizes=((64, 48),)):
     """A capture of cameras that turn around the vertical axis by a step [degrees]."""
-    cameras = {}
+    views = []
     for k in range(num):
-        turn = torch.from_numpy(Rotation.from_euler("y", k * step, degrees=True).as_matrix()).float()
-        view = camera().resized(*sizes[k % len(sizes)])
         viewmat = torch.eye(4)
-        viewmat[:3, :3] = turn
-        cameras[str(k)] = dataclasses.replace(view, viewmat=viewmat, time=k / (num - 1))
-    return Mock(spec=Capture, cameras=cameras, train=list(cameras))
+        viewmat[:3, :3] = torch.from_numpy(Rotation.from_euler("y", k * step, degrees=True).as_matrix())
+        view = camera().resized(*sizes[k % len(sizes)])
+        views.append(dataclasses.replace(view, viewmat=viewmat, time=k / (num - 1)))
+    return capture_of(views)
 
 
 def test_a_training_camera_that_turns_far_between_frames_jumps():

@@ -121,7 +121,11 @@ def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.
 
 def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:
     """A fixed camera at several times."""
-    return [dataclasses.replace(camera, time=time) for time in times]
+    return _with_times([camera] * len(times), times)
+
+
+def _with_times(path: Sequence[Camera], times: Sequence[float]) -> list[Camera]:
+    return [dataclasses.replace(camera, time=time) for camera, time in zip(path, times, strict=True)]
 
 
 def evenly_spaced(frames: int) -> list[float]:
@@ -139,7 +143,7 @@ def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -
     views = [camera if camera.size == size else filling(camera, size) for camera in recorded]
     path = interpolated(views, [camera.time for camera in recorded], times)
     path = _smoothed(path, smoothing * max(1, frames - 1)) if smoothing > 0 and frames > 2 else path
-    return [dataclasses.replace(camera, time=time) for camera, time in zip(path, times, strict=True)]
+    return _with_times(path, times)
 
 
 def jumps(capture: Capture) -> bool:
@@ -242,8 +246,7 @@ def bullet(path: Sequence[Camera], clouds: Sequence[Float[Tensor, "_ 3"]], stop:
     after = frames - swing - before
     times = [stop * k / max(1, before) for k in range(before)] + [stop]
     times += [stop + (1.0 - stop) * (k + 1) / after for k in range(after)]
-    running = interpolated(path, evenly_spaced(len(path)), times)
-    running = [dataclasses.replace(camera, time=time) for camera, time in zip(running, times, strict=True)]
+    running = _with_times(interpolated(path, evenly_spaced(len(path)), times), times)
     stopped = running[before]
     distance = focus(stopped, *clouds)
     swung = []
