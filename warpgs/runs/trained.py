@@ -126,9 +126,11 @@ class TrainedScene:
         return self._graphs.run(camera.size, partial(self._render_inputs, inputs, camera.size))[0]
 
     def _render_inputs(self, inputs: _Inputs, size: tuple[int, int]) -> tuple[Float[Tensor, "H W 3"]]:
-        return (self._render(Camera(inputs.viewmat, inputs.K, *size), inputs.time, False, False).joint.image,)
+        return (self._render(Camera(inputs.viewmat, inputs.K, *size), inputs.time).joint.image,)
 
     @torch.no_grad()
-    def _render(self, camera: Camera, time: Float[Tensor, "1"], branches: bool, depth: bool) -> Rendering:
+    def _render(
+        self, camera: Camera, time: Float[Tensor, "1"], branches: bool = False, depth: bool = False
+    ) -> Rendering:
         settings = replace(self.config.render_settings, branches=branches, depth=depth)
         return render(self._splats(time), camera, settings=settings)

@@ -116,7 +116,7 @@ def read_spec(name: str) -> SweepSpec:
 def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     _check_keys(f"{path}", values, ("title", "preset", "seeds", "data", "options", "variants"))
     preset = values.get("preset", "best")
-    if preset not in list(PRESETS):  # which a list of TOML can be compared with
+    if preset not in list(PRESETS):  # TOML may give a list, which cannot be looked up in a dictionary
         raise ValueError(f"{path}: {not_one_of('preset', preset, PRESETS)}")
     variants = values.get("variants", {"full": {}})
     if not isinstance(variants, dict) or not variants:
