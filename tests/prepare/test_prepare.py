@@ -350,6 +350,33 @@ def test_force_removes_only_the_files_of_prepare(shots, tmp_path, monkeypatch):
     assert sorted(path.name for path in (tmp_path / ".prepare").iterdir()) == ["background", "frames", "state.json"]
 
 
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", ["dataset.json", "rgb/own.png", "rgb/1x/frame_000000.png"])
+def test_a_capture_that_prepare_did_not_make_is_never_replaced(name, force, shots, tmp_path):
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ValueError, match=f"which would replace its {name.split('/')[0]}: choose another folder$"):
+        prepare(shots, tmp_path, force=force)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert path.read_text() == "mine"
+
+
+def test_other_files_in_the_folders_of_a_replaced_capture_are_kept(made, shots, tmp_path, monkeypatch):
+    root = shutil.copytree(made, tmp_path / "made")
+    kept = [root / "rgb/notes.txt", root / "depth/lidar/frame.npy", root / "resized_mask/1x/drawing.png"]
+    for path in kept:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(shots, root, force=True, holdout=8)
+    left = {path for path in root.rglob("*") if path.is_file() and ".prepare" not in path.parts}
+    assert left == set(kept)
+    assert all(path.read_text() == "mine" for path in kept)
+
+
 @pytest.mark.parametrize("options", [{"selection": Selection(fps=2.0)}, {"source": Path("no/such.mp4")}])
 def test_a_capture_is_kept_if_its_replacement_cannot_start(options, made, shots, tmp_path):
     root = shutil.copytree(made, tmp_path / "made")
@@ -363,8 +390,7 @@ def test_a_replacement_interrupted_while_files_are_removed_is_not_finished(made,
     root = shutil.copytree(made, tmp_path / "made")
     options = json.loads((root / ".prepare/state.json").read_text())["options"]
     assert Journal(root, options, force=False, log=None).is_finished
-    interrupting = SimpleNamespace(rmtree=interrupted, disk_usage=shutil.disk_usage)
-    monkeypatch.setattr("warpgs.prepare.journal.shutil", interrupting)
+    monkeypatch.setattr("warpgs.prepare.journal._remove_frames", interrupted)
     with pytest.raises(KeyboardInterrupt):
         prepare(shots, root, force=True, holdout=8)
     monkeypatch.undo()
@@ -454,6 +480,7 @@ def test_a_full_disk_is_reported_before_work_starts(shots, tmp_path, monkeypatch
 
 def test_a_replacement_does_not_keep_the_colors_of_old_points(tmp_path):
     np.save(tmp_path / "point_colors.npy", np.zeros((2, 3), np.uint8))
+    (tmp_path / "prepare.json").write_text("{}")
     journal = Journal(tmp_path, {}, force=True, log=None)
     journal.clear(journal.work / "frames")
     assert not (tmp_path / "point_colors.npy").exists()

@@ -31,7 +31,7 @@ class Prepare:
     """Add these to a capture that lacks them: masks, depth and points, separated by commas."""
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     force: bool = False
-    """Replace an existing capture."""
+    """Replace an existing capture of prepare; other files are kept."""
     quiet: bool = False
     """Print errors only."""
 

@@ -1,5 +1,6 @@
 """The journal of a capture's preparation: which steps are finished, kept in the capture's folder until all are."""
 
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -19,6 +20,9 @@ OUTPUTS = (
     "dataset.json", "masks.png", "depth.png", REPORT,
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
+
+FRAME = re.compile(r"frame_\d{6}\.")
+"""Beginning of the names of the files in these folders, also of those that were being written at an interruption."""
 
 VERSION = 4
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
@@ -49,7 +53,8 @@ class Journal:
             log: Receives a line of text after each step; None for no output at all.
 
         Raises:
-            ValueError: If the folder holds something else, or a capture made with other options, and not ``force``.
+            ValueError: If the folder holds something else, or a capture made with other options, and not ``force``;
+                with ``force``, if it holds a capture that prepare did not make.
         """
         self.root, self.work = root, root / WORK
         self.quiet, self.log = log is None, log or (lambda text: None)
@@ -58,8 +63,21 @@ class Journal:
         self.notes: list[str] = []
         if root.exists() and not root.is_dir():
             raise ValueError(f"{root} is a file: choose another folder")
-        if not force and root.exists() and any(root.iterdir()):
+        if force:
+            self._require_own_outputs()
+        elif root.exists() and any(root.iterdir()):
             self._done, self.notes = self._read_state()
+
+    def _require_own_outputs(self) -> None:
+        if (self.work / STATE).exists() or (self.root / REPORT).exists():
+            return
+        paths = (self.root / name for name in OUTPUTS)
+        foreign = [path.name for path in paths if path.is_file() or (path.is_dir() and any(path.iterdir()))]
+        if foreign:
+            raise ValueError(
+                f"{self.root} was not made by prepare, which would replace its {', '.join(foreign)}: choose another "
+                "folder"
+            )
 
     def _read_state(self) -> tuple[dict[str, Any], list[str]]:
         try:
@@ -69,9 +87,10 @@ class Journal:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             if list(self.root.iterdir()) == [self.work]:  # interrupted during the first step
                 return {}, []
+            self._require_own_outputs()
             raise ValueError(
-                f"{self.root} exists and was not made by prepare: choose another folder, or replace the capture in it "
-                "with --force"
+                f"{self.root} exists and was not made by prepare: choose another folder, or add the capture to what "
+                "is there with --force"
             ) from error
         if state.get("version") != VERSION and FINISHED not in done:
             return {}, []  # the intermediate files of an earlier version differ
@@ -148,16 +167,20 @@ class Journal:
             raise
 
     def clear(self, keep: Path) -> None:
-        """Removes the outputs of prepare and nothing else; ``keep`` in the work folder stays.
+        """Removes the outputs of prepare and nothing else, not even other files in its folders.
+
+        ``keep`` in the work folder stays.
 
         Raises:
             OSError: If something cannot be removed or written.
         """
         self._save()  # first: what is left after an interruption must not count as finished
-        leftovers = [path for path in self.work.iterdir() if path.name not in (STATE, keep.name)]
-        for path in [*(self.root / name for name in OUTPUTS), *leftovers]:
+        for path in self.work.iterdir():
+            if path.name not in (STATE, keep.name):
+                _remove(path)
+        for path in (self.root / name for name in OUTPUTS):
             if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
+                _remove_frames(path)
             else:
                 path.unlink(missing_ok=True)
 
@@ -170,7 +193,7 @@ class Journal:
         self._save()
         for path in self.work.iterdir():
             if path.name != STATE:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                _remove(path)
 
     def report(self) -> dict[str, Any]:
         """The report of a finished preparation."""
@@ -180,6 +203,25 @@ class Journal:
         write_json(
             self.work / STATE, {"version": VERSION, "options": self._options, "done": self._done, "notes": self.notes}
         )
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def _remove_frames(folder: Path) -> None:
+    """Removes the files of frames below a folder, and the folders that are empty then."""
+    for path in sorted(folder.rglob("*"), reverse=True):  # what a folder holds comes before the folder
+        if path.is_dir() and not path.is_symlink():
+            _remove_if_empty(path)
+        elif FRAME.match(path.name):
+            path.unlink()
+    _remove_if_empty(folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _flat(options: dict[str, Any]) -> dict[str, Any]:
