@@ -10,6 +10,7 @@ import shutil
 import statistics
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -30,8 +31,10 @@ from warpgs.evaluation.lpips import Lpips
 from warpgs.files import write_json
 from warpgs.rendering import Layer, Rendering
 from warpgs.runs import checkpoint
-from warpgs.runs.run import open_capture
+from warpgs.runs.run import open_capture, open_run
+from warpgs.runs.trained import TrainedScene
 from warpgs.training.train import train
+from warpgs.video.camera_paths import training_path
 
 H, W = 12, 16
 CPU = torch.device("cpu")
@@ -423,6 +426,18 @@ def test_views_without_any_error_are_numbers_in_json_and_in_the_table(tmp_path):
     evaluate.write_views(tmp_path / "views.csv", result)
     assert 58.0 < json.loads((tmp_path / "metrics.json").read_text())["psnr"] < 59.0
     assert "inf" not in (tmp_path / "views.csv").read_text()
+
+
+def test_the_video_over_time_follows_the_training_camera(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 3)
+    here, seen = open_capture(open_run(run).config), []
+    layer = SimpleNamespace(image=torch.zeros(8, 8, 3))
+    rendered = SimpleNamespace(joint=layer, static=layer, dynamic=layer)
+    monkeypatch.setattr(TrainedScene, "render", lambda self, camera, **options: seen.append(camera) or rendered)
+    evaluate_run._write_video(tmp_path / "time.mp4", open_run(run), here, quiet=True)
+    recorded = training_path(here, 3)
+    assert [camera.time for camera in seen] == [0.0, 0.5, 1.0]
+    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(seen, recorded, strict=True))
 
 
 def test_changed_images_of_a_capture_are_read_again(run, tmp_path, monkeypatch):

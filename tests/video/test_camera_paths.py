@@ -249,6 +249,15 @@ def test_a_training_camera_that_turns_far_between_frames_jumps():
     assert [paths.jumps(ring(*args)) for args in ((10, 5), (10, 90), (2, 30))] == [False, True, False]
 
 
+def test_the_replay_follows_the_training_camera_and_stays_at_the_middle_view_if_it_jumps():
+    moving, jumping = ring(10, 5), ring(10, 90)
+    for a, b in zip(paths.replay(moving, 7), paths.training_path(moving, 7), strict=True):
+        assert torch.equal(a.viewmat, b.viewmat)
+    still = paths.replay(jumping, 7)
+    assert all(torch.equal(view.viewmat, jumping.cameras[jumping.train[5]].viewmat) for view in still)
+    assert [view.time for view in still] == pytest.approx([k / 6 for k in range(7)])
+
+
 def test_a_path_through_cameras_of_two_sizes_has_one_size_and_one_field_of_view():
     path = paths.training_path(ring(5, 2, ((64, 48), (32, 24))), 9)
     assert {c.size for c in path} == {(64, 48)}

@@ -1,6 +1,5 @@
 """Evaluation of a run folder: metrics.json, views.csv, images/ and time.mp4."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from warpgs.rendering import Rendering
 from warpgs.runs.captures import require_same_times
 from warpgs.runs.run import MASK_TRIAL, Device, Run
 from warpgs.runs.trained import TrainedScene
+from warpgs.video.camera_paths import replay
 from warpgs.video.writer import Video
 from warpgs.visualize.images import comparison, to_bytes
 
@@ -101,13 +101,10 @@ def _of_run(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
 
 
 def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool) -> None:
-    """The middle evaluation camera (without one, training camera) over time: joint | static | dynamic."""
-    names = capture.val or capture.train
-    camera = capture.cameras[names[len(names) // 2]].to(scene.device)
+    """What the training camera sees over time: joint | static | dynamic."""
     with Video(path) as video:
-        for k in progress(range(VIDEO_FRAMES), "video over time", quiet):
-            at_time = dataclasses.replace(camera, time=k / (VIDEO_FRAMES - 1))
-            rendering = scene.render(at_time, branches=True)
+        for camera in progress(replay(capture, VIDEO_FRAMES), "video over time", quiet):
+            rendering = scene.render(camera.to(scene.device), branches=True)
             layers = (rendering.joint, rendering.static, rendering.dynamic)
             images = [layer.image for layer in layers if layer is not None]
             video.add(to_bytes(torch.cat(images, 1)))

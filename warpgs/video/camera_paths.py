@@ -146,6 +146,22 @@ def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -
     return _with_times(path, times)
 
 
+def replay(capture: Capture, frames: int) -> list[Camera]:
+    """Cameras while time runs from 0 to 1: the training path, or the middle view if the training camera jumps.
+
+    Seen from elsewhere, what moves would show sides at times at which no training frame shows them.
+    """
+    if jumps(capture):
+        return at_times(capture.cameras[middle_view(capture)], evenly_spaced(frames))
+    return training_path(capture, frames)
+
+
+def middle_view(capture: Capture) -> str:
+    """Name of the middle evaluation view, or training view if there is none."""
+    names = capture.val or capture.train
+    return names[len(names) // 2]
+
+
 def jumps(capture: Capture) -> bool:
     """Whether the training camera turns by more than ``MAX_TURN`` between most frames, as in D-NeRF."""
     rotations = [Rotation.from_matrix(_rotation(camera)) for camera in _in_time(capture)]

@@ -113,8 +113,8 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         frozen = [dataclasses.replace(camera, time=time) for camera in path]
         return _numbered(path if options.path == "moving" else frozen)
     if options.path == "bullet":
-        stays = options.view is not None or camera_paths.jumps(capture)
-        path = [_start_view(options, capture)] if stays else camera_paths.training_path(capture, max(frames, FRAMES))
+        stays = options.view is not None
+        path = [_start_view(options, capture)] if stays else camera_paths.replay(capture, max(frames, FRAMES))
         return _numbered(camera_paths.bullet(path, (dynamic, means), time, frames))
     camera = _start_view(options, capture)
     if options.path == "fixed":
@@ -139,10 +139,9 @@ def _number(k: int) -> str:
 
 def _start_view(options: Render, capture: Capture) -> Camera:
     """The camera from which the fixed and spiral paths start, and the bullet path with --view."""
-    names = capture.val or capture.train
-    name = options.view or names[len(names) // 2]
+    name = options.view or camera_paths.middle_view(capture)
     if name not in capture.cameras:
-        close = suggestion(name, capture.cameras) or f"; its first is {names[0]!r}"
+        close = suggestion(name, capture.cameras) or f"; its first is {(capture.val or capture.train)[0]!r}"
         raise ValueError(f"{capture.name} has no view {name!r}{close}")
     return capture.cameras[name]
 
