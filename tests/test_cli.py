@@ -67,6 +67,7 @@ def test_help_is_rewrapped_and_names_what_is_expected(command, capsys):
     assert "{None}" not in text
     assert "``" not in text
     assert "(default: None)" not in text
+    assert not re.search(r"the default is[^(]*\(default:", text)  # once is enough
     # a line ends early only at the end of a text
     broken = re.findall(r"^[│ ] {10,}\S[^│\n]{1,25}[a-z,] {20,}│?\n[│ ] {10,}[a-z]", text, re.MULTILINE)
     assert broken == []
@@ -106,6 +107,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["export", "--\x1b[2J"], "warpgs export: there is no option --\\x1b[2J; "),
         (["export"], "warpgs export: missing: RUN\n"),
         (["import"], "warpgs import: missing: SOURCE CAPTURE\n"),
+        (["train", "--resume"], "warpgs train: missing value for --resume\n"),
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),

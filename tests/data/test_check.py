@@ -308,6 +308,7 @@ def test_depth_is_not_checked_without_points(root):
     (root / "points.npy").unlink()
     report = check_capture(root)
     assert "there are no sparse points" in texts(report, "warning")
+    assert "warpgs prepare CAPTURE --add points" in texts(report, "warning")
     assert "aligned" not in str(report)
 
 

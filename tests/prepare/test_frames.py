@@ -91,6 +91,11 @@ def test_invalid_selections_are_refused(selection, word):
         check_selection(selection)
 
 
+def write_heic(folder):
+    folder.mkdir()
+    (folder / "IMG_0001.HEIC").touch()
+
+
 UNSUITABLE = {
     "text": (lambda path, images: path.write_text("hello" * 100), r"source\.mp4 is not a video"),
     "missing": (lambda path, images: None, r"source\.mp4 is missing"),
@@ -98,6 +103,7 @@ UNSUITABLE = {
     "device": (lambda path, images: path.symlink_to("/dev/zero"), r"source\.mp4 is not a file"),
     "one frame": (lambda path, images: write_video(path, images[:1]), "gives 1 frame, at least"),
     "empty folder": (lambda path, images: path.mkdir(), r"holds no \.png, .* images$"),
+    "images of a phone": (lambda path, images: write_heic(path), r"images: convert its \.HEIC files to PNG or JPEG$"),
     "hidden images": (lambda path, images: write_folder(path / ".thumbs", images), r"holds no \.png, .* images$"),
     "folder of a folder": (lambda path, images: write_folder(path / "shots", images), r"but .*source\.mp4.shots does$"),
 }

@@ -145,6 +145,12 @@ def test_runs_with_an_option_that_is_gone_open(run, part, name):
     assert read_config(run) == before
 
 
+def test_the_field_that_a_misspelt_one_may_mean_is_named(run):
+    edit(run, lambda values: values.update(itrations=values.pop("iterations")))
+    with pytest.raises(ValueError, match=r"another version: itrations; did you mean iterations\?$"):
+        read_config(run)
+
+
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))

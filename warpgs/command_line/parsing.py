@@ -51,6 +51,7 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"""^argument (?P<option>\S+): invalid choice: (?P<literal>'.*'|".*") \(choose from (?P<choices>.*)\)$""",
         _choices,
     ),
+    (r"^Missing value for argument '(\S+?)'.*", r"missing value for \1"),
     (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
 )
 """Parts of tyro's messages and what is said instead."""
@@ -188,7 +189,8 @@ def _with_help(hint: Any, text: str) -> Any:
     given = _settings(hint)
     name, metavar = (given.name, given.metavar) if given else (None, None)
     metavar = metavar or _metavar(_plain(hint))
-    return Annotated[hint, tyro.conf.arg(name=name, metavar=metavar, help=text, help_behavior_hint=_default_hint)]
+    default = "" if "the default is" in text else _default_hint
+    return Annotated[hint, tyro.conf.arg(name=name, metavar=metavar, help=text, help_behavior_hint=default)]
 
 
 def _metavar(plain: Any) -> str | None:

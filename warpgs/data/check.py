@@ -248,7 +248,8 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
     if capture.extent <= MIN_EXTENT:
         yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
     if len(capture.points) == 0:
-        yield Finding("warning", "points", "there are no sparse points: training starts from random ones")
+        remedy = "warpgs prepare CAPTURE --add points makes some"
+        yield Finding("warning", "points", f"there are no sparse points: training starts from random ones; {remedy}")
         return
     names = _sampled(capture.train, samples)
     visible = [float(capture.cameras[n].project(capture.points)[3].float().mean()) for n in names]

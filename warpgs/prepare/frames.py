@@ -24,6 +24,9 @@ MIN_LONGEST_SIDE = 64
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
+CONVERTIBLE = (".heic", ".heif", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".dng")
+"""Suffixes of images that are not read: phones write HEIC."""
+
 INDEX = "frames.json"
 """Index of the frames in their folder."""
 
@@ -165,7 +168,9 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     paths = sorted(filter(_is_image, source.iterdir()), key=lambda path: natural_order(path.name))
     if not paths:
         inside = next((p.parent for p in sorted(source.glob("[!.]*/*")) if _is_image(p)), None)
-        advice = "" if inside is None else f", but {inside} does"
+        others = {path.suffix for path in source.iterdir() if path.suffix.lower() in CONVERTIBLE}
+        advice = f": convert its {', '.join(sorted(others))} files to PNG or JPEG" if others else ""
+        advice = f", but {inside} does" if inside else advice
         raise ValueError(f"{source} holds no {', '.join(SUFFIXES)} images{advice}")
     count = min(selection.count or len(paths), len(paths))
     if count > MAX_FRAMES:

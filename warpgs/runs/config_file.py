@@ -10,7 +10,7 @@ from typing import Any
 
 from warpgs.config import TrainConfig, validate
 from warpgs.data.builtin import is_builtin
-from warpgs.errors import missing
+from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
 
 NAME = "config.json"
@@ -99,7 +99,8 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
     values = {RENAMED.get(name, name): value for name, value in values.items()}
     hints = typing.get_type_hints(cls)
     if unknown := sorted(set(values) - set(hints)):
-        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}")
+        close = suggestion(unknown[0], set(hints) - set(values))
+        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}{close}")
     fields = {}
     for name, value in values.items():
         hint = hints[name]
