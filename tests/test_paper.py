@@ -10,6 +10,7 @@ import torch
 from tests import tiny
 from warpgs.config.presets import PRESETS
 from warpgs.runs import checkpoint
+from warpgs.training import optimizer
 
 PAPER = {
     "Visual Geometry Decomposition: Eq. 6": {
@@ -154,6 +155,11 @@ def test_every_option_of_the_method_is_compared_with_the_paper_once():
     assert not set(compared) & RUN
 
 
+def test_adam_has_the_betas_of_the_paper():
+    """Experimental Setup; no preset has others."""
+    assert optimizer.BETAS == (0.9, 0.999)
+
+
 def table():
     """Switch → (value in ``paper``, value in ``best``), from the rows of the tables of docs/method.md."""
     rows = {}
@@ -190,6 +196,17 @@ def test_the_documentation_names_files_that_exist():
     named = {path for row in cells if len(row) == 8 for path in re.findall(r"`([\w/]+\.py)`", row[2])}
     assert len(named) > 8
     assert not [path for path in named if not (root / path).is_file()]
+
+
+def test_a_file_beside_each_switch_reads_it():
+    root, checked = METHOD.parents[1], 0
+    for line in METHOD.read_text().splitlines():
+        cells = line.split("|")
+        for switch in re.findall(r"`([\w.]+)`", cells[3]) if line.startswith("| ") and len(cells) == 8 else []:
+            files = [(root / path).read_text() for path in re.findall(r"`([\w/]+\.py)`", cells[2])]
+            assert any(re.search(rf"\b{switch.rpartition('.')[2]}\b", text) for text in files), switch
+            checked += 1
+    assert checked > 50
 
 
 def test_training_with_the_preset_runs_through_all_stages(tmp_path):
