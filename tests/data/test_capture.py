@@ -114,12 +114,3 @@ def test_an_assumption_shares_the_cache_and_everything_but_the_mask():
     assert assumed.frame("f1").image is capture.frame("f1").image
     assert read == ["f1"]
     assert (assumed.train, assumed.extent, assumed.points) == (capture.train, capture.extent, capture.points)
-
-
-def test_without_depth_frames_have_none():
-    capture, read = make_capture(mask=SOME_STATIC, depth=torch.ones(2, 4))
-    bare = capture.without_depth().assuming("static")
-    assert bare.frame("f0").inverse_depth is None
-    assert bare.frame("f0").static_mask.all()
-    assert capture.frame("f0").inverse_depth is not None
-    assert read == ["f0"]

@@ -54,7 +54,8 @@ class TrainConfig:
     seed: int = 0
     """Seed of all random numbers."""
     depth: bool = True
-    """Use the capture's depth; without it there is no pretraining, no depth loss, and no depth to start from."""
+    """Use the capture's depth; without it there is no pretraining, no depth loss, and no depth to start from: points
+    that are unprojected from depth are not read either."""
     dap: bool = True
     """Depth-aware pretraining; without it, its iterations are added to stage I, and depth is still compared there."""
     vdp: bool = True

@@ -116,7 +116,6 @@ class Capture:
         background: Colour behind everything; black is also that of captures whose images show no background.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         assumption: What is taken as dynamic; see ``assuming``.
-        has_depth: Whether frames have the depth of the files; see ``without_depth``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
             unit of 3DGS's position learning rate and densification thresholds [scene units].
@@ -139,7 +138,6 @@ class Capture:
     read_taken: Callable[[str], TakenFrame] | None = None
     background: Background = "black"
     assumption: Assumption = field(init=False)
-    has_depth: bool = field(init=False, default=True)
     has_empty: bool = field(init=False)
     extent: float = field(init=False)
 
@@ -172,12 +170,6 @@ class Capture:
         """
         capture = copy.copy(self)
         capture.assumption = self.unmasked if assumption == "masks" else assumption
-        return capture
-
-    def without_depth(self) -> "Capture":
-        """The same capture as if its files had no depth; the captures have one cache of frames."""
-        capture = copy.copy(self)
-        capture.has_depth = False
         return capture
 
     def over(self, background: Background) -> "Capture":
@@ -213,8 +205,6 @@ class Capture:
         frame = self._cached(name)
         if name in self._moved:
             frame = replace(frame, camera=self.cameras[name])
-        if not self.has_depth:
-            frame = replace(frame, inverse_depth=None)
         if frame.empty is not None and not self.has_empty:
             frame = replace(frame, empty=None)
         if self.assumption == "masks":

@@ -5,7 +5,7 @@ import torch
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import builtin_folder, is_builtin, require_factor
 from warpgs.data.capture import Background, Capture
-from warpgs.data.loaders import load_capture
+from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.data.synthetic import builtin_capture
 
 from .checkpoint import Metadata
@@ -28,14 +28,8 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     else:
         require_factor("builtin:room", config.factor)
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    capture = load_capture(
-        root,
-        config.dataset,
-        factor=config.factor,
-        vrig_factor=config.vrig_factor,
-        perturbation=config.masks,
-        undistort=config.undistort,
-    )
+    options = LoadOptions(config.factor, config.masks, undistort=config.undistort, depth=config.depth)
+    capture = load_with(root, config.dataset, options, config.vrig_factor)
     if config.background == "capture" or config.background == "mean":
         return capture
     return capture.over(config.background)

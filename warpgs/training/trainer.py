@@ -52,11 +52,11 @@ class Trainer:
 
     Args:
         config: Resolved config: schedule rescaled, device and background chosen.
-        capture: Capture to train on.
+        capture: Capture to train on, as ``open_capture(config)`` reads it.
         run: Run folder, for the checkpoints.
 
     Attributes:
-        capture: The capture, with the masks, background and depth that the config implies.
+        capture: The capture, with the masks and background that the config implies.
         scene: What is trained.
         iteration: Iterations done.
         gains: [T, 3] what the colours of each training frame are divided by.
@@ -74,7 +74,6 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
         self.config, self.run = config, run
-        capture = capture if config.depth else capture.without_depth()
         self.capture = capture.assuming(config.assume).over(known_background(config, capture))
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3)

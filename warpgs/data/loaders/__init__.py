@@ -4,6 +4,7 @@ To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` an
 Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -27,7 +28,16 @@ from .nerfstudio import NerfstudioLoader
 from .options import LoadOptions
 from .vipe import VipeLoader
 
-__all__ = ["LOADERS", "LoadOptions", "Loader", "is_capture", "load_capture", "recognize", "require_capture"]
+__all__ = [
+    "LOADERS",
+    "LoadOptions",
+    "Loader",
+    "is_capture",
+    "load_capture",
+    "load_with",
+    "recognize",
+    "require_capture",
+]
 
 
 class Loader(Protocol):
@@ -84,20 +94,26 @@ def load_capture(
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
     """
+    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
+    return load_with(root, dataset, options, vrig_factor)
+
+
+def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_factor: int | None = None) -> Capture:
+    """``load_capture`` with its arguments as options, which has one more: whether to read depth."""
     if dataset is not None and dataset not in LOADERS:
         raise ValueError(not_one_of("dataset", dataset, LOADERS))
+    factor = options.factor
     if factor is not None and factor < 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
-    perturbation = perturbation or MaskPerturbation()
-    check_perturbation(perturbation)
+    check_perturbation(options.perturbation)
     root = builtin_folder(root, factor=factor) if is_builtin(root) else Path(root)
     if dataset is None:
         require_capture(root)
     require_finished(root)
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
-        factor = vrig_factor
-    return loader.load(root, LoadOptions(factor, perturbation, cache_frames, undistort))
+        options = replace(options, factor=vrig_factor)
+    return loader.load(root, options)
 
 
 def is_capture(root: Path) -> bool:

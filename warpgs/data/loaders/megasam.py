@@ -13,7 +13,7 @@ from warpgs.data.npz import read_npz
 from warpgs.data.resized import inverse_of, resize
 
 from .options import LoadOptions
-from .posed import PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
+from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
 
 SUFFIXES = ("_sgd_cvd_hr.npz", "_droid.npz")
 """Ends of the names of the files that MegaSaM writes, the better one first."""
@@ -24,7 +24,7 @@ ARRAYS = ("images", "depths", "intrinsic", "cam_c2w")
 class MegaSamLoader:
     """Loads an output folder of MegaSaM with one video; every eighth frame for evaluation.
 
-    Depth has the units of the cameras, and points are taken from it. The file has no masks.
+    Depth has the units of the cameras, and points are unprojected from it. The file has no masks.
     """
 
     def recognizes(self, root: Path) -> bool:
@@ -65,7 +65,7 @@ class MegaSamLoader:
             for k in range(count)
         ]
         val = every_eighth([frame.name for frame in frames])
-        return posed_capture(root, frames, val, World(*points_of_depth(frames)), options)
+        return posed_capture(root, frames, val, World(points=None), options)
 
 
 def _file(root: Path) -> Path:

@@ -73,7 +73,7 @@ class NerfiesLoader(ABC):
         _check_split(split)
         times = _times(root / "metadata.json", metadata, [*split.train, *split.val])
         factor = options.factor or self.default_factor
-        files = _find_files(root, factor, split, incomplete_masks)
+        files = _find_files(root, factor, split, incomplete_masks, options.depth)
         cameras, lenses = {}, {}
         for name, time in times.items():
             path = root / f"camera/{name}.json"
@@ -158,7 +158,9 @@ class _FrameFiles:
     covisible: Path | None
 
 
-def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -> dict[str, _FrameFiles]:
+def _find_files(
+    root: Path, factor: int, split: Split, incomplete_masks: bool, with_depth: bool
+) -> dict[str, _FrameFiles]:
     """Files of every frame: every frame has an image, and every training frame a mask if there are any masks.
 
     Masks of some training frames suffice if they may be incomplete.
@@ -178,7 +180,7 @@ def _find_files(root: Path, factor: int, split: Split, incomplete_masks: bool) -
         if image is None:
             raise ValueError(f"{rgb / size / name}.png is missing: dataset.json lists the frame")
         mask = None if masks is None else find_mask(masks, factor, name)
-        depth = find_depth(root, factor, name)
+        depth = find_depth(root, factor, name) if with_depth else None
         covisible = first_file([root / "covisible" / size / "val" / f"{name}.png"])
         files[name] = _FrameFiles(image, mask, depth, covisible)
     for name in split.train:

@@ -16,7 +16,6 @@ from .posed import (
     World,
     every_eighth,
     plain_names,
-    points_of_depth,
     posed_capture,
     times_of_names,
 )
@@ -64,7 +63,7 @@ class NerfstudioLoader:
         by_image = {image.resolve(): name for image, name in zip(images, names, strict=True)}
         val, ignored = _evaluated(transforms, by_image)
         kept = [frame for frame in frames if frame.name not in ignored]
-        return posed_capture(root, kept, val, _world(transforms, kept, options.undistort), options)
+        return posed_capture(root, kept, val, _world(transforms), options)
 
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:
@@ -107,8 +106,7 @@ def _evaluated(transforms: Transforms, names: dict[Path, str]) -> tuple[set[str]
     return held_out, {*names.values()} - held_out - chosen["train"]
 
 
-def _world(transforms: Transforms, frames: Sequence[PosedFrame], undistort: bool) -> World:
+def _world(transforms: Transforms) -> World:
     """Points of ply_file_path; without it, points of the depth."""
     path = transforms.file(transforms.fields, "ply_file_path")
-    points, colors = points_of_depth(frames, undistort) if path is None else read_ply_points(path)
-    return World(points, colors)
+    return World(points=None) if path is None else World(*read_ply_points(path))

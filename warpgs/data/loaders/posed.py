@@ -6,7 +6,7 @@ A loader makes a ``PosedFrame`` of every image, with functions that read its par
 
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +69,8 @@ class World:
     """The world of a layout.
 
     Attributes:
-        points: [P, 3] static points, P may be 0.
+        points: [P, 3] static points, P may be 0; None to unproject them from the depth of the frames, which must have
+            the units of their cameras then.
         colors: [P, 3] 8-bit RGB; None if unknown.
         units: Scene units; around points and cameras if None.
         assumption: What is dynamic where the frames have no masks.
@@ -77,7 +78,7 @@ class World:
         background: Colour behind everything; see ``Capture``.
     """
 
-    points: Float[np.ndarray, "P 3"]
+    points: Float[np.ndarray, "P 3"] | None
     colors: UInt8[np.ndarray, "P 3"] | None = None
     units: SceneUnits | None = None
     assumption: Assumption = "masks"
@@ -95,19 +96,20 @@ def posed_capture(
         frames: All frames.
         val: Names of those to evaluate on.
         world: Points and units.
-        options: How they are read; ``factor`` is 1 if None.
+        options: How they are read; ``factor`` is 1 if None. Without ``depth``, that of the frames is ignored.
 
     Raises:
         ValueError: If there are no frames, two have one name, or a camera is invalid.
     """
-    if not frames:
-        raise ValueError(f"{root} has no frames")
+    _check_names(root, [frame.name for frame in frames])
+    if not options.depth:
+        frames = [replace(frame, inverse_depth=None) for frame in frames]
     by_name = {frame.name: frame for frame in frames}
-    if len(by_name) < len(frames):
-        names = [frame.name for frame in frames]
-        raise ValueError(f"{root}: two frames are called {next(name for name in names if names.count(name) > 1)}")
+    points, colors = world.points, world.colors
+    if points is None:
+        points, colors = points_of_depth(frames, options.undistort)
     centers = np.array([frame.center for frame in frames])
-    units = world.units or scene_units(world.points if len(world.points) else centers, centers)
+    units = world.units or scene_units(points if len(points) else centers, centers)
     cameras, lenses = _cameras(root, frames, units, world.own_times, options)
     train = [name for name in by_name if name not in val]
     reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
@@ -116,14 +118,21 @@ def posed_capture(
         cameras,
         train,
         [name for name in by_name if name in val],
-        torch.tensor(units.from_world(world.points), dtype=torch.float32),
-        None if world.colors is None else torch.tensor(world.colors),
+        torch.tensor(units.from_world(points), dtype=torch.float32),
+        None if colors is None else torch.tensor(colors),
         reader.read,
         options.cache_frames,
         world.assumption,
         read_taken=taken_reader(reader.read_with, lenses),
         background=world.background,
     )
+
+
+def _check_names(root: Path, names: Sequence[str]) -> None:
+    if not names:
+        raise ValueError(f"{root} has no frames")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{root}: two frames are called {next(name for name in names if names.count(name) > 1)}")
 
 
 def _cameras(

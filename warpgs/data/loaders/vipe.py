@@ -24,7 +24,7 @@ from warpgs.data.video_frames import VideoFrames
 from warpgs.files import read_bounded, require_file
 
 from .options import LoadOptions
-from .posed import PosedFrame, Size, World, every_eighth, points_of_depth, posed_capture, world_to_camera
+from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
 
 PINHOLE = "PINHOLE"
 
@@ -43,7 +43,7 @@ MAX_TEXT = 64 << 20
 class VipeLoader:
     """Loads ViPE's results of one video with a pinhole camera; every eighth frame for evaluation.
 
-    Points are taken from depth. The masks mark what could move, whether it does or not.
+    Points are unprojected from depth. The masks mark what could move, whether it does or not.
     """
 
     def recognizes(self, root: Path) -> bool:
@@ -57,7 +57,7 @@ class VipeLoader:
         video = VideoFrames(root / f"rgb/{name}.mp4")
         _check_cameras(root / f"intrinsics/{name}_camera.txt")
         lenses = _lenses(root / f"intrinsics/{name}.npz", video.size)
-        depths = _Archive.open(root / f"depth/{name}.zip")
+        depths = _Archive.open(root / f"depth/{name}.zip") if options.depth else None
         masks = _Archive.open(root / f"mask/{name}.zip")
         still = _still_instances(root / f"mask/{name}.txt")
         frames = []
@@ -78,7 +78,7 @@ class VipeLoader:
                 )
             )
         val = every_eighth([frame.name for frame in frames])
-        return posed_capture(root, frames, val, World(*points_of_depth(frames)), options)
+        return posed_capture(root, frames, val, World(points=None), options)
 
 
 def _video_name(root: Path) -> str:
