@@ -82,6 +82,12 @@ def test_no_points_are_unprojected_from_depth(layout, capture):
 
 
 @UNPROJECTED
+def test_the_scene_is_three_times_as_wide_as_its_cameras_box(layout, capture):
+    positions = torch.stack([camera.position for camera in opened(capture).cameras.values()])
+    assert positions.abs().max() == pytest.approx(1 / 3)
+
+
+@UNPROJECTED
 def test_static_gaussians_start_at_random_positions(layout, capture):
     scene = initial_scene(tiny.CONFIG, opened(capture), torch.Generator().manual_seed(0))
     expected = random_points(torch.zeros(0, 3), tiny.MODEL.max_static_points, torch.Generator().manual_seed(0))

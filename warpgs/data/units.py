@@ -47,6 +47,11 @@ OUTLIER_FRACTION = 0.02
 """Fraction of the points at each end of each axis that does not count for the extent of the scene."""
 
 
+CAMERA_BOX = 3.0
+"""Size of a scene of unknown size, in which training starts from random points, relative to its cameras' box: cameras
+look at what is outside of it. The value is that of gsplat (``init_extent``)."""
+
+
 def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 3"]) -> SceneUnits:
     """Scene units in which static points and cameras are in about [-1, 1].
 
@@ -57,6 +62,16 @@ def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 
     low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
     return SceneUnits((low + high) / 2.0, float(2.0 / max((high - low).max(), MIN_SIZE)))
+
+
+def units_around(centers: Float[np.ndarray, "F 3"]) -> SceneUnits:
+    """Scene units of a capture without points, whose scene is ``CAMERA_BOX`` times as large as its cameras' box.
+
+    Args:
+        centers: [F, 3] centres of the cameras.
+    """
+    units = scene_units(centers, centers)
+    return SceneUnits(units.center, units.scale / CAMERA_BOX)
 
 
 def depth_range(depths: Float[np.ndarray, " D"]) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader, without_distortion
-from warpgs.data.units import SceneUnits, scene_units
+from warpgs.data.units import SceneUnits, scene_units, units_around
 
 from .options import LoadOptions
 
@@ -72,7 +72,7 @@ class World:
         points: [P, 3] static points, P may be 0; None to unproject them from the depth of the frames, which must have
             the units of their cameras then.
         colors: [P, 3] 8-bit RGB; None if unknown.
-        units: Scene units; around points and cameras if None.
+        units: Scene units; around points and cameras if None, and wider than the cameras without points.
         assumption: What is dynamic where the frames have no masks.
         own_times: Whether times are in [0, 1] already.
         background: Colour behind everything; see ``Capture``.
@@ -109,7 +109,7 @@ def posed_capture(
     if points is None:
         points, colors = points_of_depth(frames, options.undistort)
     centers = np.array([frame.center for frame in frames])
-    units = world.units or scene_units(points if len(points) else centers, centers)
+    units = world.units or (scene_units(points, centers) if len(points) else units_around(centers))
     cameras, lenses = _cameras(root, frames, units, world.own_times, options)
     train = [name for name in by_name if name not in val]
     reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
