@@ -10,7 +10,7 @@ from tests.data import captures, layouts
 from warpgs.cli import main
 from warpgs.data.capture import Capture
 from warpgs.data.import_capture import import_capture, time_steps
-from warpgs.data.loaders import load_capture, recognize
+from warpgs.data.loaders import describe_layout, load_capture, recognize
 
 DATASETS = {name: lambda root, name=name: captures.write_capture(root, name) for name in captures.FACTORS}
 SOURCES = {**layouts.WRITERS, **DATASETS}
@@ -146,6 +146,64 @@ def test_masks_in_every_size_do_not_make_a_hypernerf_capture_one_of_nerfds(tmp_p
     for size in ("1x", "2x", "4x"):
         (root / "resized_mask" / size).mkdir(parents=True)
     assert recognize(root) == "hypernerf"
+
+
+def write_sizes(root, images, masks):
+    """A capture of the layout of Nerfies, with empty folders of more sizes, that does not name its layout."""
+    captures.write_capture(root, "hypernerf")
+    for part, sizes in (("rgb", images), ("resized_mask", masks)):
+        for size in sizes:
+            (root / part / size).mkdir(parents=True, exist_ok=True)
+    return root
+
+
+SEVERAL_SIZES = pytest.mark.parametrize(
+    ("images", "masks"),
+    [(["1x", "4x", "8x"], ["1x"]), (["1x"], ["1x", "2x"]), (["1x", "4x"], ["1x", "2x", "4x"])],
+    ids=["masks in full size", "two sizes", "three sizes"],
+)
+
+
+@SEVERAL_SIZES
+@pytest.mark.parametrize(("size", "layout"), [([480, 270], "nerfds"), ([1072, 1920], "hypernerf")])
+def test_images_of_the_released_size_tell_nerfds_from_hypernerf(tmp_path, images, masks, size, layout):
+    root = write_sizes(tmp_path / "toy", images, masks)
+    for path in (root / "camera").iterdir():
+        captures.edit_json(path, image_size=size)
+    assert describe_layout(root) == recognize(root) == layout
+
+
+@SEVERAL_SIZES
+@pytest.mark.parametrize("folder", ["train_camera", "vrig_camera"])
+def test_folders_of_cameras_that_only_nerfds_has_tell_it_from_hypernerf(tmp_path, images, masks, folder):
+    root = write_sizes(tmp_path / "toy", images, masks)
+    (root / folder).mkdir()
+    assert describe_layout(root) == recognize(root) == "nerfds"
+
+
+@SEVERAL_SIZES
+def test_a_layout_that_is_guessed_is_said_to_be_a_guess_until_it_is_named(tmp_path, images, masks):
+    root = write_sizes(tmp_path / "toy", images, masks)
+    name = recognize(root)
+    other = "hypernerf" if name == "nerfds" else "nerfds"
+    assert describe_layout(root) == f"{name}, though its files fit {other}, too; " + (
+        "--dataset or layout in dataset.json says which"
+    )
+    assert describe_layout(root, other) == other
+    captures.edit_json(root / "dataset.json", layout=other)
+    assert describe_layout(root) == other
+
+
+def test_a_layout_without_masks_is_no_guess(tmp_path):
+    assert describe_layout(write_sizes(tmp_path / "toy", ["1x", "4x"], [])) == "hypernerf"
+
+
+@pytest.mark.parametrize("size", [None, "480×270", [[480], 270]])
+def test_a_damaged_size_of_images_does_not_keep_a_layout_from_being_recognized(tmp_path, size):
+    root = write_sizes(tmp_path / "toy", ["1x"], ["1x", "2x"])
+    for path in (root / "camera").iterdir():
+        captures.edit_json(path, image_size=size)
+    assert recognize(root) == "nerfds"
 
 
 def test_the_index_is_complete(tmp_path):

@@ -27,7 +27,7 @@ from .depth_alignment import (
     sample_points,
 )
 from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
-from .loaders import load_capture, missing_capture, recognize
+from .loaders import describe_layout, load_capture, missing_capture
 from .motion_check import are_comparable, motion_between
 from .sampling import evenly_spaced_indices
 from .turning_check import turning_of
@@ -121,7 +121,11 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
         capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)
     except ValueError as error:
         return Report(root, [Finding("error", "files", str(error))])
-    findings = [Finding("note", "layout", f"read as {dataset or recognize(root)}"), *_counts(capture), *_files(capture)]
+    findings = [
+        Finding("note", "layout", f"read as {describe_layout(root, dataset)}"),
+        *_counts(capture),
+        *_files(capture),
+    ]
     if not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings):
         findings += [*_geometry(capture, SAMPLES), *_turning(capture), *_depth(capture), *_motion(capture)]
     return Report(root, findings)

@@ -12,7 +12,7 @@ from warpgs.files import complete_or_absent
 from . import writer
 from .capture import Capture, Frame
 from .lens import Lens
-from .loaders import load_capture, recognize
+from .loaders import describe_layout, load_capture
 from .units import SceneUnits, depth_range
 
 FACTORS = (1, 2)
@@ -58,7 +58,7 @@ def import_capture(
         _write_index(folder, capture, names, val)
     if log is not None:
         log(
-            f"{source} is read as {dataset or recognize(source)}: {len(names)} frames, {counts[0]} with masks, "
+            f"{source} is read as {describe_layout(source, dataset)}: {len(names)} frames, {counts[0]} with masks, "
             f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
         )
         if capture.assumption == "dynamic":

@@ -10,7 +10,7 @@ from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.check import Finding, quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.data.loaders import recognize
+from warpgs.data.loaders import describe_layout
 from warpgs.errors import command
 from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
@@ -160,7 +160,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
     config, name = trainer.config, trainer.capture.name
-    layout = "" if config.data is None else f" (read as {config.dataset or recognize(config.data)})"
+    layout = "" if config.data is None else f" (read as {describe_layout(config.data, config.dataset)})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
     log(f"{name}{layout}: {num_views} views, on {config.device}{together}, into {trainer.run}{resumed}")

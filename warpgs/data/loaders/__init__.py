@@ -23,7 +23,7 @@ from .hypernerf import HyperNerfLoader
 from .iphone import IPhoneLoader
 from .llff import LlffLoader
 from .megasam import MegaSamLoader
-from .nerfds import NerfDsLoader
+from .nerfds import NerfDsLoader, is_ambiguous
 from .nerfstudio import NerfstudioLoader
 from .options import LoadOptions
 from .vipe import VipeLoader
@@ -32,6 +32,7 @@ __all__ = [
     "LOADERS",
     "LoadOptions",
     "Loader",
+    "describe_layout",
     "is_capture",
     "load_capture",
     "load_with",
@@ -167,10 +168,23 @@ def require_finished(root: Path) -> None:
 def recognize(root: Path) -> str:
     """The layout of a capture, as a key of ``LOADERS``: ``layout`` in its dataset.json, or that of its files."""
     root = builtin_folder(root) if is_builtin(root) else root
+    recognized = (name for name, loader in LOADERS.items() if loader.recognizes(root))
+    return _named_layout(root) or next(recognized, FALLBACK)
+
+
+def describe_layout(root: Path, dataset: str | None = None) -> str:
+    """The layout that ``load_capture`` reads a capture in, for messages; says so if the files fit another one, too."""
+    root = builtin_folder(root) if is_builtin(root) else root
+    name, other = dataset or recognize(root), {"nerfds": "hypernerf", "hypernerf": "nerfds"}
+    if dataset or _named_layout(root) or name not in other or not is_ambiguous(root):
+        return name
+    return f"{name}, though its files fit {other[name]}, too; --dataset or layout in dataset.json says which"
+
+
+def _named_layout(root: Path) -> str | None:
+    """``layout`` in dataset.json; None if it is not there or not a key of ``LOADERS``."""
     try:
         named = read_json(root / "dataset.json").get("layout")
     except ValueError:  # no file, or one that the loader reports
-        named = None
-    if isinstance(named, str) and named in LOADERS:
-        return named
-    return next((name for name, loader in LOADERS.items() if loader.recognizes(root)), FALLBACK)
+        return None
+    return named if isinstance(named, str) and named in LOADERS else None

@@ -1,8 +1,17 @@
-"""NeRF-DS: full-size images with masks, one training and one evaluation camera."""
+"""NeRF-DS: full-size images with masks, one training and one evaluation camera; and what tells it from HyperNeRF."""
 
 from pathlib import Path
 
+from warpgs.files import read_json
+
 from .nerfies import NerfiesLoader
+
+RELEASED_SIZES = {(480, 270): "nerfds", (1072, 1920): "hypernerf"}
+"""Full size of the images as released: those of NeRF-DS (CVMI-Lab/SC-GS, issue 24), and nearly all of HyperNeRF
+(google/hypernerf, issue 59)."""
+
+RELEASED_FOLDERS = ("train_camera", "vrig_camera")
+"""Folders of cameras that captures of NeRF-DS have beside camera/, as its README lists them."""
 
 
 class NerfDsLoader(NerfiesLoader):
@@ -11,13 +20,39 @@ class NerfDsLoader(NerfiesLoader):
     default_factor = 1
 
     def recognizes(self, root: Path) -> bool:
-        """Whether masks have the full size, or images have the full size only.
+        """Whether images have the full size only, it is a release of NeRF-DS, or else masks have the full size.
 
         HyperNeRF's captures have images of a quarter of the size and more; masks that were added to them in several
         sizes do not make them captures of NeRF-DS.
         """
         if not (root / "rgb/1x").is_dir():
             return False
-        masks = {path.name for path in (root / "resized_mask").glob("*x")}
-        is_hypernerf = (root / "rgb/4x").is_dir() and masks != {"1x"}
-        return not (root / "rgb/2x").is_dir() or ("1x" in masks and not is_hypernerf)
+        if not (root / "rgb/2x").is_dir():
+            return True
+        if (released := _released_as(root)) is not None:
+            return released == "nerfds"
+        masks = _mask_sizes(root)
+        return "1x" in masks and (masks == {"1x"} or not (root / "rgb/4x").is_dir())
+
+
+def is_ambiguous(root: Path) -> bool:
+    """Whether a capture may be of NeRF-DS or of HyperNeRF, whose files have one layout: images and masks in several
+    sizes fit both, and it is not as either was released."""
+    has_sizes = all((root / f"rgb/{size}").is_dir() for size in ("1x", "2x"))
+    return has_sizes and "1x" in _mask_sizes(root) and _released_as(root) is None
+
+
+def _mask_sizes(root: Path) -> set[str]:
+    return {path.name for path in (root / "resized_mask").glob("*x")}
+
+
+def _released_as(root: Path) -> str | None:
+    """The dataset that has released captures like this one; None if neither has."""
+    if any((root / folder).is_dir() for folder in RELEASED_FOLDERS):
+        return "nerfds"
+    camera = next((root / "camera").glob("*.json"), None)
+    try:
+        size = None if camera is None else read_json(camera).get("image_size")
+    except ValueError:  # the loader reports it
+        return None
+    return next((name for released, name in RELEASED_SIZES.items() if size == [*released]), None)
