@@ -1,6 +1,7 @@
 """What the writer writes is read back by the loader."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -43,6 +44,12 @@ def test_images_masks_and_points_are_read_back(root):
     assert np.array_equal(frame.image.numpy(), IMAGE)
     assert np.array_equal(frame.static_mask.numpy(), STATIC)
     assert np.allclose(capture.points.numpy(), (POINTS - UNITS.center) * UNITS.scale)
+
+
+def test_masks_that_are_gone_are_no_estimates(root):
+    writer.write_index(root, TIMES, estimated_masks=True)
+    shutil.rmtree(root / "resized_mask")
+    assert not load_capture(root).estimated_masks
 
 
 def test_the_index_says_whether_masks_are_estimates(root):

@@ -95,12 +95,12 @@ class NerfiesLoader(ABC):
             reader.read,
             options.cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
-            estimated_masks=_has_estimated_masks(root / "dataset.json", dataset),
+            estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             read_taken=taken_reader(reader.read_with, lenses),
         )
 
 
-def _has_estimated_masks(path: Path, dataset: dict[str, Any]) -> bool:
+def _are_estimates(path: Path, dataset: dict[str, Any]) -> bool:
     masks = dataset.get("masks", GIVEN)
     if masks not in (GIVEN, ESTIMATED):
         raise ValueError(f"{path}: masks must be {GIVEN!r} or {ESTIMATED!r}, got {masks!r}")
