@@ -4,6 +4,7 @@ import errno
 import json
 import math
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -110,6 +111,45 @@ def test_a_folder_that_another_process_still_writes_is_kept(tmp_path):
             assert (first / "image.png").is_file()
         (tmp_path / "capture").rmdir()
     assert [path.name for path in tmp_path.rglob("*")] == ["capture", "image.png"]
+
+
+def unwritable_file(folder):
+    (folder / "rgb").touch()
+    write_bytes(folder / "rgb/left_000000.png", [b"x"])
+
+
+def unwritable_folder(folder):
+    (folder / "rgb").touch()
+    (folder / "rgb").mkdir()
+
+
+def full_target(folder):
+    target = folder.parent.parent / folder.name
+    target.mkdir()
+    (target / "mine").touch()
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (unwritable_file, "/rgb/left_000000.png could not be written: File exists"),
+        (unwritable_folder, "/rgb"),
+        (full_target, ""),
+    ],
+)
+def test_what_cannot_be_written_names_the_folder_and_not_the_temporary_one(tmp_path, write, message):
+    def make():
+        with complete_or_absent(tmp_path / "capture") as partial:
+            write(partial)
+
+    with pytest.raises(OSError, match=re.escape(f"{tmp_path}/capture{message}")) as raised:
+        make()
+    assert ".capture-" not in str(raised.value)
+
+
+def test_an_error_of_another_file_is_kept(tmp_path):
+    with pytest.raises(FileNotFoundError, match="source"), complete_or_absent(tmp_path / "capture"):
+        (tmp_path / "source").read_bytes()
 
 
 def test_hidden_folders_of_the_user_are_kept(tmp_path):

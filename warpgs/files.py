@@ -88,7 +88,8 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
         keep_existing: Whether another process may make the same folder meanwhile, which is kept then.
 
     Raises:
-        OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent.
+        OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent, as do
+            those of errors of files in it, instead of the temporary folder.
     """
     _remove_abandoned(folder)
     try:
@@ -106,6 +107,12 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
             except OSError:
                 if not (keep_existing and folder.is_dir()):
                     raise
+    except OSError as error:
+        if str(beside) not in str(error):
+            raise
+        # The temporary name would make equal errors of two attempts differ, and nobody finds that folder afterwards.
+        message = str(error).replace(str(partial), str(folder)).replace(str(beside), str(folder))
+        raise OSError(message) from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
