@@ -15,6 +15,7 @@ from warpgs.data.writer import STATE, WORK
 from warpgs.sweep.cells import (
     arguments,
     as_evaluated_before,
+    equal_variants,
     find_scenes,
     finished_metrics,
     is_evaluated,
@@ -101,6 +102,13 @@ def test_two_cells_with_one_name_are_refused(tmp_path):
     two = spec(Variant("c", "", {}), Variant("b-c", "", {}))
     with pytest.raises(ValueError, match="two cells have the name a-b-c-seed0: variant b-c on a, and variant c on a-b"):
         plan(two, {"a": "/a", "a-b": "/b"}, tmp_path)
+
+
+def test_variants_are_equal_if_they_train_the_same_on_one_capture_whatever_its_names(tmp_path):
+    different = (Variant("a", "", {}), Variant("b", "", {"app": False}))
+    scenes = {"first": "/as", "second": "/as"}
+    assert equal_variants(plan(spec(*different), scenes, tmp_path)) == []
+    assert equal_variants(plan(spec(*different, Variant("c", "", {})), scenes, tmp_path)) == [["a", "c"]]
 
 
 @pytest.mark.parametrize(

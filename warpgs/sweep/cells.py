@@ -144,10 +144,11 @@ def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides:
 
 
 def equal_variants(cells: Iterable[Cell]) -> list[list[str]]:
-    """Names of those variants whose trainings are the same, in groups."""
-    groups: dict[str, list[str]] = {}
+    """Names of those variants whose trainings of one capture are the same, in groups."""
+    groups: dict[tuple[str, str], list[str]] = {}  # by the name of the capture: one folder may have two
     for cell in cells:
-        groups.setdefault(repr(dataclasses.replace(cell.config, out=None)), []).append(cell.variant)
+        key = cell.scene, repr(dataclasses.replace(cell.config, out=None))
+        groups.setdefault(key, []).append(cell.variant)
     return [list(names) for names in dict.fromkeys(map(tuple, groups.values())) if len(names) > 1]
 
 
