@@ -16,6 +16,7 @@ from warpgs.sweep.cells import (
     arguments,
     as_evaluated_before,
     equal_variants,
+    find_problems,
     find_scenes,
     finished_metrics,
     is_evaluated,
@@ -177,21 +178,40 @@ def test_two_captures_with_one_name_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["", "as="])
-def test_what_is_no_capture_is_refused_as_training_does(name, tmp_path):
+def test_what_is_no_capture_has_the_problem_that_training_names(name, tmp_path):
     (tmp_path / "empty").mkdir()
     for path, problem in (("nowhere", "does not exist"), ("empty", "has no dataset.json and the files of no other")):
-        with pytest.raises(ValueError, match=f"{path} {problem}"):
-            find_scenes([f"{name}{tmp_path / path}"])
+        found = find_problems(find_scenes([f"{name}{tmp_path / path}"]))
+        assert list(found) == [name.rstrip("=") or path]
+        assert f"{tmp_path / path} {problem}" in found[name.rstrip("=") or path]
+
+
+def test_a_capture_that_cannot_be_read_has_a_problem_and_others_do_not(tmp_path, monkeypatch):
+    for name in ("good", "closed"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "dataset.json").touch()
+    exists = Path.exists
+
+    def refuse(path):
+        if "closed" in path.parts:
+            raise PermissionError(f"[Errno 13] Permission denied: '{path}'")
+        return exists(path)
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    scenes = {name: str(tmp_path / name) for name in ("good", "closed")} | {"room": "builtin:room"}
+    closed = tmp_path / "closed/dataset.json"
+    assert find_problems(scenes) == {"closed": f"[Errno 13] Permission denied: '{closed}'"}
 
 
 @pytest.mark.parametrize("path", ["scenes", "scenes/b"])
-def test_a_capture_that_prepare_has_not_finished_is_refused_before_anything_is_trained(path, tmp_path):
+def test_a_capture_that_prepare_has_not_finished_has_a_problem_before_anything_is_trained(path, tmp_path):
     for name, done in (("a", '{"finished": {}}'), ("b", "{}")):
         (tmp_path / "scenes" / name / WORK).mkdir(parents=True)
         (tmp_path / "scenes" / name / "dataset.json").write_text("{}")
         (tmp_path / "scenes" / name / WORK / STATE).write_text(f'{{"done": {done}}}')
-    with pytest.raises(ValueError, match=r"scenes.b is not finished"):
-        find_scenes([str(tmp_path / path)])
+    problems = find_problems(find_scenes([str(tmp_path / path)]))
+    assert list(problems) == ["b"]
+    assert f"{tmp_path}/scenes/b is not finished" in problems["b"]
 
 
 def test_a_sweep_without_captures_is_refused():

@@ -278,6 +278,51 @@ def test_folders_that_are_no_captures_are_named_but_not_in_the_script_of_a_dry_r
     assert capsys.readouterr().out.startswith(warning)
 
 
+def test_a_missing_capture_fails_only_its_own_cells_and_is_named_before_the_first_training(sweep, tmp_path, capsys):
+    data = ["--data", str(tmp_path / "as"), str(tmp_path / "az")]
+    assert sweep(*data) == (1, ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"])
+    printed = capsys.readouterr().out
+    problem = f"{tmp_path}/az does not exist"
+    assert printed.startswith(f"warning: {problem}\n[5/8] as-full-seed0 finished\n")
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed
+    note = f"az-full-seed0, az-plain-seed0, az-full-seed1, az-plain-seed1: {problem}\n"
+    assert note in printed
+    assert note in (tmp_path / "out/table.md").read_text()
+    assert sweep(*data) == sweep(*data, "--tables-only") == (1, [])
+    assert capsys.readouterr().out.count(note) == 2
+    (tmp_path / "az").mkdir()
+    (tmp_path / "az/dataset.json").touch()
+    assert sweep(*data) == (0, ["az-full-seed0", "az-plain-seed0", "az-full-seed1", "az-plain-seed1"])
+
+
+def test_a_sweep_of_missing_captures_alone_is_refused_in_one_line(sweep, tmp_path, capsys):
+    for options in ([], ["--dry-run"]):
+        assert sweep("--data", str(tmp_path / "cup"), str(tmp_path / "bell"), *options) == (2, [])
+        assert capsys.readouterr() == ("", f"warpgs sweep: {tmp_path}/cup does not exist\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("options", [[], ["--tables-only"]])
+def test_a_finished_sweep_does_not_need_its_captures(sweep, tmp_path, capsys, options):
+    sweep()
+    shutil.rmtree(tmp_path / "as")
+    capsys.readouterr()
+    assert sweep(*options) == (0, [])
+    printed = capsys.readouterr().out
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed
+    assert "does not exist" not in printed
+
+
+def test_cells_whose_capture_was_deleted_fail_and_keep_what_was_measured(sweep, tmp_path, capsys):
+    sweep()
+    shutil.rmtree(tmp_path / "as")
+    capsys.readouterr()
+    assert sweep("--seeds", "3", "--as-taken") == (1, [])
+    printed = capsys.readouterr().out
+    assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 of 3 |" in printed
+    assert f"as-plain-seed2: {tmp_path}/as does not exist\n" in printed
+
+
 def test_tables_alone_keep_the_reasons_and_the_exit_code(sweep, tmp_path, capsys):
     def fail(job):
         return 'node7: a, "b" is [bad]' if job.name == "as-plain-seed0" else sweep.finish(job)

@@ -75,6 +75,12 @@ class Board:
                 if state == "failed":
                     self.states[name] = state
 
+    def give_up(self, problems: Mapping[str, str]) -> None:
+        """Marks what has not finished as failed, on the captures that have a problem."""
+        for cell in self.unfinished():
+            if cell.scene in problems:
+                self.states[cell.name], self.errors[cell.name] = "failed", problems[cell.scene]
+
     def jobs(self, device: str) -> list[Job]:
         """What is left to do, in the order in which it starts."""
         return [
@@ -93,7 +99,7 @@ class Board:
 
     def unfinished(self) -> list[Cell]:
         """The cells to train or to evaluate, in the order of the tables."""
-        return [cell for cell in self.cells if self.states[cell.name] != "finished"]
+        return [cell for cell in self.cells if self.states[cell.name] not in ("finished", "failed")]
 
     @property
     def _running(self) -> Path:

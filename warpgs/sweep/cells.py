@@ -12,7 +12,7 @@ from typing import Any
 from warpgs.config import TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import is_builtin, parse_builtin
-from warpgs.errors import visible
+from warpgs.errors import one_line, visible
 from warpgs.files import read_json
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config
@@ -62,14 +62,14 @@ class Cell:
 
 
 def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> dict[str, str]:
-    """Captures by name, in order.
+    """Captures by name, in order, also those that cannot be read (``find_problems``).
 
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
         log: Receives a warning for each folder of captures with subfolders that are not captures.
 
     Raises:
-        ValueError: If there is none, one is no capture, or a name is wrong or given twice; the message names it.
+        ValueError: If there is none, or a name is wrong or given twice; the message names it.
     """
     if not data:
         raise ValueError("a sweep needs captures: give them with --data")
@@ -88,28 +88,19 @@ def _named(text: str, log: Callable[[str], object]) -> Iterator[tuple[str, str]]
     name, equals, rest = text.partition("=")
     if is_builtin(text):
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
-    elif equals and not Path(text).exists():
+    elif equals and not os.path.exists(text):
         check_name(f"there is no capture {text}", name)
-        yield name, rest if is_builtin(rest) else str(_capture(Path(rest).resolve()))
+        yield name, rest if is_builtin(rest) else str(Path(rest).resolve())
     else:
         root = Path(text).resolve()
-        yield from ((path.name, str(_capture(path))) for path in _captures_in(root, log) or [root])
-
-
-def _capture(root: Path) -> Path:
-    """The folder; raises ValueError if it is no capture, as training would."""
-    from warpgs.data.loaders import require_capture, require_finished  # imports torch
-
-    require_capture(root)
-    require_finished(root)
-    return root
+        yield from ((path.name, str(path)) for path in _captures_in(root, log) or [root])
 
 
 def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
     """The captures in a folder, by name; none if it is a capture itself. Says which other folders are in it."""
     from warpgs.data.loaders import is_capture  # imports torch
 
-    if not root.is_dir() or is_capture(root):
+    if not os.access(root, os.R_OK | os.X_OK) or not root.is_dir() or is_capture(root):
         return []
     folders = [path for path in sorted(root.iterdir()) if os.path.isdir(path)]
     found = [path for path in folders if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
@@ -117,6 +108,21 @@ def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
     if found and others:
         log(visible(f"warning: {root}: skipped folders that are not captures: {', '.join(others)}"))
     return found
+
+
+def find_problems(scenes: Mapping[str, str]) -> dict[str, str]:
+    """Why captures cannot be trained, in one line each, by name: no such folder, no capture, or not finished."""
+    from warpgs.data.loaders import require_capture, require_finished  # imports torch
+
+    problems = {}
+    for name, path in scenes.items():
+        if not is_builtin(path):
+            try:
+                require_capture(Path(path))
+                require_finished(Path(path))
+            except (ValueError, OSError) as error:
+                problems[name] = one_line(error)
+    return problems
 
 
 def plan_cells(spec: SweepSpec, scenes: Mapping[str, str], out: Path, overrides: Mapping[str, Any]) -> list[Cell]:

@@ -17,7 +17,16 @@ from warpgs.files import kept_if_used, read_json, write_json
 from warpgs.runs.run import LOCK, lock_folder
 
 from .board import Board
-from .cells import Cell, as_evaluated_before, equal_variants, find_scenes, is_started, parse_evaluation, plan_cells
+from .cells import (
+    Cell,
+    as_evaluated_before,
+    equal_variants,
+    find_problems,
+    find_scenes,
+    is_started,
+    parse_evaluation,
+    plan_cells,
+)
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
@@ -40,7 +49,8 @@ def run_sweep(options: Sweep, log: Log) -> int:
     """Trains what is missing, then prints and writes the tables; returns the exit code.
 
     Raises:
-        ValueError: If options, the sweep's file or the plan are wrong, or the folder holds another sweep's results.
+        ValueError: If options, the sweep's file or the plan are wrong, no capture can be trained and nothing has
+            finished, or the folder holds another sweep's results.
         ImportError: If Ray is not installed.
         OSError: If a file cannot be written; tables that cannot be written have been printed.
         KeyboardInterrupt: After Ctrl-C or SIGTERM; the tables of what is finished are written.
@@ -55,22 +65,39 @@ def run_sweep(options: Sweep, log: Log) -> int:
         for cell in plan_cells(spec, scenes, out, overrides)
     ]
     peers = read_peers(options.compare) if options.compare else {}
+    board = Board(out, cells, log)
+    problems = _problems(options, board, scenes)
     for warning in _warnings(options, cells, peers, scenes):
         warn(f"warning: {warning}")
+    for problem in problems.values():
+        warn(f"warning: {problem}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
     if options.tables_only and not any(cell.name in known for cell in cells):
         raise ValueError(f"{out} has no training of this sweep: --tables-only needs the --out that it was started with")
     with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
-        board = Board(out, cells, log)
         if options.tables_only:
             board.recall()
         else:
+            board.give_up(problems)
             for lpips, net in {(cell.config.lpips, cell.config.lpips_net) for cell in board.unfinished()}:
                 locate(lpips, net)  # reports a wrong folder now, not in every cell
         _write_index(out, cells, known)
         return _run(options, spec, board, peers, log)
+
+
+def _problems(options: Sweep, board: Board, scenes: Mapping[str, str]) -> dict[str, str]:
+    """Why captures cannot be trained, of those that have cells to train; they fail these cells alone.
+
+    Raises:
+        ValueError: If there is nothing else to do.
+    """
+    problems = find_problems(scenes)
+    if len(problems) == len(scenes) and not board.metrics and not options.tables_only:
+        raise ValueError(next(iter(problems.values())))
+    needed = {cell.scene for cell in board.unfinished()}
+    return {scene: problem for scene, problem in problems.items() if scene in needed}
 
 
 def _warnings(options: Sweep, cells: list[Cell], peers: Peers, scenes: Mapping[str, str]) -> Iterator[str]:
@@ -187,7 +214,7 @@ def _train(pool: Pool, spec: SweepSpec, board: Board, peers: Peers) -> None:
         with suppress(OSError):  # a full disk, which is reported at the end, and stops no training that still runs
             write_tables(board.out, spec, board, peers)  # Ray may end this program
 
-    for data in sorted({str(cell.config.data) for cell in board.cells if is_builtin(str(cell.config.data))}):
+    for data in sorted({str(cell.config.data) for cell in board.unfinished() if is_builtin(str(cell.config.data))}):
         builtin_folder(data)  # once, not in every cell
     with board:
         run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
