@@ -3,11 +3,13 @@
 import contextlib
 import http.server
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -15,7 +17,7 @@ pytest.importorskip("ray")
 
 from warpgs.sweep import ray_pool
 from warpgs.sweep.ray_pool import RayPool
-from warpgs.sweep.scheduler import ClusterGoneError
+from warpgs.sweep.scheduler import ClusterGoneError, Result
 from warpgs.sweep.worker import Job
 
 pytestmark = pytest.mark.filterwarnings("default")  # Ray's own
@@ -52,8 +54,8 @@ def pool():
     made.close()
 
 
-def results(pool, count):
-    found, deadline = {}, time.monotonic() + 60
+def results(pool, count, seconds=60):
+    found, deadline = {}, time.monotonic() + seconds
     while len(found) < count and time.monotonic() < deadline:
         found.update({result.name: result for result in pool.wait(0.2)})
     return found
@@ -68,6 +70,28 @@ def test_jobs_report_success_failure_bugs_and_lost_workers(pool):
     assert found["crash"].is_lost
     assert not found["bug"].is_lost
     assert "a bug" in found["bug"].error
+    assert {found[name].node for name in ("good", "bad")} == pool.nodes()
+
+
+def test_a_queued_job_that_is_moved_runs_only_elsewhere_and_one_that_runs_goes_on(pool, tmp_path):
+    (tmp_path / "runs").touch()
+    running = [
+        job(f"long{k}", str(tmp_path / f"started{k}"))._replace(running=str(tmp_path / "runs"))
+        for k in range(os.cpu_count())
+    ]
+    queued = job("queued")._replace(running=str(tmp_path / "does not run"))
+    for made in (*running, queued):
+        pool.submit(made)
+    wait_until(lambda: all(Path(made.arguments[0]).exists() for made in running))
+    for made in (*running, queued):
+        pool.move(made, pool.nodes())  # there is no other node
+    assert results(pool, 1, seconds=3) == {}
+    for made in (*running, queued):
+        pool.move(made, frozenset())
+    assert not list(tmp_path.glob("*.saved"))
+    for made in running:
+        pool._ray.cancel(pool._references[made.name])
+    assert results(pool, len(running) + 1)["queued"] == Result("queued", None, node=next(iter(pool.nodes())))
 
 
 def test_stop_interrupts_what_runs_and_drops_what_waits(pool, tmp_path):
@@ -276,16 +300,28 @@ checkpoint_every = 10
 """
 
 
-@pytest.fixture
-def cluster(request):
+@contextlib.contextmanager
+def cluster_of(request, *environments):
+    """A cluster of a head, on which nothing is trained, and a node of one core in each environment."""
     if not request.config.getoption("--cluster"):
         pytest.skip("minutes; runs with --cluster")
     from ray.cluster_utils import Cluster
 
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    made.workers = [made.add_node(num_cpus=1) for _ in range(2)]
+    made.workers = []
+    for environment in environments:
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in environment.items():
+                patch.setenv(name, value)
+            made.workers.append(made.add_node(num_cpus=1))
     yield made
     made.shutdown()
+
+
+@pytest.fixture
+def cluster(request):
+    with cluster_of(request, {}, {}) as made:
+        yield made
 
 
 def running_from(out, iteration):
@@ -356,3 +392,29 @@ def test_a_cluster_that_is_gone_leaves_one_line_and_the_tables(cluster, tmp_path
     assert "warpgs sweep: the Ray cluster at" in output
     assert "0 of 4 trainings finished" in output
     assert (tmp_path / "out/report.html").exists()
+
+
+def test_a_node_that_cannot_keep_a_built_in_capture_costs_no_cell(request, tmp_path, monkeypatch):
+    import warp
+
+    import warpgs.runtime.launch  # noqa: F401  # initializes Warp
+    from warpgs.data.builtin import builtin_folder
+
+    monkeypatch.setenv("WARP_CACHE_PATH", str(Path(warp.config.kernel_cache_dir).parent))  # else they compile kernels
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "head"))
+    capture = builtin_folder("builtin:room", quiet=True).relative_to(tmp_path / "head")
+    blocked = tmp_path / "full" / capture.parent
+    blocked.parent.mkdir(parents=True)
+    blocked.touch()  # a file in the place of a folder
+    (tmp_path / "tiny.toml").write_text(TOML)
+    command = [sys.executable, "-m", "warpgs", "sweep", "tiny.toml", "--data", "builtin:room", "--iterations", "40"]
+    with cluster_of(request, *({"XDG_CACHE_HOME": str(tmp_path / name)} for name in ("full", "good"))) as cluster:
+        command += ["--out", "out", "--address", cluster.address, "--cpus", "1"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 of 4 trainings finished" in done.stdout
+    [line] = [line for line in done.stdout.splitlines() if " gets " in line]
+    assert re.match(
+        r"node [0-9a-f]{8} gets no more cells: .* failed on it in a row \(.*builtin cannot be kept in ", line
+    )
+    assert (tmp_path / "good" / capture).is_dir()  # each node makes its own

@@ -25,6 +25,18 @@ app = false
 """
 
 
+class Nodes:
+    """What a pool knows of its nodes."""
+
+    device = "cpu"
+
+    def move(self, job, avoid):
+        pass
+
+    def nodes(self):
+        return {"one", "two"}
+
+
 @pytest.fixture
 def sweep(tmp_path, monkeypatch, finished_run):
     """Runs the command; ``train(job)`` returns an error, and by default leaves a finished run behind."""
@@ -38,19 +50,17 @@ def sweep(tmp_path, monkeypatch, finished_run):
         )
         (folder / "views.csv").write_text("name,time,psnr,ssim,lpips\nleft_000000,0,20,0.5,\n")
 
-    class Pretended:
-        device = "cpu"
-
+    class Pretended(Nodes):
         def __init__(self, *_):
             self.queue = []
 
-        def submit(self, job):
+        def submit(self, job, avoid=frozenset()):
             self.queue.append(job)
 
         def wait(self, seconds):
             job = self.queue.pop(0)
             trained.append(job.name)
-            return [Result(job.name, train(job))]
+            return [Result(job.name, train(job), node=run.node)]
 
         def stop(self):
             pass
@@ -71,7 +81,7 @@ def sweep(tmp_path, monkeypatch, finished_run):
         options = ["--data", str(tmp_path / "as"), "--out", str(tmp_path / "out")]
         return main(["sweep", str(tmp_path / "mine.toml"), *options, *arguments]), list(trained)
 
-    run.finish = finish
+    run.finish, run.node = finish, ""
     return run
 
 
@@ -126,6 +136,14 @@ def test_a_failed_cell_is_reported_with_the_table_of_the_others(sweep, tmp_path,
     assert "3 of 4 trainings finished" in printed
     assert "as-plain-seed0: warpgs train: broken" in printed
     assert (tmp_path / "out/table.tex").read_text().endswith("\n\nas-plain-seed0: warpgs train: broken\n")
+
+
+def test_a_node_that_gets_no_more_cells_is_named_once(sweep, capsys):
+    sweep.node = "one"
+    assert sweep(by=lambda job: "node7: full")[0] == 1
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("node ")]
+    cells = "as-full-seed0, as-plain-seed0"
+    assert lines == [f"node one gets no more cells: {cells} failed on it in a row (node7: full)"]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import socket
 import sys
 import time
 import warnings
+from collections.abc import Callable, Mapping, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
@@ -22,6 +23,9 @@ PROBE_SECONDS = 5.0
 
 MAX_SILENCE = 20.0
 """Time without an accepted connection after which a cluster is gone [s]; Ray ends the program after 60 s."""
+
+NODE_LABEL = "ray.io/node-id"
+"""Label that Ray gives every node: its id."""
 
 OBJECT_STORE_BYTES = 100 << 20
 """Shared memory of a Ray that is started here [bytes]; nothing is exchanged through it. Ray would take 30 % of the
@@ -65,7 +69,9 @@ class RayPool:
 
     def __init__(self, address: str | None, device: str | None, per_gpu: int, cpus: int | None) -> None:
         self._ray: Any = None
-        self._jobs: dict[Any, str] = {}
+        self._jobs: dict[Any, Job] = {}  # by Ray's reference
+        self._references: dict[str, Any] = {}  # by name of the job
+        self._moved: dict[str, Set[str]] = {}  # nodes to avoid of cancelled jobs, which are queued again
         # Signals interrupt the main thread only, so Ray starts in another one: completely, or not at all. What it
         # starts on this machine inherits that SIGTERM is blocked, which timeout, Slurm and systemd send to all
         # processes: Ray and the cells run until the sweep stops them. Ray's processes end with that thread.
@@ -85,9 +91,11 @@ class RayPool:
         gpus = 1.0 / per_gpu if self.device == "cuda" else 0.0
         cores = cpus or (self._share_of_cores(per_gpu) if gpus else min(2, round(total.get("CPU", 1))))
         self._check_room(gpus, cores)
+        self._needs = gpus, cores
+        self._look_around()
         # Attempts are counted by the sweep, and a worker's memory must not outlive its training.
         remote = self._ray.remote(num_cpus=cores, num_gpus=gpus, max_retries=0, max_calls=1)
-        self._run = remote(run_job)
+        self._run, self._run_job = remote(_attempt), run_job
 
     def _connect(self, address: str | None) -> None:
         ray = _import_ray(address)
@@ -111,7 +119,14 @@ class RayPool:
         self._head = ray.get_runtime_context().gcs_address
 
     def _nodes(self) -> list[dict[str, float]]:
-        return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        return [node["Resources"] for node in self._alive()]
+
+    def _alive(self) -> list[dict[str, Any]]:
+        return [node for node in self._ray.nodes() if node["Alive"]]
+
+    def _look_around(self) -> None:
+        """Takes note of the nodes for trainings."""
+        self._ids = frozenset(node["NodeID"] for node in self._alive() if _has_room(node["Resources"], *self._needs))
 
     def _share_of_cores(self, per_gpu: int) -> int:
         """Cores per training on the node with the fewest; Ray limits the threads of torch to them."""
@@ -120,15 +135,30 @@ class RayPool:
 
     def _check_room(self, gpus: float, cores: int) -> None:
         nodes = self._nodes()
-        if not any(node.get("GPU", 0) >= gpus and node.get("CPU", 0) >= cores for node in nodes):
+        if not any(_has_room(node, gpus, cores) for node in nodes):
             raise ValueError(
                 f"no node of the cluster has {cores} cores{f' and {gpus:g} GPUs' if gpus else ''} for a training: "
                 f"{', '.join(_described(node) for node in nodes) or 'there are no nodes'}"
             )
 
-    def submit(self, job: Job) -> None:
-        """Queues a job."""
-        self._jobs[self._run.options(name=job.name).remote(job)] = job.name
+    def submit(self, job: Job, avoid: Set[str] = frozenset()) -> None:
+        """Queues a job, for any node but those to avoid."""
+        labels = {"label_selector": {NODE_LABEL: f"!in({','.join(sorted(avoid))})"}} if avoid else {}
+        reference = self._run.options(name=job.name, **labels).remote(self._run_job, job)
+        self._jobs[reference], self._references[job.name] = job, reference
+
+    def move(self, job: Job, avoid: Set[str]) -> None:
+        """Changes the nodes that a queued job avoids; one that runs goes on where it is.
+
+        Ray cannot tell which jobs run. One that has begun a moment ago may be cancelled, too: it continues elsewhere.
+        """
+        if job.name in self._moved or not os.path.exists(job.running):
+            self._moved[job.name] = avoid
+            self._ray.cancel(self._references[job.name])
+
+    def nodes(self) -> Set[str]:
+        """Ids of the nodes that are alive and have room for a job."""
+        return self._ids
 
     def wait(self, seconds: float) -> list[Result]:
         """The jobs that have ended since the last call; waits up to some seconds for the first.
@@ -138,17 +168,23 @@ class RayPool:
         """
         done, _ = self._ray.wait(list(self._jobs), timeout=seconds)
         self._check_head()
-        return [self._result(reference) for reference in done]
+        return [result for reference in done if (result := self._result(reference))]
 
-    def _result(self, reference: Any) -> Result:
-        name, errors = self._jobs.pop(reference), self._ray.exceptions
+    def _result(self, reference: Any) -> Result | None:
+        """How an attempt has ended; None if the job was moved, and is queued again."""
+        job, errors = self._jobs.pop(reference), self._ray.exceptions
+        moved = self._moved.pop(job.name, None)
         try:
-            return Result(name, self._ray.get(reference))
-        except (errors.NodeDiedError, errors.WorkerCrashedError, errors.ObjectLostError) as error:
-            return Result(name, f"its node was lost ({type(error).__name__})", is_lost=True)
+            error, node = self._ray.get(reference)
+            return Result(job.name, error, node=node)
         except errors.RayError as error:
+            if moved is not None:
+                self.submit(job, moved)
+                return None
+            if isinstance(error, errors.NodeDiedError | errors.WorkerCrashedError | errors.ObjectLostError):
+                return Result(job.name, f"its node was lost ({type(error).__name__})", is_lost=True)
             lines = [line for line in str(error).splitlines() if line.strip()]
-            return Result(name, one_line(ValueError(lines[-1] if lines else type(error).__name__))[:300])
+            return Result(job.name, one_line(ValueError(lines[-1] if lines else type(error).__name__))[:300])
 
     def _check_head(self) -> None:
         now = time.monotonic()
@@ -158,6 +194,7 @@ class RayPool:
         with suppress(ConnectionError):
             _probe(self._head)
             self._heard = now
+            self._look_around()
         if now - self._heard > MAX_SILENCE:
             raise ClusterGoneError(f"the Ray cluster at {self._head} is gone")
 
@@ -175,6 +212,17 @@ class RayPool:
     def _disconnect(self) -> None:
         if self._ray is not None:
             self._ray.shutdown()
+
+
+def _attempt(run: Callable[[Job], str | None], job: Job) -> tuple[str | None, str]:
+    """Runs a job on a node; returns its error and the id of the node."""
+    import ray
+
+    return run(job), ray.get_runtime_context().get_node_id()
+
+
+def _has_room(node: Mapping[str, float], gpus: float, cores: int) -> bool:
+    return node.get("GPU", 0) >= gpus and node.get("CPU", 0) >= cores
 
 
 def _local_options() -> dict[str, Any]:

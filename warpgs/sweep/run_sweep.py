@@ -162,7 +162,7 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
     with _pool(options, board, log) as pool:  # outside of the try: without it, the command is refused
         try:
             if pool is not None:
-                _train(pool, spec, board, peers)
+                _train(pool, spec, board, peers, log)
         except OSError as error:  # the cluster is gone, or there is no space for a built-in capture
             log(f"warpgs sweep: {one_line(error)}; the same command continues with what is missing")
             code = FAILED
@@ -208,7 +208,7 @@ def _pool(options: Sweep, board: Board, log: Log) -> Iterator[Pool | None]:
             pool.close()
 
 
-def _train(pool: Pool, spec: SweepSpec, board: Board, peers: Peers) -> None:
+def _train(pool: Pool, spec: SweepSpec, board: Board, peers: Peers, log: Log) -> None:
     def on_event(event: Event) -> None:
         board.tell(event)
         with suppress(OSError):  # a full disk, which is reported at the end, and stops no training that still runs
@@ -217,4 +217,4 @@ def _train(pool: Pool, spec: SweepSpec, board: Board, peers: Peers) -> None:
     for data in sorted({str(cell.config.data) for cell in board.unfinished() if is_builtin(str(cell.config.data))}):
         builtin_folder(data)  # once, not in every cell
     with board:
-        run_jobs(pool, board.jobs(pool.device), on_event, board.poll)
+        run_jobs(pool, board.jobs(pool.device), on_event, board.poll, log)

@@ -1,9 +1,10 @@
-"""Which cells run again: failed ones once, those of a lost node a few times. Knows nothing of Ray."""
+"""Which cells run again, and where: failed ones once, those of a lost node a few times. Knows nothing of Ray."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from .nodes import Nodes
 from .worker import Job
 
 MAX_FAILURES = 2
@@ -22,11 +23,13 @@ class Result(NamedTuple):
         name: Name of the cell.
         error: Why it failed, in one line; None on success.
         is_lost: Whether its node was lost, so that the error says nothing about the cell.
+        node: Id of the node that it ran on; empty if it is not known.
     """
 
     name: str
     error: str | None
     is_lost: bool = False
+    node: str = ""
 
 
 class ClusterGoneError(ConnectionError):
@@ -43,8 +46,16 @@ class Pool(Protocol):
 
     device: str
 
-    def submit(self, job: Job) -> None:
-        """Queues a job."""
+    def submit(self, job: Job, avoid: Set[str] = frozenset()) -> None:
+        """Queues a job, for any node but those to avoid."""
+        ...
+
+    def move(self, job: Job, avoid: Set[str]) -> None:
+        """Changes the nodes that a queued job avoids; one that runs goes on where it is."""
+        ...
+
+    def nodes(self) -> Set[str]:
+        """Ids of the nodes that are alive and have room for a job."""
         ...
 
     def wait(self, seconds: float) -> list[Result]:
@@ -74,28 +85,40 @@ class Event(NamedTuple):
     error: str | None
 
 
-def run_jobs(pool: Pool, jobs: Iterable[Job], on_event: Callable[[Event], None], on_poll: Callable[[], None]) -> None:
+def run_jobs(
+    pool: Pool,
+    jobs: Iterable[Job],
+    on_event: Callable[[Event], None],
+    on_poll: Callable[[], None],
+    log: Callable[[str], object] = print,
+) -> None:
     """Runs jobs until each has finished or was given up.
 
-    ``on_event`` is called when an attempt at a cell has ended, ``on_poll`` about twice a second.
+    ``on_event`` is called when an attempt at a cell has ended, ``on_poll`` about twice a second, ``log`` with a line
+    about each node that gets no more cells, or gets them again.
 
     Raises:
         KeyboardInterrupt: After Ctrl-C or SIGTERM; by then the pool has stopped, and unfinished cells can be continued.
         ClusterGoneError: If the cluster cannot be reached any more.
     """
     waiting = {job.name: job for job in jobs}
-    failures: Counter[str] = Counter()
-    losses: Counter[str] = Counter()
+    avoided: dict[str, Set[str]] = dict.fromkeys(waiting, frozenset())
+    counts: Counter[tuple[str, bool]] = Counter()
+    nodes = Nodes()
     try:
         for job in waiting.values():
             pool.submit(job)
         while waiting:
-            for result in pool.wait(POLL_SECONDS):
-                event = _judge(result, failures, losses)
+            results = pool.wait(POLL_SECONDS)
+            events = [_judge(result, counts) for result in results]
+            for result, event in zip(results, events, strict=True):
+                nodes.note(result.name, "" if result.is_lost else result.node, result.error)
                 if event.state in ("finished", "failed"):
                     del waiting[result.name]
-                else:
-                    pool.submit(waiting[result.name])
+            for line in nodes.exclude(pool.nodes()):
+                log(line)
+            _place(pool, waiting, avoided, nodes, {result.name for result in results})
+            for event in events:
                 on_event(event)
             on_poll()
     except KeyboardInterrupt:
@@ -103,9 +126,20 @@ def run_jobs(pool: Pool, jobs: Iterable[Job], on_event: Callable[[Event], None],
         raise
 
 
-def _judge(result: Result, failures: Counter[str], losses: Counter[str]) -> Event:
+def _place(pool: Pool, waiting: Mapping[str, Job], avoided: dict[str, Set[str]], nodes: Nodes, ended: Set[str]) -> None:
+    """Queues the cells again whose attempts have ended, and moves those that avoid other nodes than before."""
+    for name, job in waiting.items():
+        avoid = nodes.avoided_by(name)
+        if name in ended:
+            pool.submit(job, avoid)
+        elif avoid != avoided[name]:
+            pool.move(job, avoid)
+        avoided[name] = avoid
+
+
+def _judge(result: Result, counts: Counter[tuple[str, bool]]) -> Event:
     if result.error is None:
         return Event(result.name, "finished", None)
-    counts, limit, again = (losses, MAX_LOSSES, "lost") if result.is_lost else (failures, MAX_FAILURES, "retried")
-    counts[result.name] += 1
-    return Event(result.name, "failed" if counts[result.name] >= limit else again, result.error)
+    limit, again = (MAX_LOSSES, "lost") if result.is_lost else (MAX_FAILURES, "retried")
+    counts[result.name, result.is_lost] += 1
+    return Event(result.name, "failed" if counts[result.name, result.is_lost] >= limit else again, result.error)
