@@ -331,6 +331,18 @@ def test_a_finished_sweep_does_not_need_its_captures(sweep, tmp_path, capsys, op
     assert "does not exist" not in printed
 
 
+def test_tables_alone_do_not_need_the_folder_of_captures(sweep, tmp_path, capsys):
+    for name in ("bell", "cup"):
+        (tmp_path / "captures" / name).mkdir(parents=True)
+        (tmp_path / "captures" / name / "dataset.json").touch()
+    data = ["--data", str(tmp_path / "captures")]
+    assert sweep(*data)[0] == 0
+    before = (tmp_path / "out/table.md").read_text()
+    shutil.rmtree(tmp_path / "captures")
+    assert sweep(*data, "--tables-only") == sweep(*data) == (0, [])
+    assert (tmp_path / "out/table.md").read_text() == before
+
+
 def test_cells_whose_capture_was_deleted_fail_and_keep_what_was_measured(sweep, tmp_path, capsys):
     sweep()
     shutil.rmtree(tmp_path / "as")

@@ -6,6 +6,7 @@ import os
 import shlex
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +62,13 @@ class Cell:
         return shlex.join(["warpgs", "train", *arguments(self.config)])
 
 
-def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> dict[str, str]:
+def find_scenes(data: Sequence[str], log: Callable[[str], object] = print, known: Iterable[str] = ()) -> dict[str, str]:
     """Captures by name, in order, also those that cannot be read (``find_problems``).
 
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
         log: Receives a warning for each folder of captures with subfolders that are not captures.
+        known: Captures that were trained before; a folder that does not exist any more stands for those that it had.
 
     Raises:
         ValueError: If there is none, or a name is wrong or given twice; the message names it.
@@ -75,7 +77,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> di
         raise ValueError("a sweep needs captures: give them with --data")
     scenes: dict[str, str] = {}
     for text in data:
-        for name, path in _named(text, log):
+        for name, path in _named(text, log, known):
             if name in scenes:
                 raise ValueError(
                     f"two captures have the name {name}: {scenes[name]} and {path}; name one with --data NAME={path}"
@@ -84,7 +86,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print) -> di
     return scenes
 
 
-def _named(text: str, log: Callable[[str], object]) -> Iterator[tuple[str, str]]:
+def _named(text: str, log: Callable[[str], object], known: Iterable[str]) -> Iterator[tuple[str, str]]:
     name, equals, rest = text.partition("=")
     if is_builtin(text):
         yield text.partition(":")[2].replace("?", "-").replace("=", "-").replace("&", "-"), text
@@ -93,7 +95,8 @@ def _named(text: str, log: Callable[[str], object]) -> Iterator[tuple[str, str]]
         yield name, rest if is_builtin(rest) else str(Path(rest).resolve())
     else:
         root = Path(text).resolve()
-        yield from ((path.name, str(path)) for path in _captures_in(root, log) or [root])
+        gone = [] if os.path.exists(root) else [path for path in map(Path, known) if path.parent == root]
+        yield from ((path.name, str(path)) for path in _captures_in(root, log) or gone or [root])
 
 
 def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
@@ -212,6 +215,12 @@ def parse_evaluation(command: str) -> tuple[dict[str, Any], list[str]]:
     parser.add_argument("--as-taken", action="store_true")
     found, words = parser.parse_known_args(shlex.split(command))
     return vars(found), words
+
+
+def trained_captures(commands: Iterable[str]) -> list[str]:
+    """The captures of cells, as the commands that train them say."""
+    words = [shlex.split(command) for command in commands]
+    return list(dict.fromkeys(word for line in words for name, word in pairwise(line) if name == "--data"))
 
 
 def as_evaluated_before(cell: Cell, command: str, given: Collection[str]) -> Cell:

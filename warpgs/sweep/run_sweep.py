@@ -26,6 +26,7 @@ from .cells import (
     is_started,
     parse_evaluation,
     plan_cells,
+    trained_captures,
 )
 from .command import Sweep
 from .peers import read_peers
@@ -59,7 +60,8 @@ def run_sweep(options: Sweep, log: Log) -> int:
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
     # The output of a dry run is a script.
     warn = partial(print, file=sys.stderr) if options.dry_run else log
-    scenes, overrides, known = find_scenes(spec.data, warn), _overrides(options), _known_commands(out)
+    overrides, known = _overrides(options), _known_commands(out)
+    scenes = find_scenes(spec.data, warn, trained_captures(known.values()))
     cells = [
         as_evaluated_before(cell, known.get(cell.name, ""), overrides)
         for cell in plan_cells(spec, scenes, out, overrides)
@@ -67,10 +69,8 @@ def run_sweep(options: Sweep, log: Log) -> int:
     peers = read_peers(options.compare) if options.compare else {}
     board = Board(out, cells, log)
     problems = _problems(options, board, scenes)
-    for warning in _warnings(options, cells, peers, scenes):
+    for warning in (*_warnings(options, cells, peers, scenes), *problems.values()):
         warn(f"warning: {warning}")
-    for problem in problems.values():
-        warn(f"warning: {problem}")
     if options.dry_run:
         log("\n".join(cell.command for cell in cells))
         return 0
