@@ -365,7 +365,11 @@ def test_a_capture_that_prepare_did_not_make_is_never_replaced(name, force, shot
 
 def test_other_files_in_the_folders_of_a_replaced_capture_are_kept(made, shots, tmp_path, monkeypatch):
     root = shutil.copytree(made, tmp_path / "made")
-    kept = [root / "rgb/notes.txt", root / "depth/lidar/frame.npy", root / "resized_mask/1x/drawing.png"]
+    names = ("rgb/notes.txt", "depth/lidar/frame.npy", "resized_mask/1x/drawing.png", "rgb/1x/frame_000000.png.bak")
+    kept = [root / name for name in names]
+    elsewhere = tmp_path / "elsewhere"
+    (root / "depth/1x").rename(elsewhere)
+    (root / "depth/1x").symlink_to(elsewhere)
     for path in kept:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
@@ -374,6 +378,8 @@ def test_other_files_in_the_folders_of_a_replaced_capture_are_kept(made, shots, 
         prepare(shots, root, force=True, holdout=8)
     left = {path for path in root.rglob("*") if path.is_file() and ".prepare" not in path.parts}
     assert left == set(kept)
+    assert not (root / "depth/1x").is_symlink()
+    assert elsewhere.is_dir()
     assert all(path.read_text() == "mine" for path in kept)
 
 

@@ -252,7 +252,9 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
     if capture.extent <= MIN_EXTENT:
         yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
     if len(capture.points) == 0:
-        remedy = "warpgs prepare CAPTURE --add points makes some"
+        remedy = (
+            "warpgs prepare CAPTURE --add points makes some, in a copy of warpgs import if the layout is another one"
+        )
         yield Finding("warning", "points", f"there are no sparse points: training starts from random ones; {remedy}")
         return
     names = _sampled(capture.train, samples)

@@ -101,7 +101,7 @@ def _of_run(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
 
 
 def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool) -> None:
-    """What the training camera sees over time: joint | static | dynamic."""
+    """Joint | static | dynamic image over time, from the cameras of ``replay``."""
     with Video(path) as video:
         for camera in progress(replay(capture, VIDEO_FRAMES), "video over time", quiet):
             rendering = scene.render(camera.to(scene.device), branches=True)

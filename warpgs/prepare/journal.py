@@ -21,8 +21,8 @@ OUTPUTS = (
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
-FRAME = re.compile(r"frame_\d{6}\.")
-"""Beginning of the names of the files in these folders, also of those that were being written at an interruption."""
+FRAME = re.compile(r"frame_\d{6}\.(png|png\.png|npy|json)(\.partial)?")
+"""Names of the files in these folders, also of those that were being written at an interruption."""
 
 VERSION = 4
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
@@ -72,7 +72,11 @@ class Journal:
         if (self.work / STATE).exists() or (self.root / REPORT).exists():
             return
         paths = (self.root / name for name in OUTPUTS)
-        foreign = [path.name for path in paths if path.is_file() or (path.is_dir() and any(path.iterdir()))]
+        foreign = [
+            path.name
+            for path in paths
+            if path.is_symlink() or path.is_file() or (path.is_dir() and any(path.iterdir()))
+        ]
         if foreign:
             raise ValueError(
                 f"{self.root} was not made by prepare, which would replace its {', '.join(foreign)}: choose another "
@@ -214,7 +218,7 @@ def _remove_frames(folder: Path) -> None:
     for path in sorted(folder.rglob("*"), reverse=True):  # what a folder holds comes before the folder
         if path.is_dir() and not path.is_symlink():
             _remove_if_empty(path)
-        elif FRAME.match(path.name):
+        elif path.is_dir() or FRAME.fullmatch(path.name):  # through a link, the new capture would read old frames
             path.unlink()
     _remove_if_empty(folder)
 
