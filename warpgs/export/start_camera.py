@@ -74,8 +74,8 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
     track: list[Camera] = []
     camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
     if capture is not None:
-        names = capture.val or capture.train
-        camera, track = capture.cameras[names[len(names) // 2]], camera_paths.training_path(capture, keys)
+        camera = capture.cameras[camera_paths.middle_view(capture)]
+        track = camera_paths.training_path(capture, keys)
     K = camera.K.tolist()
     dynamic = cloud.select(cloud.is_dynamic) if cloud.is_dynamic.any() else cloud
     config = clouds.scene.config

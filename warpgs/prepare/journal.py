@@ -215,17 +215,12 @@ def _remove(path: Path) -> None:
 
 def _remove_frames(folder: Path) -> None:
     """Removes the files of frames below a folder, and the folders that are empty then."""
-    for path in sorted(folder.rglob("*"), reverse=True):  # what a folder holds comes before the folder
+    for path in [*sorted(folder.rglob("*"), reverse=True), folder]:  # what a folder holds comes before the folder
         if path.is_dir() and not path.is_symlink():
-            _remove_if_empty(path)
+            if not any(path.iterdir()):
+                path.rmdir()
         elif path.is_dir() or FRAME.fullmatch(path.name):  # through a link, the new capture would read old frames
             path.unlink()
-    _remove_if_empty(folder)
-
-
-def _remove_if_empty(folder: Path) -> None:
-    if not any(folder.iterdir()):
-        folder.rmdir()
 
 
 def _flat(options: dict[str, Any]) -> dict[str, Any]:

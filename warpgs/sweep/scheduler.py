@@ -23,7 +23,7 @@ class Result(NamedTuple):
         name: Name of the cell.
         error: Why it failed, in one line; None on success.
         is_lost: Whether its node was lost, so that the error says nothing about the cell.
-        node: Id of the node that it ran on; empty if it is not known.
+        node: Id of the node that it ran on; empty if it is not known, as that of a lost one.
     """
 
     name: str
@@ -112,7 +112,7 @@ def run_jobs(
             results = pool.wait(POLL_SECONDS)
             events = [_judge(result, counts) for result in results]
             for result, event in zip(results, events, strict=True):
-                nodes.note(result.name, "" if result.is_lost else result.node, result.error)
+                nodes.note(result.name, result.node, result.error)
                 if event.state in ("finished", "failed"):
                     del waiting[result.name]
             for line in nodes.exclude(pool.nodes()):
