@@ -20,7 +20,7 @@ class Script:
         self.queue.append(job.name)
 
     def move(self, job, avoid):
-        raise AssertionError("there are no nodes to avoid")
+        raise AssertionError("a single node has no node to exclude")
 
     def nodes(self):
         return set()

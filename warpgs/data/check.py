@@ -252,10 +252,9 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
     if capture.extent <= MIN_EXTENT:
         yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
     if len(capture.points) == 0:
-        remedy = (
-            "warpgs prepare CAPTURE --add points makes some, in a copy of warpgs import if the layout is another one"
-        )
-        yield Finding("warning", "points", f"there are no sparse points: training starts from random ones; {remedy}")
+        remedy = "warpgs prepare CAPTURE --add points adds some (after warpgs import, if the layout needs it)"
+        text = f"there are no sparse points: Gaussians are initialized at random positions; {remedy}"
+        yield Finding("warning", "points", text)
         return
     names = _sampled(capture.train, samples)
     visible = [float(capture.cameras[n].project(capture.points)[3].float().mean()) for n in names]
