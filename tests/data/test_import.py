@@ -182,6 +182,13 @@ def test_folders_of_cameras_that_only_nerfds_has_tell_it_from_hypernerf(tmp_path
 
 
 @SEVERAL_SIZES
+def test_a_capture_that_prepare_wrote_before_it_named_layouts_is_no_guess(tmp_path, images, masks):
+    root = write_sizes(tmp_path / "toy", images, masks)
+    (root / "prepare.json").write_text("{}")
+    assert describe_layout(root) == recognize(root) == "nerfds"
+
+
+@SEVERAL_SIZES
 def test_a_layout_that_is_guessed_is_said_to_be_a_guess_until_it_is_named(tmp_path, images, masks):
     root = write_sizes(tmp_path / "toy", images, masks)
     name = recognize(root)

@@ -23,6 +23,9 @@ WORK, STATE, FINISHED = ".prepare", "state.json", "finished"
 """Folder in a capture for the intermediate files of ``warpgs prepare``, file in it with the steps done, and the last of
 these steps."""
 
+REPORT = "prepare.json"
+"""Report of ``warpgs prepare`` in a finished capture: options, result and seconds of every step, notes."""
+
 GIVEN, ESTIMATED = "given", "estimated"
 """What dataset.json says of the masks, see ``Capture.estimated_masks``."""
 

@@ -9,11 +9,8 @@ from errno import ENOSPC
 from pathlib import Path
 from typing import Any, TypeVar
 
-from warpgs.data.writer import FINISHED, STATE, WORK
+from warpgs.data.writer import FINISHED, REPORT, STATE, WORK
 from warpgs.files import read_json, write_json
-
-REPORT = "prepare.json"
-"""Report in the finished capture: options, result and seconds of every step, notes."""
 
 OUTPUTS = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "point_colors.npy", "scene.json", "metadata.json",

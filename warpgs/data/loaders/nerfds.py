@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from warpgs.data.writer import LAYOUT, REPORT
 from warpgs.files import read_json
 
 from .nerfies import NerfiesLoader
@@ -20,7 +21,7 @@ class NerfDsLoader(NerfiesLoader):
     default_factor = 1
 
     def recognizes(self, root: Path) -> bool:
-        """Whether images have the full size only, it is a release of NeRF-DS, or else masks have the full size.
+        """Whether images have the full size only, its origin has this layout, or else masks have the full size.
 
         HyperNeRF's captures have images of a quarter of the size and more; masks that were added to them in several
         sizes do not make them captures of NeRF-DS.
@@ -29,25 +30,27 @@ class NerfDsLoader(NerfiesLoader):
             return False
         if not (root / "rgb/2x").is_dir():
             return True
-        if (released := _released_as(root)) is not None:
-            return released == "nerfds"
+        if (origin := _origin(root)) is not None:
+            return origin == "nerfds"
         masks = _mask_sizes(root)
         return "1x" in masks and (masks == {"1x"} or not (root / "rgb/4x").is_dir())
 
 
 def is_ambiguous(root: Path) -> bool:
     """Whether a capture may be of NeRF-DS or of HyperNeRF, whose files have one layout: images and masks in several
-    sizes fit both, and it is not as either was released."""
+    sizes fit both, it is not as either was released, and ``warpgs prepare`` did not write it."""
     has_sizes = all((root / f"rgb/{size}").is_dir() for size in ("1x", "2x"))
-    return has_sizes and "1x" in _mask_sizes(root) and _released_as(root) is None
+    return has_sizes and "1x" in _mask_sizes(root) and _origin(root) is None
 
 
 def _mask_sizes(root: Path) -> set[str]:
     return {path.name for path in (root / "resized_mask").glob("*x")}
 
 
-def _released_as(root: Path) -> str | None:
-    """The dataset that has released captures like this one; None if neither has."""
+def _origin(root: Path) -> str | None:
+    """The layout by who made the capture: ``warpgs prepare``, NeRF-DS or HyperNeRF; None if nothing shows it."""
+    if (root / REPORT).is_file():  # version 0.2 of prepare named no layout in dataset.json
+        return LAYOUT
     if any((root / folder).is_dir() for folder in RELEASED_FOLDERS):
         return "nerfds"
     camera = next((root / "camera").glob("*.json"), None)
