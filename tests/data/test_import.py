@@ -193,12 +193,17 @@ def test_a_layout_that_is_guessed_is_said_to_be_a_guess_until_it_is_named(tmp_pa
     root = write_sizes(tmp_path / "toy", images, masks)
     name = recognize(root)
     other = "hypernerf" if name == "nerfds" else "nerfds"
-    assert describe_layout(root) == f"{name}, though its files fit {other}, too; " + (
-        "--dataset or layout in dataset.json says which"
-    )
+    assert describe_layout(root) == f"{name}, a guess that --dataset {other} overrides"
     assert describe_layout(root, other) == other
     captures.edit_json(root / "dataset.json", layout=other)
     assert describe_layout(root) == other
+
+
+def test_a_guess_reads_well_in_the_summary_of_an_import(tmp_path, capsys):
+    root = captures.write_capture(tmp_path / "toy", "nerfds")
+    (root / "rgb/2x").mkdir(exist_ok=True)
+    assert main(["import", str(root), str(tmp_path / "copy")]) == 0
+    assert "is read as nerfds, a guess that --dataset hypernerf overrides: 6 frames, " in capsys.readouterr().out
 
 
 def test_a_layout_without_masks_is_no_guess(tmp_path):

@@ -173,12 +173,12 @@ def recognize(root: Path) -> str:
 
 
 def describe_layout(root: Path, dataset: str | None = None) -> str:
-    """The layout that ``load_capture`` reads a capture in, for messages; says so if the files fit another one, too."""
+    """The layout that ``load_capture`` reads a capture in, for the middle of messages; says if it is a guess."""
     root = builtin_folder(root) if is_builtin(root) else root
     name, other = dataset or recognize(root), {"nerfds": "hypernerf", "hypernerf": "nerfds"}
     if dataset or _named_layout(root) or name not in other or not is_ambiguous(root):
         return name
-    return f"{name}, though its files fit {other[name]}, too; --dataset or layout in dataset.json says which"
+    return f"{name}, a guess that --dataset {other[name]} overrides"
 
 
 def _named_layout(root: Path) -> str | None:
