@@ -5,7 +5,7 @@ import torch
 
 from warpgs.cameras import Camera
 from warpgs.data import capture as capture_module
-from warpgs.data.capture import MIN_EXTENT, Capture, Frame
+from warpgs.data.capture import MIN_EXTENT, Capture, Frame, no_view
 
 
 def camera(x: float) -> Camera:
@@ -65,6 +65,13 @@ def test_the_cache_of_frames_has_a_maximum_size(monkeypatch):
 def test_an_unknown_frame_is_a_key_error():
     with pytest.raises(KeyError, match="nine"):
         make_capture()[0].frame("nine")
+
+
+def test_a_view_that_is_not_there_is_told_the_similar_one_or_the_first():
+    capture = make_capture()[0].split(["f1", "f2"], [])
+    assert no_view(capture, "F2") == "c has no view 'F2'; did you mean f2?"
+    assert no_view(capture, 7) == "c has no view 7; its first is f1"
+    assert no_view(capture.split(["f1"], ["f2"]), "middle") == "c has no view 'middle'; its first is f2"
 
 
 def test_the_extent_is_a_tenth_more_than_the_radius_of_the_training_cameras():

@@ -91,6 +91,7 @@ def test_a_single_keyframe_gives_a_constant_path(path):
         ({"view": "0", "position": [0, 0, 0], "target": [0, 0, 1], "time": 0}, "must have either a view"),
         ({"position": [0, 0, 0], "time": 0}, "must have either a view"),
         ({"view": "9", "time": 0}, "test has no view '9'; its first is 0$"),
+        ({"view": "00", "time": 0}, r"test has no view '00'; did you mean 0\?$"),
         ({"view": ["0"], "time": 0}, r"test has no view \['0'\]"),
         ({"view": "0"}, "time must be a number, got None"),
         ({"view": "0", "time": "0"}, "time must be a number, got '0'"),

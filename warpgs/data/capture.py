@@ -1,6 +1,7 @@
 """A capture: posed images of a dynamic scene, read frame by frame."""
 
 import copy
+import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.errors import suggestion
 
 from .read_ahead import ReadAhead
 
@@ -215,3 +217,10 @@ class Capture:
     def frames(self, names: Sequence[str]) -> Iterator[Frame]:
         """Frames one after the other, read ahead by threads; raises as ``frame``."""
         return ReadAhead(self.frame).each(names)
+
+
+def no_view(capture: Capture, name: object) -> str:
+    """Message that a capture has no view ``name``, and the similar one or its first."""
+    first = (capture.val or capture.train)[0]
+    close = suggestion(str(name), capture.cameras) or f"; its first is {first}"
+    return f"{capture.name} has no view {reprlib.repr(name)}{close}"

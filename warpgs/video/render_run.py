@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture
-from warpgs.errors import suggestion
+from warpgs.data.capture import Capture, no_view
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
@@ -141,8 +140,7 @@ def _start_view(options: Render, capture: Capture) -> Camera:
     """The camera from which the fixed and spiral paths start, and the bullet path with --view."""
     name = options.view or camera_paths.middle_view(capture)
     if name not in capture.cameras:
-        close = suggestion(name, capture.cameras) or f"; its first is {(capture.val or capture.train)[0]!r}"
-        raise ValueError(f"{capture.name} has no view {name!r}{close}")
+        raise ValueError(no_view(capture, name))
     return capture.cameras[name]
 
 
