@@ -83,3 +83,17 @@ def test_a_damaged_checkpoint_is_named_and_training_continues_from_another(finis
     with pytest.raises(ValueError, match=f"{newest} is damaged") as raised:
         Run.open(run, "cpu").trained_scene()
     assert str(raised.value).endswith(f"{run} continues from the newest intact one") == bool(others)
+
+
+@pytest.mark.parametrize("command", ["render", "eval"])
+def test_a_command_says_how_to_use_the_checkpoint_before_a_damaged_one(finished_run, tmp_path, capsys, command):
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    *_, before, newest = checkpoint.list_checkpoints(run)
+    newest.write_bytes(newest.read_bytes()[:1000])
+    assert main([command, str(run), "--device", "cpu", "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert f"; move it elsewhere to use {before.name}, or " in error
+    assert error.count("\n") == 1
+    newest.rename(tmp_path / newest.name)
+    assert Run.open(run, "cpu").newest_checkpoint() == before
+    Run.open(run, "cpu").trained_scene()

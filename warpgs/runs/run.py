@@ -159,7 +159,8 @@ class Run:
             if len(saved) == 1:
                 raise
             resume = command("train", "--resume", self.folder)
-            raise ValueError(f"{error}; {resume} continues from the newest intact one") from error
+            advice = f"move it elsewhere to use {saved[-2].name}, or {resume} continues from the newest intact one"
+            raise ValueError(f"{error}; {advice}") from error
         if limit_of_multiprocessors():  # which may break half precision; PSNR is the same to 0.001 dB
             in_single_precision(scene)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
