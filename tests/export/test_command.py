@@ -12,6 +12,7 @@ from tests.export import scenes
 from tests.export.pages import read_page
 from tests.export.test_gltf import decoded as gltf_of
 from warpgs.cli import main
+from warpgs.data.capture import Capture
 from warpgs.data.loaders import load_capture
 from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
@@ -155,6 +156,28 @@ def test_a_page_starts_at_the_middle_view_and_follows_the_training_cameras(run, 
     assert start.viewmat == capture.cameras[capture.val[len(capture.val) // 2]].viewmat.tolist()
     assert len(start.track) == 4
     assert start.title == "the run"
+
+
+@pytest.mark.parametrize(
+    ("num_static", "num_dynamic", "away", "chosen"),
+    [
+        (40, 20, False, slice(40, None)),
+        (40, 0, False, slice(None)),
+        (0, 20, False, slice(None)),
+        (40, 20, True, slice(0, 40)),
+    ],
+    ids=["what moves", "static alone", "dynamic alone", "what moves is out of view"],
+)
+def test_a_page_orbits_what_moves_in_its_first_view_else_what_is_there(num_static, num_dynamic, away, chosen):
+    clouds = scenes.clouds(num_static, num_dynamic)
+    if away:
+        clouds.scene.scene.dynamic.means.add_(torch.tensor([0.0, 0.0, -20.0]))
+    camera = dataclasses.replace(scenes.camera(), time=0.5)
+    capture = Capture("test", {"0": camera}, ["0"], [], torch.zeros(0, 3), None, lambda name: None)
+    _, _, depth, inside = camera.project(torch.from_numpy(clouds.at(0.5).means)[chosen])
+    assert inside.any()
+    pivot = start_view(clouds, capture, keys=2, seconds=1.0).pivot
+    assert pivot == pytest.approx(float(depth[inside].median()))
 
 
 def test_a_page_shows_images_as_the_config_says(run):

@@ -30,7 +30,8 @@ class StartView:
         size: (width, height) of the image that ``intrinsics`` refer to [px].
         intrinsics: fx, fy, cx, cy [px].
         viewmat: [4, 4] world to camera, of the first view.
-        pivot: Distance from the camera to the point that it orbits [scene units].
+        pivot: Distance from the camera to the point that it orbits: what moves in its image, else all in it [scene
+            units].
         track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
         seconds: Duration of the scene [s].
         antialias, max_alpha: As in ``RenderSettings``.
@@ -77,14 +78,14 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         camera = capture.cameras[camera_paths.middle_view(capture)]
         track = camera_paths.training_path(capture, keys)
     K = camera.K.tolist()
-    dynamic = cloud.select(cloud.is_dynamic) if cloud.is_dynamic.any() else cloud
+    dynamic = cloud.select(cloud.is_dynamic)
     config = clouds.scene.config
     return StartView(
         title=config.out.resolve().name if config.out else "scene",
         size=camera.size,
         intrinsics=(K[0][0], K[1][1], K[0][2], K[1][2]),
         viewmat=camera.viewmat.tolist(),
-        pivot=camera_paths.focus(camera, _means(dynamic)),
+        pivot=camera_paths.focus(camera, _means(dynamic), _means(cloud)),
         track=[c.viewmat.tolist() for c in track],
         seconds=seconds,
         antialias=config.antialias,
