@@ -1,6 +1,7 @@
 """``warpgs import``: the copy in the layout of warpgs is the same capture."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from tests.data import captures, layouts
 from warpgs.cli import main
+from warpgs.data import loaders
 from warpgs.data.capture import Capture
 from warpgs.data.import_capture import import_capture, time_steps
 from warpgs.data.loaders import describe_layout, load_capture, recognize
@@ -204,6 +206,35 @@ def test_a_guess_reads_well_in_the_summary_of_an_import(tmp_path, capsys):
     (root / "rgb/2x").mkdir(exist_ok=True)
     assert main(["import", str(root), str(tmp_path / "copy")]) == 0
     assert "is read as nerfds, a guess that --dataset hypernerf overrides: 6 frames, " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("images", "masks", "layout"),
+    [
+        (["1x", "4x"], ["1x"], "nerfds"),
+        (["1x", "4x"], ["1x", "2x"], "hypernerf"),
+        (["1x"], ["2x"], "hypernerf"),
+        (["1x"], ["1x", "2x"], "nerfds"),
+    ],
+    ids=["full size only", "full size and others", "others only", "no quarter of the size"],
+)
+def test_the_sizes_of_masks_decide_a_layout_that_nothing_else_does(tmp_path, images, masks, layout):
+    assert recognize(write_sizes(tmp_path / "toy", images, masks)) == layout
+
+
+def test_a_camera_that_is_no_json_does_not_keep_a_layout_from_being_recognized(tmp_path):
+    root = write_sizes(tmp_path / "toy", ["1x", "4x"], ["1x"])
+    for path in (root / "camera").iterdir():
+        path.write_text("{")
+    assert describe_layout(root) == "nerfds, a guess that --dataset hypernerf overrides"
+
+
+def test_the_layout_of_a_built_in_capture_is_that_of_its_folder(tmp_path, monkeypatch):
+    root = write_sizes(tmp_path / "toy", ["1x", "4x"], ["1x"])
+    monkeypatch.setattr(loaders, "builtin_folder", lambda name: root)
+    assert describe_layout(Path("builtin:studio")) == "nerfds, a guess that --dataset hypernerf overrides"
+    captures.edit_json(root / "dataset.json", layout="hypernerf")
+    assert describe_layout(Path("builtin:studio")) == "hypernerf"
 
 
 def test_a_layout_without_masks_is_no_guess(tmp_path):

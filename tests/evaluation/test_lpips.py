@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -218,6 +219,13 @@ def test_a_folder_that_does_not_exist_is_named(tmp_path):
     wanted = f"{tmp_path}/nothing does not hold the weights of LPIPS .*: it does not exist"
     with pytest.raises(ValueError, match=wanted):
         lpips.locate(tmp_path / "nothing", "vgg")
+
+
+def test_a_folder_that_is_misspelt_is_told_the_similar_one(tmp_path):
+    (tmp_path / "weights").mkdir()
+    wanted = rf"it does not exist; did you mean {re.escape(str(tmp_path / 'weights'))}\?$"
+    with pytest.raises(ValueError, match=wanted):
+        lpips.locate(tmp_path / "wieghts", "vgg")
 
 
 @pytest.mark.parametrize("name", [FILES["squeeze"], "lpips_v0.1_squeeze_lin.pth"])

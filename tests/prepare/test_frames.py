@@ -96,6 +96,12 @@ def write_heic(folder):
     (folder / "IMG_0001.HEIC").touch()
 
 
+def write_album(folder, images):
+    write_heic(folder)
+    (folder / "b.dng").touch()
+    write_folder(folder / "shots", images)
+
+
 UNSUITABLE = {
     "text": (lambda path, images: path.write_text("hello" * 100), r"source\.mp4 is not a video"),
     "missing": (lambda path, images: None, r"source\.mp4 is missing"),
@@ -104,6 +110,11 @@ UNSUITABLE = {
     "one frame": (lambda path, images: write_video(path, images[:1]), "gives 1 frame, at least"),
     "empty folder": (lambda path, images: path.mkdir(), r"holds no \.png, .* images$"),
     "images of a phone": (lambda path, images: write_heic(path), r"images: convert its \.HEIC files to PNG or JPEG$"),
+    "two suffixes": (
+        lambda path, images: write_album(path, []),
+        r"images: convert its \.HEIC, \.dng files to PNG or JPEG$",
+    ),
+    "images of a phone and a folder": (write_album, r"images, but .*source\.mp4.shots does$"),
     "hidden images": (lambda path, images: write_folder(path / ".thumbs", images), r"holds no \.png, .* images$"),
     "folder of a folder": (lambda path, images: write_folder(path / "shots", images), r"but .*source\.mp4.shots does$"),
 }

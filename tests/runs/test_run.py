@@ -151,6 +151,12 @@ def test_the_field_that_a_misspelt_one_may_mean_is_named(run):
         read_config(run)
 
 
+def test_a_field_that_is_there_is_not_meant_by_a_misspelt_one(run):
+    edit(run, lambda values: values.update(itrations=1))
+    with pytest.raises(ValueError, match=r"another version: itrations$"):
+        read_config(run)
+
+
 @pytest.mark.parametrize("part", [None, "model", "schedule"])
 def test_an_unknown_field_is_refused_by_its_name(run, part):
     edit(run, lambda values: (values if part is None else values[part]).update(future=1))
