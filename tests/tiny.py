@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
-from warpgs.data.loaders import load_capture
+from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
@@ -77,7 +77,7 @@ def write(folder: Path) -> Path:
 
 
 def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
-    return Trainer(config, load_capture(data), run)
+    return Trainer(config, load_with(data, None, LoadOptions(depth=config.depth)), run)
 
 
 def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:

@@ -11,7 +11,7 @@ import torch
 from tests import tiny
 from tests.data import captures, layouts
 from warpgs.config import TrainConfig
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Frame
 from warpgs.data.loaders import load_capture
 from warpgs.runs.captures import open_capture
 from warpgs.training.initialize import initial_scene
@@ -102,3 +102,28 @@ def test_training_runs_through_all_stages(layout, capture, tmp_path):
     trainer = Trainer(config, open_capture(config), tmp_path / "run")
     assert trainer.num_aligned == trainer.num_with_objects == 0
     assert tiny.train(trainer)
+
+
+@pytest.mark.parametrize("part", ["all frames", "the last frame"])
+def test_a_trainer_refuses_depth_that_its_config_excludes(part, tmp_path):
+    capture = load_capture(tiny.write(tmp_path / "capture"))
+    if part == "the last frame":
+        read, last = capture.read, capture.train[-1]
+
+        def read_partly(name: str) -> Frame:
+            frame = read(name)
+            return frame if name == last else dataclasses.replace(frame, inverse_depth=None)
+
+        capture = dataclasses.replace(capture, read=read_partly)
+    config = dataclasses.replace(tiny.CONFIG, depth=False)
+    remedy = r"was read with depth, but the config is without .* LoadOptions\(depth=False\), as open_capture\(config\)"
+    with pytest.raises(ValueError, match=remedy) as raised:
+        Trainer(config, capture, tmp_path / "run")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_trainer_without_depth_takes_what_has_none(tmp_path):
+    data, config = tiny.write(tmp_path / "capture"), dataclasses.replace(tiny.CONFIG, depth=False)
+    assert tiny.trainer(data, tmp_path / "run", config).num_aligned == 0
+    shutil.rmtree(data / "depth")
+    assert Trainer(config, load_capture(data), tmp_path / "run").num_aligned == 0

@@ -13,7 +13,7 @@ from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
-from warpgs.runs.captures import known_background, require_same_times
+from warpgs.runs.captures import known_background, require_depth_as_asked, require_same_times
 from warpgs.runs.trained import TrainedScene
 
 from . import initialize, ranks
@@ -69,10 +69,12 @@ class Trainer:
         callbacks: Called after regular checks and before checkpoints, off the clock.
 
     Raises:
-        ValueError: If a training frame has no mask or is damaged, or an option has an unknown value.
+        ValueError: If a training frame has no mask, is damaged, or has depth that the config excludes, or an option has
+            an unknown value.
     """
 
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
+        require_depth_as_asked(config, capture)  # its points may come from depth, too
         self.config, self.run = config, run
         self.capture = capture.assuming(config.assume).over(known_background(config, capture))
         self.device = torch.device(config.device or "cpu")
