@@ -141,6 +141,15 @@ def test_a_folder_of_captures_stands_for_the_captures_in_it(tmp_path):
     assert len(lines) == 1
 
 
+def test_a_folder_of_captures_also_stands_for_those_that_were_trained_and_are_gone(tmp_path):
+    (tmp_path / "cup").mkdir()
+    (tmp_path / "cup/dataset.json").touch()
+    known = ["builtin:room", str(tmp_path / "other/as"), str(tmp_path / "cup/bell"), str(tmp_path / "bell")]
+    expected = {name: str(tmp_path / name) for name in ("bell", "cup")}
+    assert list(find_scenes([str(tmp_path)], known=known).items()) == list(expected.items())
+    assert find_scenes([str(tmp_path / "cup")], known=known) == {"cup": expected["cup"]}
+
+
 @pytest.mark.parametrize("write", [layouts.write_colmap, layouts.write_nerfstudio, layouts.write_llff])
 def test_a_folder_of_captures_may_have_any_layout(write, tmp_path):
     for name in ("bell", "as"):

@@ -331,16 +331,32 @@ def test_a_finished_sweep_does_not_need_its_captures(sweep, tmp_path, capsys, op
     assert "does not exist" not in printed
 
 
-def test_tables_alone_do_not_need_the_folder_of_captures(sweep, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("gone", "emptied"),
+    [
+        ("captures", []),
+        ("captures", ["captures"]),
+        ("captures", ["captures/bell", "captures/notes"]),
+        ("captures/bell", []),
+        ("captures/bell", ["captures/bell"]),
+    ],
+)
+def test_tables_alone_do_not_need_the_folder_of_captures(sweep, tmp_path, capsys, gone, emptied):
     for name in ("bell", "cup"):
         (tmp_path / "captures" / name).mkdir(parents=True)
         (tmp_path / "captures" / name / "dataset.json").touch()
     data = ["--data", str(tmp_path / "captures")]
     assert sweep(*data)[0] == 0
     before = (tmp_path / "out/table.md").read_text()
-    shutil.rmtree(tmp_path / "captures")
+    shutil.rmtree(tmp_path / gone)
+    for path in emptied:
+        (tmp_path / path).mkdir(parents=True)
+    capsys.readouterr()
     assert sweep(*data, "--tables-only") == sweep(*data) == (0, [])
     assert (tmp_path / "out/table.md").read_text() == before
+    skipped = [line for line in capsys.readouterr().out.splitlines() if "skipped" in line]
+    assert all(line.endswith("captures: notes") for line in skipped)
+    assert bool(skipped) == ("captures/notes" in emptied)
 
 
 def test_cells_whose_capture_was_deleted_fail_and_keep_what_was_measured(sweep, tmp_path, capsys):

@@ -68,7 +68,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print, known
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
         log: Receives a warning for each folder of captures with subfolders that are not captures.
-        known: Captures that were trained before; a folder that does not exist any more stands for those that it had.
+        known: Captures that were trained before: a folder also stands for those of them that were in it.
 
     Raises:
         ValueError: If there is none, or a name is wrong or given twice; the message names it.
@@ -95,22 +95,27 @@ def _named(text: str, log: Callable[[str], object], known: Iterable[str]) -> Ite
         yield name, rest if is_builtin(rest) else str(Path(rest).resolve())
     else:
         root = Path(text).resolve()
-        gone = [] if os.path.exists(root) else [path for path in map(Path, known) if path.parent == root]
-        yield from ((path.name, str(path)) for path in _captures_in(root, log) or gone or [root])
+        yield from ((path.name, str(path)) for path in _captures_in(root, log, known) or [root])
 
 
-def _captures_in(root: Path, log: Callable[[str], object]) -> list[Path]:
-    """The captures in a folder, by name; none if it is a capture itself. Says which other folders are in it."""
+def _captures_in(root: Path, log: Callable[[str], object], known: Iterable[str]) -> list[Path]:
+    """The captures in a folder, and those known that were there, by name; none if it is a capture itself.
+
+    Says which other folders are in it.
+    """
     from warpgs.data.loaders import is_capture  # imports torch
 
-    if not os.access(root, os.R_OK | os.X_OK) or not root.is_dir() or is_capture(root):
+    captures = {path for path in map(Path, known) if path.parent == root}
+    if not os.access(root, os.R_OK | os.X_OK) or not root.is_dir():
+        return sorted(captures)
+    if is_capture(root):
         return []
     folders = [path for path in sorted(root.iterdir()) if os.path.isdir(path)]
-    found = [path for path in folders if os.access(path, os.R_OK | os.X_OK) and is_capture(path)]
-    others = [path.name for path in folders if path not in found and not path.name.startswith(".")]
-    if found and others:
+    captures |= {path for path in folders if os.access(path, os.R_OK | os.X_OK) and is_capture(path)}
+    others = [path.name for path in folders if path not in captures and not path.name.startswith(".")]
+    if captures and others:
         log(visible(f"warning: {root}: skipped folders that are not captures: {', '.join(others)}"))
-    return found
+    return sorted(captures)
 
 
 def find_problems(scenes: Mapping[str, str]) -> dict[str, str]:
