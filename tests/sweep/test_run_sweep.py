@@ -313,6 +313,15 @@ def test_a_missing_capture_fails_only_its_own_cells_and_is_named_before_the_firs
     assert sweep(*data) == (0, ["az-full-seed0", "az-plain-seed0", "az-full-seed1", "az-plain-seed1"])
 
 
+def test_tables_alone_do_not_warn_of_missing_captures(sweep, tmp_path, capsys):
+    data = ["--data", str(tmp_path / "as"), str(tmp_path / "az")]
+    assert sweep(*data)[0] == 1
+    shutil.rmtree(tmp_path / "as")
+    capsys.readouterr()
+    assert sweep(*data, "--seeds", "3", "--tables-only") == (1, [])
+    assert "warning" not in "".join(capsys.readouterr())
+
+
 def test_a_sweep_of_missing_captures_alone_is_refused_in_one_line(sweep, tmp_path, capsys):
     for options in ([], ["--dry-run"]):
         assert sweep("--data", str(tmp_path / "cup"), str(tmp_path / "bell"), *options) == (2, [])

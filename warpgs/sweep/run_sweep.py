@@ -93,8 +93,10 @@ def _problems(options: Sweep, board: Board, scenes: Mapping[str, str]) -> dict[s
     Raises:
         ValueError: If there is nothing else to do.
     """
+    if options.tables_only:
+        return {}  # tables need no captures
     problems = find_problems(scenes)
-    if len(problems) == len(scenes) and not board.metrics and not options.tables_only:
+    if len(problems) == len(scenes) and not board.metrics:
         raise ValueError(next(iter(problems.values())))
     needed = {cell.scene for cell in board.unfinished()}
     return {scene: problem for scene, problem in problems.items() if scene in needed}
