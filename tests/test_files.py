@@ -12,6 +12,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -145,6 +146,42 @@ def test_what_cannot_be_written_names_the_folder_and_not_the_temporary_one(tmp_p
     with pytest.raises(OSError, match=re.escape(f"{tmp_path}/capture{message}")) as raised:
         make()
     assert ".capture-" not in str(raised.value)
+
+
+def no_space_for_a_file(folder):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "replace", full_disk)
+        write_bytes(folder / "rgb/left_000000.png", [b"x"])
+
+
+def error_of_a_library(folder):
+    raise av.error.PermissionError(errno.EACCES, "denied", str(folder / "video.mp4"))  # takes no message alone
+
+
+@pytest.mark.parametrize(
+    ("write", "kind", "number"),
+    [
+        (unwritable_file, FileExistsError, errno.EEXIST),
+        (unwritable_folder, FileExistsError, errno.EEXIST),
+        (full_target, OSError, errno.ENOTEMPTY),
+        (no_space_for_a_file, OSError, errno.ENOSPC),
+        (error_of_a_library, PermissionError, errno.EACCES),
+    ],
+)
+def test_what_cannot_be_written_keeps_the_class_and_the_number_of_the_error(tmp_path, write, kind, number):
+    folder = tmp_path / "capture"
+    with pytest.raises(kind, match=re.escape(str(folder))) as raised, complete_or_absent(folder) as partial:
+        write(partial)
+    assert (raised.type, raised.value.errno) == (kind, number)
+    assert ".capture-" not in str(raised.value)
+
+
+def test_a_folder_that_cannot_be_made_keeps_the_class_and_the_number_of_the_error(tmp_path):
+    (tmp_path / "file").touch()
+    message = re.escape(f"capture cannot be kept in {tmp_path / 'file'}: File exists")
+    with pytest.raises(FileExistsError, match=f"^{message}$") as raised, complete_or_absent(tmp_path / "file/capture"):
+        pass
+    assert raised.value.errno == errno.EEXIST
 
 
 def test_an_error_of_another_file_is_kept(tmp_path):

@@ -60,12 +60,21 @@ def partial_path(path: Path) -> Path:
     return path.with_name(path.name + ".partial")
 
 
+def _reworded(error: OSError, message: str) -> OSError:
+    """An error of the same number and built-in class with another message."""
+    # The constructors of other classes, such as PyAV's, may take something else than a message.
+    built_in = next(kind for kind in type(error).__mro__ if kind.__module__ == "builtins")
+    reworded: OSError = built_in(message)
+    reworded.errno = error.errno
+    return reworded
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary path to write to: renamed to ``path`` on success, removed after any error or Ctrl-C.
 
     Raises:
-        OSError: If the file cannot be written; the message names ``path``.
+        OSError: If the file cannot be written; the message names ``path``. Its class and errno are those of the cause.
     """
     partial = partial_path(path)
     try:
@@ -73,7 +82,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         yield partial
         os.replace(partial, path)
     except OSError as error:
-        raise OSError(f"{path} could not be written: {error.strerror or error}") from error
+        raise _reworded(error, f"{path} could not be written: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -89,14 +98,14 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
 
     Raises:
         OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent, as do
-            those of errors of files in it, instead of the temporary folder.
+            those of errors of files in it, instead of the temporary folder. Its class and errno are those of the cause.
     """
     _remove_abandoned(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
     except OSError as error:
-        raise OSError(f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
+        raise _reworded(error, f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
     partial = beside / folder.name  # only its owner may open ``beside``
     try:
         with _locked(beside):
@@ -112,7 +121,7 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
             raise
         # The temporary name would make equal errors of two attempts differ, and nobody finds that folder afterwards.
         message = str(error).replace(str(partial), str(folder)).replace(str(beside), str(folder))
-        raise OSError(message) from error
+        raise _reworded(error, message) from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 
