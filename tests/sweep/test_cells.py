@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import shlex
 from pathlib import Path
@@ -22,6 +23,7 @@ from warpgs.sweep.cells import (
     is_evaluated,
     parse_evaluation,
     plan_cells,
+    trained_captures,
 )
 from warpgs.sweep.spec import SweepSpec, Variant, read_spec
 from warpgs.training.command import parse
@@ -210,6 +212,33 @@ def test_a_capture_that_cannot_be_read_has_a_problem_and_others_do_not(tmp_path,
     scenes = {name: str(tmp_path / name) for name in ("good", "closed")} | {"room": "builtin:room"}
     closed = tmp_path / "closed/dataset.json"
     assert find_problems(scenes) == {"closed": f"[Errno 13] Permission denied: '{closed}'"}
+
+
+@pytest.mark.parametrize("denied", [os.R_OK, os.X_OK])
+def test_a_folder_that_may_not_be_read_stands_for_itself_and_is_skipped_in_others(tmp_path, monkeypatch, denied):
+    for name in ("good", "closed"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "dataset.json").touch()
+    exists = Path.exists
+
+    def refuse(path):
+        if "closed" in path.parts:
+            raise PermissionError(f"[Errno 13] Permission denied: '{path}'")
+        return exists(path)
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    monkeypatch.setattr(os, "access", lambda path, mode: not ("closed" in Path(path).parts and mode & denied))
+    lines, closed = [], tmp_path / "closed"
+    assert find_scenes([str(tmp_path)], lines.append) == {"good": str(tmp_path / "good")}
+    assert lines == [f"warning: {tmp_path}: skipped folders that are not captures: closed"]
+    assert find_scenes([str(closed)]) == {"closed": str(closed)}
+    assert find_scenes([str(closed)], known=[str(closed / "as")]) == {"as": str(closed / "as")}
+
+
+def test_the_captures_of_cells_are_what_their_commands_train_on_each_once(tmp_path):
+    captures = {"my cup": str(tmp_path / "my cup"), "room": "builtin:room", "as": str(tmp_path / "as")}
+    cells = plan(spec(Variant("data", "", {}), Variant("b", "", {"app": False}), seeds=(0, 1)), captures, tmp_path)
+    assert trained_captures([*(cell.command for cell in cells), "warpgs train --preset quick"]) == [*captures.values()]
 
 
 @pytest.mark.parametrize("path", ["scenes", "scenes/b"])

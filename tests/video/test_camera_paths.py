@@ -249,6 +249,11 @@ def test_a_training_camera_that_turns_far_between_frames_jumps():
     assert [paths.jumps(ring(*args)) for args in ((10, 5), (10, 90), (2, 30))] == [False, True, False]
 
 
+@pytest.mark.parametrize(("val", "expected"), [("", "2"), ("5", "5"), ("56", "6"), ("567", "6")])
+def test_the_middle_view_is_one_to_evaluate_on_unless_there_is_none(val, expected):
+    assert paths.middle_view(ring(8, 5).split("01234", val)) == expected
+
+
 def test_the_replay_follows_the_training_camera_and_stays_at_the_middle_view_if_it_jumps():
     moving, jumping = ring(10, 5), ring(10, 90)
     for a, b in zip(paths.replay(moving, 7), paths.training_path(moving, 7), strict=True):
