@@ -104,11 +104,11 @@ class Evaluation:
         means = {f.name: _mean([getattr(v, f.name) for v in self.views]) for f in fields(ViewMetrics)[2:]}
         return {
             **means,
-            "flicker": self.flicker,
-            "fps": self.fps,
             "lpips_net": self.lpips_net,
             "frames": self.frames,
             "num_views": len(self.views),
+            "flicker": self.flicker,
+            "fps": self.fps,
         }
 
 
