@@ -63,8 +63,8 @@ def partial_path(path: Path) -> Path:
 def _reworded(error: OSError, message: str) -> OSError:
     """An error of the same number and built-in class with another message."""
     # The constructors of other classes, such as PyAV's, may take something else than a message.
-    built_in = next(kind for kind in type(error).__mro__ if kind.__module__ == "builtins")
-    reworded: OSError = built_in(message)
+    classes = (kind for kind in type(error).__mro__ if kind.__module__ == "builtins" and issubclass(kind, OSError))
+    reworded: OSError = next(classes)(message)
     reworded.errno = error.errno
     return reworded
 

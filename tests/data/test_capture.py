@@ -1,11 +1,13 @@
 """A capture reads frames on request and caches the last ones."""
 
+import dataclasses
+
 import pytest
 import torch
 
 from warpgs.cameras import Camera
 from warpgs.data import capture as capture_module
-from warpgs.data.capture import MIN_EXTENT, Capture, Frame, no_view
+from warpgs.data.capture import MIN_EXTENT, Capture, Frame, missing_view
 
 
 def camera(x: float) -> Camera:
@@ -69,9 +71,17 @@ def test_an_unknown_frame_is_a_key_error():
 
 def test_a_view_that_is_not_there_is_told_the_similar_one_or_the_first():
     capture = make_capture()[0].split(["f1", "f2"], [])
-    assert no_view(capture, "F2") == "c has no view 'F2'; did you mean f2?"
-    assert no_view(capture, 7) == "c has no view 7; its first is f1"
-    assert no_view(capture.split(["f1"], ["f2"]), "middle") == "c has no view 'middle'; its first is f2"
+    assert missing_view(capture, "F2") == "c has no view 'F2'; did you mean 'f2'?"
+    assert missing_view(capture, 7) == "c has no view 7; its first is 'f1'"
+    assert missing_view(capture.split(["f1"], ["f2"]), "middle") == "c has no view 'middle'; its first is 'f2'"
+
+
+def test_a_number_or_a_long_name_that_is_no_view_is_shown_as_given():
+    capture = make_capture()[0]
+    capture = dataclasses.replace(capture, cameras={"10": capture.cameras["f1"]}, train=["10"], val=[])
+    assert missing_view(capture, 10) == "c has no view 10; did you mean '10'?"
+    name = "shots/left_camera_of_the_pair/000001.png"
+    assert repr(name) in missing_view(capture, name)
 
 
 def test_the_extent_is_a_tenth_more_than_the_radius_of_the_training_cameras():

@@ -184,7 +184,7 @@ def test_folders_of_cameras_that_only_nerfds_has_tell_it_from_hypernerf(tmp_path
 
 
 @SEVERAL_SIZES
-def test_a_capture_that_prepare_wrote_before_it_named_layouts_is_no_guess(tmp_path, images, masks):
+def test_a_capture_that_prepare_wrote_before_it_named_layouts_is_not_a_guess(tmp_path, images, masks):
     root = write_sizes(tmp_path / "toy", images, masks)
     (root / "prepare.json").write_text("{}")
     assert describe_layout(root) == recognize(root) == "nerfds"
@@ -222,7 +222,7 @@ def test_the_sizes_of_masks_decide_a_layout_that_nothing_else_does(tmp_path, ima
     assert recognize(write_sizes(tmp_path / "toy", images, masks)) == layout
 
 
-def test_a_camera_that_is_no_json_does_not_keep_a_layout_from_being_recognized(tmp_path):
+def test_a_camera_that_is_not_json_does_not_keep_a_layout_from_being_recognized(tmp_path):
     root = write_sizes(tmp_path / "toy", ["1x", "4x"], ["1x"])
     for path in (root / "camera").iterdir():
         path.write_text("{")
@@ -237,7 +237,7 @@ def test_the_layout_of_a_built_in_capture_is_that_of_its_folder(tmp_path, monkey
     assert describe_layout(Path("builtin:studio")) == "hypernerf"
 
 
-def test_a_layout_without_masks_is_no_guess(tmp_path):
+def test_a_layout_without_masks_is_not_a_guess(tmp_path):
     assert describe_layout(write_sizes(tmp_path / "toy", ["1x", "4x"], [])) == "hypernerf"
 
 

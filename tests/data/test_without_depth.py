@@ -104,8 +104,9 @@ def test_training_runs_through_all_stages(layout, capture, tmp_path):
     assert tiny.train(trainer)
 
 
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 @pytest.mark.parametrize("part", ["all frames", "the last frame"])
-def test_a_trainer_refuses_depth_that_its_config_excludes(part, tmp_path):
+def test_a_trainer_refuses_depth_that_its_config_excludes(part, resident_bytes, tmp_path):
     capture = load_capture(tiny.write(tmp_path / "capture"))
     if part == "the last frame":
         read, last = capture.read, capture.train[-1]
@@ -115,8 +116,8 @@ def test_a_trainer_refuses_depth_that_its_config_excludes(part, tmp_path):
             return frame if name == last else dataclasses.replace(frame, inverse_depth=None)
 
         capture = dataclasses.replace(capture, read=read_partly)
-    config = dataclasses.replace(tiny.CONFIG, depth=False)
-    remedy = r"was read with depth, but the config is without .* LoadOptions\(depth=False\), as open_capture\(config\)"
+    config = dataclasses.replace(tiny.CONFIG, depth=False, resident_bytes=resident_bytes)
+    remedy = r"was read with depth, but the config is without \(depth=False\); .* open_capture\(config\)"
     with pytest.raises(ValueError, match=remedy) as raised:
         Trainer(config, capture, tmp_path / "run")
     assert "\n" not in str(raised.value)

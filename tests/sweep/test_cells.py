@@ -150,6 +150,17 @@ def test_a_folder_of_captures_also_stands_for_those_that_were_trained_and_are_go
     expected = {name: str(tmp_path / name) for name in ("bell", "cup")}
     assert list(find_scenes([str(tmp_path)], known=known).items()) == list(expected.items())
     assert find_scenes([str(tmp_path / "cup")], known=known) == {"cup": expected["cup"]}
+    assert find_scenes([f"horn={tmp_path}/bell", str(tmp_path)], known=known) == {
+        "horn": expected["bell"],
+        "cup": expected["cup"],
+    }
+
+
+def test_a_folder_without_captures_has_no_skipped_folders(tmp_path):
+    (tmp_path / "notes").mkdir()
+    lines = []
+    assert find_scenes([str(tmp_path)], lines.append) == {tmp_path.name: str(tmp_path)}
+    assert not lines
 
 
 @pytest.mark.parametrize("write", [layouts.write_colmap, layouts.write_nerfstudio, layouts.write_llff])

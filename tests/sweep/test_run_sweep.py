@@ -368,6 +368,18 @@ def test_tables_alone_do_not_need_the_folder_of_captures(sweep, tmp_path, capsys
     assert bool(skipped) == ("captures/notes" in emptied)
 
 
+def test_a_capture_that_was_removed_before_a_training_on_it_finished_is_forgotten(sweep, tmp_path, capsys):
+    for name in ("bad", "cup"):
+        (tmp_path / "captures" / name).mkdir(parents=True)
+        (tmp_path / "captures" / name / "dataset.json").touch()
+    data = ["--data", str(tmp_path / "captures")]
+    assert sweep(*data, by=lambda job: "broken" if job.name.startswith("bad") else sweep.finish(job))[0] == 1
+    shutil.rmtree(tmp_path / "captures/bad")
+    capsys.readouterr()
+    assert sweep(*data) == (0, [])
+    assert "bad" not in capsys.readouterr().out
+
+
 def test_cells_whose_capture_was_deleted_fail_and_keep_what_was_measured(sweep, tmp_path, capsys):
     sweep()
     shutil.rmtree(tmp_path / "as")

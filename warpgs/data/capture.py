@@ -219,8 +219,9 @@ class Capture:
         return ReadAhead(self.frame).each(names)
 
 
-def no_view(capture: Capture, name: object) -> str:
+def missing_view(capture: Capture, name: object) -> str:
     """Message that a capture has no view ``name``, and the similar one or its first."""
     first = (capture.val or capture.train)[0]
-    close = suggestion(str(name), capture.cameras) or f"; its first is {first}"
-    return f"{capture.name} has no view {reprlib.repr(name)}{close}"
+    close = suggestion(str(name), capture.cameras, repr) or f"; its first is {first!r}"
+    given = repr(name) if isinstance(name, str) else reprlib.repr(name)
+    return f"{capture.name} has no view {given}{close}"

@@ -30,8 +30,8 @@ class StartView:
         size: (width, height) of the image that ``intrinsics`` refer to [px].
         intrinsics: fx, fy, cx, cy [px].
         viewmat: [4, 4] world to camera, of the first view.
-        pivot: Distance from the camera to the point that it orbits: what moves in its image, else all in it [scene
-            units].
+        pivot: Distance from the camera to the point that it orbits: median depth of the dynamic Gaussians in its image,
+            or of all in it if there are none [scene units].
         track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
         seconds: Duration of the scene [s].
         antialias, max_alpha: As in ``RenderSettings``.

@@ -163,7 +163,7 @@ class Journal:
         try:
             yield
         except OSError as error:
-            if error.errno == ENOSPC or "No space left" in str(error):
+            if error.errno == ENOSPC:
                 raise OSError(f"{self.root}: the disk is full; {ADVICE}") from error
             raise
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
-from warpgs.data.capture import no_view
+from warpgs.data.capture import missing_view
 from warpgs.data.images import decode
 from warpgs.evaluation.poses import alignment
 from warpgs.runs.run import Device, Run
@@ -77,7 +77,7 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
     strips = {}
     for name in progress(names, f"rendering {evaluated.label}", quiet):
         if name not in capture.cameras:
-            raise ValueError(no_view(capture, name))
+            raise ValueError(missing_view(capture, name))
         frame = capture.frame(name)
         truth = frame.image.to(scene.device).float() / 255.0
         rendering = scene.render(align(frame), branches=True)

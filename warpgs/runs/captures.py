@@ -46,21 +46,6 @@ def require_same_times(capture: Capture, metadata: Metadata) -> None:
             )
 
 
-def require_depth_as_asked(config: TrainConfig, capture: Capture) -> None:
-    """Raises ValueError if a config is without depth, but a training frame of the capture has some.
-
-    Reads every training frame if none has: the capture keeps as many of them as its cache holds.
-    """
-    if config.depth:
-        return
-    for frame in capture.frames(capture.train):
-        if frame.inverse_depth is not None:
-            raise ValueError(
-                f"{capture.name} was read with depth, but the config is without (depth=False): read it with "
-                "LoadOptions(depth=False), as open_capture(config) does"
-            )
-
-
 def known_background(config: TrainConfig, capture: Capture) -> Background:
     """The background of a config.
 

@@ -68,7 +68,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print, known
     Args:
         data: Captures, folders of captures, built-in captures ("builtin:studio"), or NAME=PATH.
         log: Receives a warning for each folder of captures with subfolders that are not captures.
-        known: Captures that were trained before: a folder also stands for those of them that were in it.
+        known: Captures of trainings that have finished: a folder also stands for those of them that were in it.
 
     Raises:
         ValueError: If there is none, or a name is wrong or given twice; the message names it.
@@ -77,7 +77,7 @@ def find_scenes(data: Sequence[str], log: Callable[[str], object] = print, known
         raise ValueError("a sweep needs captures: give them with --data")
     scenes: dict[str, str] = {}
     for text in data:
-        for name, path in _named(text, log, known):
+        for name, path in _named(text, log, set(known) - set(scenes.values())):
             if name in scenes:
                 raise ValueError(
                     f"two captures have the name {name}: {scenes[name]} and {path}; name one with --data NAME={path}"

@@ -61,7 +61,8 @@ def run_sweep(options: Sweep, log: Log) -> int:
     # The output of a dry run is a script.
     warn = partial(print, file=sys.stderr) if options.dry_run else log
     overrides, known = _overrides(options), _known_commands(out)
-    scenes = find_scenes(spec.data, warn, trained_captures(known.values()))
+    finished = [command for name, command in known.items() if (out / name / "metrics.json").is_file()]
+    scenes = find_scenes(spec.data, warn, trained_captures(finished))
     cells = [
         as_evaluated_before(cell, known.get(cell.name, ""), overrides)
         for cell in plan_cells(spec, scenes, out, overrides)

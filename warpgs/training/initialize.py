@@ -141,6 +141,16 @@ class DepthAlignment(NamedTuple):
         return DepthTrust(weight, loss.depth_margin * errors)
 
 
+def require_no_depth(capture: Capture, views: Views) -> None:
+    """Raises ValueError if a training view has depth: a capture is to be read without where the config is without."""
+    for name, view in zip(capture.train, views, strict=True):
+        if bool(view.inverse_depth.isfinite().any()):
+            raise ValueError(
+                f"{capture.name}: frame {name} was read with depth, but the config is without (depth=False); open the "
+                "capture with open_capture(config)"
+            )
+
+
 @torch.no_grad()
 def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> DepthAlignment:
     """Aligns each view's inverse depth to the sparse points; metric depth stays as it is.

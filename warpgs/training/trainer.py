@@ -13,7 +13,7 @@ from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
-from warpgs.runs.captures import known_background, require_depth_as_asked, require_same_times
+from warpgs.runs.captures import known_background, require_same_times
 from warpgs.runs.trained import TrainedScene
 
 from . import initialize, ranks
@@ -74,7 +74,6 @@ class Trainer:
     """
 
     def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
-        require_depth_as_asked(config, capture)  # its points may come from depth, too
         self.config, self.run = config, run
         self.capture = capture.assuming(config.assume).over(known_background(config, capture))
         self.device = torch.device(config.device or "cpu")
@@ -86,6 +85,8 @@ class Trainer:
         self.views = Views(
             self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph
         )
+        if not config.depth:
+            initialize.require_no_depth(self.capture, self.views)
         self.iteration, self.rollbacks = 0, 0
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.camera_files import is_rotation
-from warpgs.data.capture import Capture, no_view
+from warpgs.data.capture import Capture, missing_view
 from warpgs.files import read_json, write_json
 
 from . import camera_paths
@@ -152,7 +152,7 @@ def _posed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Ca
     if "view" in value:
         view = value["view"]
         if not isinstance(view, str) or view not in capture.cameras:
-            raise ValueError(f"{name}: {no_view(capture, view)}")
+            raise ValueError(f"{name}: {missing_view(capture, view)}")
         return capture.cameras[view]
     if "viewmat" in value:
         return _from_matrices(name, value, first)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture, no_view
+from warpgs.data.capture import Capture, missing_view
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
@@ -140,7 +140,7 @@ def _start_view(options: Render, capture: Capture) -> Camera:
     """The camera from which the fixed and spiral paths start, and the bullet path with --view."""
     name = options.view or camera_paths.middle_view(capture)
     if name not in capture.cameras:
-        raise ValueError(no_view(capture, name))
+        raise ValueError(missing_view(capture, name))
     return capture.cameras[name]
 
 

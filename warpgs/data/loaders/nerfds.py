@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from warpgs.data.writer import LAYOUT, REPORT
+from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
 from .nerfies import NerfiesLoader
@@ -50,7 +50,7 @@ def _mask_sizes(root: Path) -> set[str]:
 def _origin(root: Path) -> str | None:
     """The layout by who made the capture: ``warpgs prepare``, NeRF-DS or HyperNeRF; None if nothing shows it."""
     if (root / REPORT).is_file():  # version 0.2 of prepare named no layout in dataset.json
-        return LAYOUT
+        return "nerfds"
     if any((root / folder).is_dir() for folder in RELEASED_FOLDERS):
         return "nerfds"
     camera = next((root / "camera").glob("*.json"), None)
