@@ -121,6 +121,48 @@ def test_playing_advances_time_and_the_slider_stops_it(browser, page):
     browser.until("!state.playing && state.time === 0.75")
 
 
+def click(browser, selector):
+    box = browser.value(
+        f"(({{x, y, width, height}}) => [x + width / 2, y + height / 2])({selector}.getBoundingClientRect())"
+    )
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
+
+
+def press(browser, key, text=""):
+    code = {"Tab": 9, " ": 32}[key]
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=text, windowsVirtualKeyCode=code)
+    browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, windowsVirtualKeyCode=code)
+
+
+@pytest.mark.parametrize("control", ["home", "static"])
+def test_the_space_bar_plays_after_a_click_on_a_control_and_activates_one_that_was_reached_by_tab(
+    browser, page, control
+):
+    browser.open(f"file://{page}#play=0")
+    browser.until(SETTLED)
+    click(browser, f"document.getElementById('{control}')")
+    browser.until("document.activeElement === document.body")
+    was_checked = browser.value("document.getElementById('static').checked")
+    assert was_checked == (control != "static")
+    press(browser, " ", " ")
+    browser.until("state.playing")
+    browser.value("document.getElementById('static').focus()")
+    press(browser, " ", " ")
+    browser.until(f"document.getElementById('static').checked !== {str(was_checked).lower()}")
+    assert browser.value("state.playing && document.activeElement.id === 'static'")
+
+
+def test_another_fragment_in_the_address_is_applied(browser, page):
+    shown(browser, page, "time=0.25&layers=static")
+    browser.value("location.hash = '#play=0&time=0.5&layers=dynamic'")
+    browser.until("state.time === 0.5 && document.getElementById('dynamic').checked")
+    assert not browser.value("document.getElementById('static').checked || state.playing")
+    browser.value("location.hash = '#time=0.75&layers=mesh'")
+    browser.until("state.playing")
+    assert browser.value("document.getElementById('static').checked && document.getElementById('dynamic').checked")
+
+
 def test_a_slow_frame_skips_times_instead_of_slowing_down(browser, page):
     shown(browser, page, "time=0.1")
     advanced = browser.value(

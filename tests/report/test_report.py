@@ -153,7 +153,28 @@ def test_runs_of_one_capture_are_shown_side_by_side(tmp_path, run, other):
 
 def test_runs_with_different_views_have_separate_galleries(tmp_path, run, other):
     edit_views(other, lambda rows: rows.pop())
-    assert report(tmp_path, run, other, views=1).text.count("Worst views") == 2
+    page = report(tmp_path, run, other, views=1)
+    assert page.text.count("Worst views") == 2
+    for label in ("run", "other"):
+        assert f"Worst and best views of {label}" in page.text
+
+
+def test_values_of_different_captures_are_not_compared(tmp_path, run, other):
+    edit_views(other, lambda rows: rows.pop())
+    assert "evaluated on different captures or views" in report(tmp_path, run, other, views=0).text
+    assert "class=best" not in (tmp_path / "report.html").read_text()
+
+
+def test_the_only_value_of_a_metric_is_not_the_better_one(tmp_path, run, other):
+    edit_json(run / "metrics.json", ms_ssim=0.987)
+    edit_json(other / "metrics.json", ms_ssim=None)
+    assert "different captures" not in report(tmp_path, run, other, views=0).text
+    assert "<td>0.9870</td>" in (tmp_path / "report.html").read_text()
+
+
+def test_the_capture_of_the_built_in_scene_has_its_name():
+    configs = [TrainConfig(), TrainConfig(data=Path("captures/as"))]
+    assert ("data", ["builtin:room", "captures/as"]) in config_rows(configs)
 
 
 def test_the_better_metric_is_marked(tmp_path, run, other):

@@ -178,6 +178,26 @@ def test_the_command_prints_the_address(run, capsys, monkeypatch):
     assert f"{run}: http://127.0.0.1:" in capsys.readouterr().out
 
 
+def test_a_viewer_waits_for_a_training_that_has_not_created_its_run(run, tmp_path, monkeypatch, capsys):
+    def create(seconds):
+        (tmp_path / "later").mkdir(exist_ok=True)  # the trainer writes config.json after it
+        waited.append(seconds)
+        if len(waited) > 1:
+            shutil.copytree(run, tmp_path / "later", dirs_exist_ok=True)
+
+    waited = []
+    monkeypatch.setattr(serve, "_wait", lambda: None)
+    monkeypatch.setattr(serve, "lower_priority", lambda _: None)
+    monkeypatch.setattr(serve.time, "sleep", create)
+    View(tmp_path / "later", port=0, while_training=True, device="cpu").run()
+    assert f"waiting for a training to create {tmp_path}/later (press Ctrl-C to stop)" in capsys.readouterr().out
+    assert len(waited) == 2
+
+
+def test_a_wrong_folder_is_reported_before_a_port_in_use(tmp_path, taken, capsys):
+    assert "does not exist" in error_line(capsys, "view", tmp_path / "nosuch", "--port", taken)
+
+
 def test_a_viewer_of_a_run_in_training_has_a_low_priority(run, monkeypatch):
     given = []
     monkeypatch.setattr(serve, "_wait", lambda: None)

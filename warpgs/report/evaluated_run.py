@@ -68,6 +68,15 @@ class EvaluatedRun:
     curves: dict[str, Curve]
 
 
+def groups(runs: Sequence[EvaluatedRun]) -> list[list[int]]:
+    """Indices of the runs that were evaluated on the same views of the same capture."""
+    found: dict[tuple[object, ...], list[int]] = {}
+    for index, run in enumerate(runs):
+        key = (run.config.data, run.config.factor, *sorted(view.name for view in run.views))
+        found.setdefault(key, []).append(index)
+    return list(found.values())
+
+
 def read_runs(folders: Sequence[Path]) -> list[EvaluatedRun]:
     """The runs of a report.
 

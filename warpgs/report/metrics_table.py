@@ -104,7 +104,11 @@ def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:
         preset = configs[0].preset
         flat.append(dict(_flat("", TrainConfig() if preset is None else PRESETS[preset])))
     names = [name for name in flat[0] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
-    return [(name, [str(values[name]) for values in rows]) for name in names]
+    return [(name, [_setting(name, values[name]) for values in rows]) for name in names]
+
+
+def _setting(name: str, value: Any) -> str:
+    return "builtin:room" if name == "data" and value is None else str(value)
 
 
 def _flat(prefix: str, part: Any) -> Iterator[tuple[str, Any]]:

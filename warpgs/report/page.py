@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from warpgs.visualize.images import ERROR_RANGE
 
 from .charts import Series, chart, color_of
-from .evaluated_run import EvaluatedRun
+from .evaluated_run import EvaluatedRun, groups
 from .image_strips import Strips
 from .metrics_table import HIGHER, LOWER, TITLES, config_rows, summary_rows
 
@@ -105,20 +105,21 @@ def _header(runs: Sequence[EvaluatedRun], first: str = "") -> str:
 
 
 def _summary(runs: Sequence[EvaluatedRun]) -> str:
-    rows = []
+    rows, are_comparable = [], len(groups(runs)) == 1
     for name, values, texts in summary_rows(runs):
-        best = _best(name, values) if len(runs) > 1 else None
+        best = _best(name, values) if are_comparable else None
         cells = "".join(
             f"<td{' class=best' if best is not None and value == best else ''}>{text(formatted)}</td>"
             for value, formatted in zip(values, texts, strict=True)
         )
         rows.append(f"<tr><th>{text(TITLES.get(name, name))}</th>{cells}</tr>")
-    return f"<h2>Metrics and timing</h2>{_wide(_header(runs) + ''.join(rows))}"
+    note = "" if are_comparable else "<p class=note>The runs were evaluated on different captures or views.</p>"
+    return f"<h2>Metrics and timing</h2>{note}{_wide(_header(runs) + ''.join(rows))}"
 
 
 def _best(name: str, values: Iterable[Any]) -> float | None:
     known = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-    if not known or name not in HIGHER | LOWER:
+    if len(known) < 2 or name not in HIGHER | LOWER:
         return None
     return max(known) if name in HIGHER else min(known)
 
@@ -161,7 +162,8 @@ def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
     error = f"mean absolute error over the channels, black at 0, brightest from {ERROR_RANGE} on"
     scale = f"<p class=note>Ordered by PSNR. Error: {error}.</p>"
     table = f'<div class="strips" style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
-    return f"<h2>Worst and best views</h2>{scale}{notes}{table}"
+    labels = "" if len(gallery.runs) == len(runs) else f" of {', '.join(_named(runs, k) for k in gallery.runs)}"
+    return f"<h2>Worst and best views{labels}</h2>{scale}{notes}{table}"
 
 
 def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> str:

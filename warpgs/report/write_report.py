@@ -10,7 +10,7 @@ from warpgs.errors import one_line
 from warpgs.files import write_text
 
 from .command import Report
-from .evaluated_run import EvaluatedRun, read_runs
+from .evaluated_run import EvaluatedRun, groups, read_runs
 from .image_strips import Strips, rendered_strips, saved_strips, saved_views
 from .page import Gallery, page
 
@@ -50,15 +50,6 @@ def _gallery(options: Report, runs: Sequence[EvaluatedRun], group: Sequence[int]
     for k, reason in reasons.items():
         strips[k] = saved_strips(chosen[k], [*worst, *best], reason)
     return Gallery(group, worst, best, strips)
-
-
-def groups(runs: Sequence[EvaluatedRun]) -> list[list[int]]:
-    """Indices of the runs that were evaluated on the same views of the same capture."""
-    found: dict[tuple[object, ...], list[int]] = {}
-    for index, run in enumerate(runs):
-        key = (run.config.data, run.config.factor, *sorted(view.name for view in run.views))
-        found.setdefault(key, []).append(index)
-    return list(found.values())
 
 
 def extremes(runs: Sequence[EvaluatedRun], count: int, among: set[str] | None = None) -> tuple[list[str], list[str]]:

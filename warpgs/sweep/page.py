@@ -6,10 +6,10 @@ from pathlib import Path
 
 from warpgs.command_line.version import version
 from warpgs.files import write_text
-from warpgs.report.evaluated_run import read_runs
+from warpgs.report.evaluated_run import groups, read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
 from warpgs.report.page import Gallery, page, text
-from warpgs.report.write_report import extremes, groups
+from warpgs.report.write_report import extremes
 
 from .cells import Cell
 from .formats import heads, texts

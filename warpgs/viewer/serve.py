@@ -4,6 +4,7 @@ import atexit
 import gc
 import importlib.util
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -11,9 +12,10 @@ from contextlib import suppress
 from warpgs.command_line.posix import lower_priority
 from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
+from warpgs.runs import config_file
 
 from .command import View
-from .source import Source, open_source
+from .source import POLL_SECONDS, Source, open_source
 from .training_cameras import TrainingCameras
 
 NICENESS = 10
@@ -33,8 +35,12 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
     from .server import Viewer, check_address
 
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
-    check_address(options.host, options.port)
+    if options.while_training and not options.run_folder.exists():
+        report(f"waiting for a training to create {options.run_folder} (press Ctrl-C to stop)")
+        while not (options.run_folder / config_file.NAME).exists():
+            time.sleep(POLL_SECONDS)
     source = open_source(options.run_folder, options.device, options.while_training)
+    check_address(options.host, options.port)
     if options.while_training and source.device.type == "cpu":
         lower_priority(NICENESS)
     with Viewer(source, training_cameras(source, warn), options.host, options.port) as viewer:

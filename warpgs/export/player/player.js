@@ -200,16 +200,24 @@ async function upload() {
 
 // Playback -----------------------------------------------------------------------------------------------------------
 
-const options = new URLSearchParams(location.hash.slice(1)); // e.g. #time=0.5&play=0&layers=dynamic
-const state = {time: 0, playing: options.get('play') !== '0', sorting: false, count: 0, changed: true};
+const state = {time: 0, playing: true, sorting: false, count: 0, changed: true};
 const orbit = new Orbit(cameraOf(START.viewmat), START.pivot);
 const track = START.track.map(cameraOf);
 const numberOf = (value) => Number.isFinite(parseFloat(value)) ? Math.min(1, Math.max(0, parseFloat(value))) : 0;
-state.time = numberOf(options.get('time'));
-if (options.has('layers')) for (const name of NAMES) element(name).checked = options.get('layers').includes(name);
-if (options.get('controls') === '0') element('controls').hidden = true;
-element('follow').checked = options.get('follow') === '1' && track.length > 0;
 element('follow-label').hidden = track.length === 0;
+
+function applyAddress() { // e.g. #time=0.5&play=0&layers=dynamic
+  const options = new URLSearchParams(location.hash.slice(1));
+  const layers = NAMES.filter((name) => options.get('layers')?.includes(name));
+  for (const name of NAMES) element(name).checked = !layers.length || layers.includes(name);
+  state.time = numberOf(options.get('time'));
+  state.playing = options.get('play') !== '0';
+  state.changed = true;
+  element('controls').hidden = options.get('controls') === '0';
+  element('follow').checked = options.get('follow') === '1' && track.length > 0;
+}
+applyAddress();
+addEventListener('hashchange', applyAddress);
 
 function currentCamera() {
   if (element('follow').checked) {
@@ -324,6 +332,11 @@ canvas.addEventListener('wheel', (event) => {
   orbit.zoom(Math.exp(event.deltaY / 800));
   update();
 }, {passive: false});
+// A control that was clicked does not keep the keys of the page. Those who move between controls by Tab keep the focus.
+addEventListener('click', (event) => {
+  if (event.detail && event.target.tagName !== 'SELECT') requestAnimationFrame(() => document.activeElement.blur());
+});
+element('speed').onchange = () => element('speed').blur();
 addEventListener('keydown', (event) => {
   if (event.target !== document.body && event.target !== canvas) return;
   const step = lastKey > 0 ? 1 / lastKey : 0;
