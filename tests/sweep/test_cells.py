@@ -208,7 +208,9 @@ def test_what_is_no_capture_has_the_problem_that_training_names(name, tmp_path):
         assert f"{tmp_path / path} {problem}" in found[name.rstrip("=") or path]
 
 
-def test_a_capture_that_cannot_be_read_has_a_problem_and_others_do_not(tmp_path, monkeypatch):
+@pytest.fixture
+def closed(tmp_path, monkeypatch):
+    """One of two captures, which may not be read; the other is ``good``."""
     for name in ("good", "closed"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "dataset.json").touch()
@@ -220,26 +222,20 @@ def test_a_capture_that_cannot_be_read_has_a_problem_and_others_do_not(tmp_path,
         return exists(path)
 
     monkeypatch.setattr(Path, "exists", refuse)
+    return tmp_path / "closed"
+
+
+def test_a_capture_that_cannot_be_read_has_a_problem_and_others_do_not(tmp_path, closed):
     scenes = {name: str(tmp_path / name) for name in ("good", "closed")} | {"room": "builtin:room"}
-    closed = tmp_path / "closed/dataset.json"
-    assert find_problems(scenes) == {"closed": f"[Errno 13] Permission denied: '{closed}'"}
+    assert find_problems(scenes) == {"closed": f"[Errno 13] Permission denied: '{closed / 'dataset.json'}'"}
 
 
 @pytest.mark.parametrize("denied", [os.R_OK, os.X_OK])
-def test_a_folder_that_may_not_be_read_stands_for_itself_and_is_skipped_in_others(tmp_path, monkeypatch, denied):
-    for name in ("good", "closed"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "dataset.json").touch()
-    exists = Path.exists
-
-    def refuse(path):
-        if "closed" in path.parts:
-            raise PermissionError(f"[Errno 13] Permission denied: '{path}'")
-        return exists(path)
-
-    monkeypatch.setattr(Path, "exists", refuse)
+def test_a_folder_that_may_not_be_read_stands_for_itself_and_is_skipped_in_others(
+    tmp_path, monkeypatch, closed, denied
+):
     monkeypatch.setattr(os, "access", lambda path, mode: not ("closed" in Path(path).parts and mode & denied))
-    lines, closed = [], tmp_path / "closed"
+    lines = []
     assert find_scenes([str(tmp_path)], lines.append) == {"good": str(tmp_path / "good")}
     assert lines == [f"warning: {tmp_path}: skipped folders that are not captures: closed"]
     assert find_scenes([str(closed)]) == {"closed": str(closed)}
