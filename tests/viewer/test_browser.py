@@ -301,6 +301,14 @@ def test_training_cameras_are_shown_and_removed(page, session):
     until(lambda: np.abs(seen(page, session) - before).max() < 10)
 
 
+def test_training_cameras_are_hidden_while_the_browser_looks_through_one(page, session):
+    before = seen(page, session)
+    session.panel.show_cameras.value = True
+    page.get_by_text("training cameras are hidden").wait_for()
+    assert np.abs(seen(page, session) - before).max() < 10
+    session.panel.show_cameras.value = False
+
+
 @pytest.fixture
 def path_folder(page):
     """The folder of camera paths is open."""

@@ -13,13 +13,15 @@ import threading
 
 from tests.video.test_camera_paths import capture
 from warpgs.viewer import path_editor
+from warpgs.viewer.adaptive_resolution import AdaptiveResolution
 from warpgs.viewer.browser_camera import through_training_camera
+from warpgs.viewer.canvas import MAX_ASPECT, MAX_CANVAS
 from warpgs.viewer.clock import Clock
 from warpgs.viewer.layers import LAYERS
 from warpgs.viewer.panel import Panel
 from warpgs.viewer.path_editor import PathEditor
 from warpgs.viewer.pose import Pose, camera_of
-from warpgs.viewer.session import MAX_ASPECT, MAX_CANVAS, Session
+from warpgs.viewer.session import Session
 from warpgs.viewer.training_cameras import TrainingCameras
 
 pytestmark = pytest.mark.usefixtures("contracts_off")
@@ -144,6 +146,28 @@ def test_cameras_that_are_switched_off_while_they_are_added_are_removed(monkeypa
     here._show_cameras(TRAINING)
     assert len(read) == 3
     assert here._client.scene.names == []
+
+
+def looking(pose, time, wipe=0.0):
+    """A session that looks with a pose at a time, with the second training camera selected; it renders nothing."""
+    here = session(view=2, width=640, layer="joint", residual=True, time=time, wipe=wipe)
+    here._pose, here._training, here._clock, here._resolution = lambda: pose, TRAINING, Clock(), AdaptiveResolution()
+    here._source = SimpleNamespace(current=object)
+    here._frustums = SimpleNamespace(visible=True)
+    here._requested = here._shown = None
+    here._changed_at = 0.0
+    here._render = lambda *_: None
+    return here
+
+
+def test_training_cameras_are_hidden_from_where_the_selected_one_stands_and_shown_from_elsewhere():
+    view = TRAINING.views[1]
+    here = looking(view.pose, view.time)
+    here._update_image()
+    assert not here._frustums.visible
+    here._pose = lambda: view.pose._replace(position=(9.0, 9.0, 9.0))
+    here._update_image()
+    assert here._frustums.visible
 
 
 def test_an_outdated_event_shows_nothing():

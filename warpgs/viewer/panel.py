@@ -77,6 +77,11 @@ class Panel:
         return _clamped(self.wipe.value, (0.0, 1.0)) if hasattr(self, "wipe") else 0.0
 
     @property
+    def shows_cameras(self) -> bool:
+        """Whether the training cameras are to be shown in the scene."""
+        return hasattr(self, "show_cameras") and bool(self.show_cameras.value)
+
+    @property
     def current_layer(self) -> str:
         """Name of the layer to show, a key of ``LAYERS``."""
         name = self.layer.value
@@ -85,7 +90,8 @@ class Panel:
     def _add_training(self, gui: viser.GuiApi, training: TrainingCameras, is_narrow: bool) -> None:
         count, first = len(training.views), training.thumbnail(0)
         with gui.add_folder("Training cameras", expand_by_default=not is_narrow):
-            self.show_cameras = gui.add_checkbox("show in the scene", False, hint="Click a camera to look through it")
+            hint = "Click a camera to look through it; they are hidden while you do, or they would cover the image"
+            self.show_cameras = gui.add_checkbox("show in the scene", False, hint=hint)
             self.view = gui.add_slider("camera", 1, max(2, count), 1, 1, disabled=count < 2)
             self.snap = gui.add_button("Look through it")
             hint = "Left of the border is the training image, as long as the camera stays where it was recorded"

@@ -18,6 +18,7 @@ from warpgs.files import encode_png
 from . import comparison
 from .adaptive_resolution import AdaptiveResolution
 from .browser_camera import set_camera, through_training_camera
+from .canvas import NARROW, canvas_of, size_at
 from .clock import Clock
 from .frustums import BLUE, add_frustum
 from .page_state import PageState
@@ -43,17 +44,13 @@ QUALITY, QUALITY_AT_REST = 80, 92
 RATE_SECONDS = 2.0
 """Interval over which images are counted for the FPS [s]; at rest, the FPS are estimated from the last image."""
 
-MAX_CANVAS = (4096, 2160)
-"""Maximum width and height of a canvas to render for [px]."""
-
-MAX_ASPECT = 4
-"""Maximum height over width of a keyframe."""
-
-NARROW = 600
-"""Width of a canvas below which the panel lies over the image [px]."""
-
 KEYFRAME_SCALE = 0.1
 """Size of keyframes in a scene without training cameras [scene units]."""
+
+FRUSTUMS = "/training"
+"""Path of the training cameras in the scene."""
+
+HIDDEN = "training cameras are hidden from where they stand"
 
 STEPS = 60
 """Steps of the time of a scene without training cameras."""
@@ -103,6 +100,7 @@ class Session:
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
         capture = None if training is None else training.capture
         self.path = PathEditor(client.scene, self.panel.path, source.run, self, scale, capture)
+        self._frustums = client.scene.add_frame(FRUSTUMS, show_axes=False, visible=False)
         if view is not None:
             self._restore(view)
         self._connect()
@@ -235,11 +233,12 @@ class Session:
                 if not self.panel.show_cameras.value:
                     break
                 view, image = training.views[index], training.thumbnail(index)
-                name, scale = f"/training/{index}", training.frustum_scale
+                name, scale = f"{FRUSTUMS}/{index}", training.frustum_scale
                 frustum = add_frustum(self._client.scene, name, view.pose, view.aspect, scale, BLUE, image)
                 frustum.on_click(partial(self._look_through, training, index))
             if not self.panel.show_cameras.value:
-                self._client.scene.remove_by_name("/training")
+                for index in training.frustums():
+                    self._client.scene.remove_by_name(f"{FRUSTUMS}/{index}")
 
     def _look_through(self, training: TrainingCameras, index: int, _: object) -> None:
         if self.panel.view.value == index + 1:
@@ -273,6 +272,7 @@ class Session:
         request = self._request()
         if request is None:
             return IDLE_SECONDS
+        self._frustums.visible = self._at(request) is None  # from one of them, they would cover the image
         if request != self._requested:
             self._requested, self._changed_at = request, now
         shown = self._shown.scale if self._shown is not None and self._shown.request == request else 0.0
@@ -297,13 +297,18 @@ class Session:
 
     def _truth_for(self, request: RenderRequest) -> tuple[int, float] | None:
         """The training camera whose image is shown beside, and which part of it; only from where it was recorded."""
-        training, wipe = self._training, self.panel.current_wipe
-        if training is None or not wipe:
+        wipe = self.panel.current_wipe
+        index = self._at(request) if wipe else None
+        return None if index is None else (index, wipe)
+
+    def _at(self, request: RenderRequest) -> int | None:
+        """The training camera that the slider selects, if the browser's camera is where it was recorded."""
+        training = self._training
+        if training is None:
             return None
         index = self._selected(training)
         camera = camera_of(request.pose, request.size, request.time)
-        beside = comparison.is_beside(camera, training.camera(index), training.capture.extent)
-        return (index, wipe) if beside else None
+        return index if comparison.is_beside(camera, training.camera(index), training.capture.extent) else None
 
     def _with_truth(self, request: RenderRequest, image: Image) -> Image:
         """An image with the part of the training image that its request asks for."""
@@ -338,11 +343,8 @@ class Session:
         return Pose(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov))
 
     def _canvas(self) -> tuple[int, int]:
-        """(width, height) of the canvas, scaled down to ``MAX_CANVAS``: a browser may send any size."""
-        camera = self._client.camera
-        width, height = max(1, camera.image_width), max(1, camera.image_height)
-        factor = min(1.0, MAX_CANVAS[0] / width, MAX_CANVAS[1] / height)
-        return max(1, round(width * factor)), max(1, round(height * factor))
+        """(width, height) of the canvas."""
+        return canvas_of(self._client.camera)
 
     def go_to(self, camera: Camera) -> None:
         """Moves the camera of the browser, and its time."""
@@ -355,10 +357,7 @@ class Session:
 
     def current_camera(self) -> Camera:
         """The current camera for a keyframe, with the width of the slider: the size of the canvas may change."""
-        width, height = self._canvas()
-        across = self.panel.current_width
-        high = min(max(1, round(height * across / width)), MAX_ASPECT * across)
-        return camera_of(self._pose(), (across, high), self.panel.current_time)
+        return camera_of(self._pose(), size_at(self._canvas(), self.panel.current_width), self.panel.current_time)
 
     def _update_status(self) -> None:
         """Shows problems, numbers of Gaussians, the iteration and the speed."""
@@ -366,7 +365,9 @@ class Session:
         if now - self._status_at < STATUS_SECONDS:
             return
         self._status_at = now
-        lines = [escape(line) for line in (self._problem, self._note, self._source.note, self._source.progress) if line]
+        hidden = HIDDEN if self.panel.shows_cameras and not self._frustums.visible else ""
+        notes = (self._problem, self._note, hidden, self._source.note, self._source.progress)
+        lines = [escape(note) for note in notes if note]
         if self._shown is not None:
             trained = self._shown.request.scene
             static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
