@@ -35,6 +35,10 @@ def test_a_path_never_overwrites_another(tmp_path, path):
     assert keyframes.path_of(tmp_path, "fly").name == "fly-2.json"
 
 
+def test_a_path_overwrites_another_if_it_is_told_to(tmp_path, path):
+    assert keyframes.path_of(tmp_path, "fly", replaces=True) == path
+
+
 @pytest.mark.parametrize("name", ["", "../x", "a/b", "a\\b", ".hidden", "a.json", "\0", "x" * 65, "a\n"])
 def test_a_name_that_could_lead_out_of_the_folder_is_refused(tmp_path, name):
     with pytest.raises(ValueError, match="the name of a path must have 1 to 64 letters"):

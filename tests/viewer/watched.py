@@ -5,6 +5,7 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
@@ -54,3 +55,17 @@ def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < end, "timeout"
         time.sleep(0.02)
+
+
+class Scene:
+    """The scene of a browser, which only records the names of its objects."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def add_camera_frustum(self, name: str, *_: object, **__: object) -> SimpleNamespace:
+        self.names.append(name)
+        return SimpleNamespace(on_click=lambda _: None)
+
+    def remove_by_name(self, name: str) -> None:
+        self.names = [other for other in self.names if not other.startswith(name)]

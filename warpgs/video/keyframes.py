@@ -51,18 +51,22 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _-]{0,63}")
 """Valid names of paths; a name comes from a browser and must not lead out of the folder."""
 
 
-def path_of(run: Path, name: str) -> Path:
-    """A file in a run folder for a new path, numbered if the name is taken.
+def path_of(run: Path, name: str, replaces: bool = False) -> Path:
+    """A file in a run folder for a path.
+
+    Args:
+        run: Run folder.
+        name: Name of the path.
+        replaces: Whether it replaces a file of that name; otherwise it is numbered if the name is taken.
 
     Raises:
         ValueError: If the name has other characters than letters, digits, spaces, - and _, or too many.
     """
     if not NAME.fullmatch(name):
         raise ValueError(f"the name of a path must have 1 to 64 letters, digits, spaces, - and _, got {name!r}")
-    stem = run / FOLDER / name
-    return next(
-        p for k in range(1, 10_000) if not (p := Path(f"{stem}.json" if k == 1 else f"{stem}-{k}.json")).exists()
-    )
+    path = run / FOLDER / f"{name}.json"
+    numbered = (path.with_name(f"{name}-{k}.json") for k in range(2, 10_000))
+    return path if replaces else next(p for p in (path, *numbered) if not p.exists())
 
 
 def write_path(path: Path, cameras: Sequence[Camera]) -> None:

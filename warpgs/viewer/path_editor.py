@@ -1,12 +1,14 @@
 """The keyframes that one browser collects: added, edited, previewed, saved, loaded and rendered."""
 
+import operator
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import viser
 
@@ -19,7 +21,7 @@ from warpgs.video import keyframes
 
 from .frustums import ORANGE, add_frustum
 from .panel import escape, set_value
-from .path_controls import END_PREVIEW, NEW, PREVIEW, PathControls
+from .path_controls import DEFAULT_NAME, END_PREVIEW, NEW, PREVIEW, PathControls
 from .pose import camera_of, pose_of
 
 MAX_KEYFRAMES = 1000
@@ -39,6 +41,26 @@ class BrowserView(Protocol):
 
     def go_to(self, camera: Camera) -> None:
         """Moves the camera of the browser, and its time."""
+
+
+class PathState(NamedTuple):
+    """What an editor holds, which survives a reload of its page.
+
+    Attributes:
+        cameras: The keyframes.
+        selected: Index of the selected one.
+        name: Name to save them by.
+        opened: Name of the file that was opened or saved last; ``NEW`` without one.
+        stored: Its keyframes.
+        own: Names of all files that were opened or saved here.
+    """
+
+    cameras: list[Camera]
+    selected: int
+    name: str
+    opened: str
+    stored: list[Camera]
+    own: set[str]
 
 
 class PathEditor:
@@ -70,6 +92,11 @@ class PathEditor:
         self._child: subprocess.Popen[str] | None = None
         self._preview_ended: threading.Event | None = None  # set to end the preview that runs
         self.cameras: list[Camera] = []
+        self._opened = NEW
+        self._stored: list[Camera] = []
+        self._own: set[str] = set()
+        self._warned = ""  # choice of a path that would have dropped keyframes
+        self._sets = False  # whether this editor sets its menus, which then are not to be obeyed
         for button, action in (
             (controls.add, self._add),
             (controls.replace, self._replace),
@@ -80,8 +107,8 @@ class PathEditor:
         ):
             button.on_click(partial(_without_event, action))
         controls.selected.on_update(lambda _: self._go())
-        controls.saved.on_update(lambda _: self._load())
-        self._list_saved()
+        controls.saved.on_update(lambda _: self._choose())
+        self._start()
 
     def stop(self) -> None:
         """Ends a preview and a video that is being rendered."""
@@ -91,6 +118,32 @@ class PathEditor:
                 self._preview_ended.set()
         if self._child is not None:
             interrupt(self._child)  # as Ctrl-C: it removes what it has written of the video
+
+    # A page that is reloaded ------------------------------------------------------------------------------------------
+
+    def state(self) -> PathState:
+        """What this editor holds."""
+        with self._lock:
+            name = str(self._controls.name.value)
+            return PathState(self.cameras, self.selected, name, self._opened, self._stored, self._own)
+
+    def restore(self, state: PathState) -> None:
+        """Continues from a state, without moving the camera."""
+        with self._lock, self._setting():
+            self.cameras, self._opened, self._stored = list(state.cameras), state.opened, list(state.stored)
+            self._own = set(state.own)
+            self._show(state.selected)
+            self._list_saved()
+            set_value(self._controls.name, state.name)
+
+    @contextmanager
+    def _setting(self) -> Iterator[None]:
+        """While this editor sets its menus; other threads wait for the lock, which has to be held."""
+        before, self._sets = self._sets, True
+        try:
+            yield
+        finally:
+            self._sets = before
 
     # Keyframes --------------------------------------------------------------------------------------------------------
 
@@ -131,12 +184,13 @@ class PathEditor:
 
     def _go(self) -> None:
         with self._lock:
-            camera = self.cameras[self.selected] if self.cameras else None
+            camera = self.cameras[self.selected] if self.cameras and not self._sets else None
         if camera is not None:
             self._browser.go_to(camera)
 
     def _show(self, selected: int) -> None:
         """Shows all keyframes in the scene, and in the menu."""
+        self._warned = ""
         self._scene.remove_by_name("/keyframes")
         for k, camera in enumerate(self.cameras):
             name = f"/keyframes/{k + 1}"
@@ -156,36 +210,71 @@ class PathEditor:
     # Files ------------------------------------------------------------------------------------------------------------
 
     def _list_saved(self) -> None:
-        self._controls.saved.options = (NEW, *keyframes.saved_names(self._run.folder))
+        """Lists the files, with the opened one chosen."""
+        with self._lock, self._setting():
+            self._controls.saved.options = names = (NEW, *keyframes.saved_names(self._run.folder))
+            set_value(self._controls.saved, self._opened if self._opened in names else NEW)
+
+    def _is_stored(self) -> bool:
+        """Whether the keyframes are as they were when their file was opened or saved."""
+        return len(self.cameras) == len(self._stored) and all(map(operator.is_, self.cameras, self._stored))
+
+    def _keep(self, name: str) -> None:
+        """Remembers that the keyframes are those of a file."""
+        self._opened, self._stored = name, list(self.cameras)
+        self._own.add(name)
+        self._list_saved()
+        set_value(self._controls.name, name)
 
     def _save(self) -> Path | None:
+        """Writes the keyframes, if they or their name have changed; only files of this editor are replaced."""
         try:
             with self._lock:  # otherwise two clicks could choose the same file
-                path = keyframes.path_of(self._run.folder, self._controls.name.value)
-                keyframes.write_path(path, self.cameras)
+                name = self._controls.name.value
+                path = keyframes.path_of(self._run.folder, name, replaces=name in self._own)
+                if name != self._opened or not self._is_stored() or not path.exists():
+                    keyframes.write_path(path, self.cameras)
+                    self._keep(path.stem)
         except (ValueError, OSError) as error:
             self._note(str(error))
             return None
-        self._list_saved()
         self._note(f"{self._count()} saved as {path}")
         return path
 
-    def _load(self) -> None:
-        name = self._controls.saved.value
-        if name not in keyframes.saved_names(self._run.folder):  # a browser may send anything
-            return
-        if self._capture is None:
-            self._note("paths cannot be loaded without the capture")
-            return
+    def _choose(self) -> None:
+        """Opens the chosen file, or starts a new path; keyframes that are not saved are only dropped if asked twice."""
+        with self._lock:
+            name = self._controls.saved.value
+            if self._sets or name not in (NEW, *keyframes.saved_names(self._run.folder)):  # a browser may send anything
+                return
+            if self.cameras and not self._is_stored() and self._warned != name:
+                self._list_saved()
+                self._note(f"{self._count()} not saved: save the path, or choose {name} again to drop them")
+                self._warned = name
+            elif name == NEW:
+                self._start()
+            else:
+                self._open(name)
+
+    def _start(self) -> None:
+        """Starts an empty path, with a name that is free."""
+        self.cameras, self._opened, self._stored = [], NEW, []
+        self._show(-1)
+        self._list_saved()
+        set_value(self._controls.name, keyframes.path_of(self._run.folder, DEFAULT_NAME).stem)
+
+    def _open(self, name: str) -> None:
         try:
+            if self._capture is None:
+                raise ValueError("paths cannot be loaded without the capture")
             cameras, _ = keyframes.read_keyframes(self._run.folder / keyframes.FOLDER / f"{name}.json", self._capture)
         except (ValueError, OSError) as error:
             self._note(str(error))
+            self._list_saved()
             return
-        with self._lock:
-            self.cameras = cameras[:MAX_KEYFRAMES]
-            self._show(0)
-        set_value(self._controls.name, name)
+        self.cameras = cameras[:MAX_KEYFRAMES]
+        self._show(0)
+        self._keep(name)
         self._browser.go_to(cameras[0])
 
     def _render(self) -> None:

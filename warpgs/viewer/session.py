@@ -123,9 +123,10 @@ class Session:
 
     def view(self) -> PageState:
         """What the browser shows."""
-        return PageState.of(self._client.camera, self.panel, self._training is not None)
+        return PageState.of(self._client.camera, self.panel, self._training is not None, self.path)
 
     def _restore(self, view: PageState) -> None:
+        self.path.restore(view.path)
         for name, value in view.controls.items():
             set_value(getattr(self.panel, name), value)
         if self._training is not None and view.training_view is not None:
