@@ -153,6 +153,14 @@ def test_training_cameras_are_hidden_from_where_the_selected_one_stands_and_show
     assert here._frustums.visible
 
 
+def test_truth_is_shown_where_and_when_it_was_recorded():
+    view = TRAINING.views[1]
+    assert looking(view.pose, round(view.time, 3), 0.5)._request().truth == (1, 0.5)
+    assert looking(view.pose, view.time + 0.01, 0.5)._request().truth is None
+    elsewhere = view.pose._replace(position=(9.0, 9.0, 9.0))
+    assert looking(elsewhere, view.time, 0.5)._request().truth is None
+
+
 def test_an_outdated_event_shows_nothing():
     """The last click counts, in whichever order the threads run."""
     here = session(show_cameras=False)

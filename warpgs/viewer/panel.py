@@ -94,7 +94,7 @@ class Panel:
             self.show_cameras = gui.add_checkbox("show in the scene", False, hint=hint)
             self.view = gui.add_slider("camera", 1, max(2, count), 1, 1, disabled=count < 2)
             self.snap = gui.add_button("Look through it")
-            hint = "Left of the border is the training image, as long as the camera stays where it was recorded"
+            hint = "Left of the border is the training image, while camera and time are those of its recording"
             self.wipe = gui.add_slider("truth", 0.0, 1.0, 0.01, 0.0, hint=hint)
             image = np.zeros((1, 1, 3), np.uint8) if first is None else first
             self.truth = gui.add_image(image, label="training image")

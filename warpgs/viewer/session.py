@@ -50,7 +50,10 @@ KEYFRAME_SCALE = 0.1
 FRUSTUMS = "/training"
 """Path of the training cameras in the scene."""
 
-HIDDEN = "training cameras are hidden from where they stand"
+HIDDEN = "training cameras are hidden while you look through one"
+
+ROUNDED = 0.51e-3
+"""Maximum error of a time from its slider, which has three digits."""
 
 STEPS = 60
 """Steps of the time of a scene without training cameras."""
@@ -167,9 +170,8 @@ class Session:
                 self.panel.play.label = PLAY
             times = [k / STEPS for k in range(STEPS + 1)] if self._training is None else self._training.times
             now = self.panel.current_time
-            rounded = 0.51e-3  # the slider has three digits
             index = (
-                bisect.bisect_right(times, now + rounded) if forward else bisect.bisect_left(times, now - rounded) - 1
+                bisect.bisect_right(times, now + ROUNDED) if forward else bisect.bisect_left(times, now - ROUNDED) - 1
             )
             set_value(self.panel.time, times[min(max(index, 0), len(times) - 1)])
         self._wake.set()
@@ -297,10 +299,12 @@ class Session:
         return request._replace(truth=self._truth_for(request))
 
     def _truth_for(self, request: RenderRequest) -> tuple[int, float] | None:
-        """The training camera whose image is shown beside, and which part of it; only from where it was recorded."""
+        """The training camera whose image is shown beside, and which part; only from where and when it was recorded."""
         wipe = self.panel.current_wipe
         index = self._at(request) if wipe else None
-        return None if index is None else (index, wipe)
+        if self._training is None or index is None or abs(request.time - self._training.views[index].time) > ROUNDED:
+            return None
+        return index, wipe
 
     def _at(self, request: RenderRequest) -> int | None:
         """The training camera that the slider selects, if the browser's camera is where it was recorded."""
