@@ -401,11 +401,14 @@ def test_the_pose_of_the_camera_is_exact(session):
 
 def test_the_screenshot_button_downloads_the_image(page, session, tmp_path):
     """Last, because a note about the download lies over the image for a while."""
+    session.panel.width.value = 1280  # more than the canvas has
     settle(session)
     with page.expect_download() as download:
         page.get_by_role("button", name="Screenshot").click()
     download.value.save_as(tmp_path / "shot.png")
     assert download.value.suggested_filename == f"run-joint-{session.panel.current_time:.3f}.png"
     request = session._request()
+    width, height = request.canvas
+    request = request._replace(canvas=(1280, round(height * 1280 / width)))
     expected = session._renderer.render(request, 1.0).image
     assert np.array_equal(cv2.imread(str(tmp_path / "shot.png"))[..., ::-1], expected)

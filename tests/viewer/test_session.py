@@ -1,8 +1,12 @@
 """Values from a browser are checked, and its events may arrive in any order."""
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
+import cv2
+import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
@@ -72,6 +76,28 @@ def test_the_size_of_a_keyframe_is_limited(size):
     camera = session(size, width=10**9, time=0.5).current_camera()
     assert 1 <= camera.width <= 1920
     assert 1 <= camera.height <= MAX_ASPECT * 1920
+
+
+def sent_screenshot(canvas, width):
+    """(width, height) of the image that a session with a canvas sends."""
+    here, sent = looking(TRAINING.views[0].pose, 0.5), []
+    camera = here._client.camera
+    camera.image_width, camera.image_height = canvas
+    here.panel.width.value = width
+    here._source.run = SimpleNamespace(folder=Path("run"))
+    render = Mock(side_effect=lambda r, scale: SimpleNamespace(image=np.zeros((*r.size_at(scale)[::-1], 3), np.uint8)))
+    here._renderer = SimpleNamespace(render=render)
+    here._client.send_file_download = lambda _, data, **__: sent.append(cv2.imdecode(np.frombuffer(data, np.uint8), 1))
+    here._send_screenshot()
+    return sent[0].shape[1::-1]
+
+
+@pytest.mark.parametrize(
+    ("canvas", "size"),
+    [((900, 700), (1600, 1244)), ((1920, 1080), (1600, 900)), ((300, 10**6), (1600, 4096 * 2160 // 1600))],
+)
+def test_a_screenshot_is_as_wide_as_the_slider_says(canvas, size):
+    assert sent_screenshot(canvas, 1600) == size
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ MAX_CANVAS = (4096, 2160)
 """Maximum width and height of a canvas to render for [px]."""
 
 MAX_ASPECT = 4
-"""Maximum height over width of a keyframe."""
+"""Maximum height over width of a keyframe or a screenshot."""
 
 NARROW = 600
 """Width of a canvas below which the panel lies over the image [px]."""
@@ -20,6 +20,7 @@ def canvas_of(camera: viser.CameraHandle) -> tuple[int, int]:
 
 
 def size_at(canvas: tuple[int, int], across: int) -> tuple[int, int]:
-    """(width, height) of an image with another width and the aspect of a canvas."""
+    """(width, height) of an image with another width and the aspect of a canvas, of no more pixels than a canvas."""
     width, height = canvas
-    return across, min(max(1, round(height * across / width)), MAX_ASPECT * across)
+    most = min(MAX_ASPECT * across, MAX_CANVAS[0] * MAX_CANVAS[1] // across)
+    return across, min(max(1, round(height * across / width)), most)

@@ -45,7 +45,7 @@ class Panel:
             self.layer = gui.add_dropdown("layer", tuple(LAYERS), initial_value=next(iter(LAYERS)))
             hint = "Off: static Gaussians have their own colours, without the appearance network"
             self.residual = gui.add_checkbox("appearance", True, hint=hint)
-            hint = "Width at rest; while something changes, as much as the machine can render in time"
+            hint = "Width at rest, at most the canvas's; while something changes, what the machine can render in time"
             self.width = gui.add_slider("width [px]", *WIDTHS, 80, width, hint=hint)
             self.screenshot = gui.add_button("Screenshot", hint="Downloads the image at this width as a PNG file")
         if training is not None:

@@ -182,10 +182,11 @@ class Session:
         self._wake.set()
 
     def _send_screenshot(self) -> None:
-        """Sends the image at full resolution to the browser as a PNG file."""
+        """Sends the image to the browser as a PNG file, as wide as the slider says, also if the canvas is narrower."""
         request = self._request()
         if request is None:
             return
+        request = request._replace(canvas=size_at(request.canvas, request.max_width))
         try:
             image = self._with_truth(request, self._renderer.render(request, 1.0).image)
         except (ValueError, RuntimeError) as error:
