@@ -138,6 +138,21 @@ def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
         gc.enable()
 
 
+@pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
+@pytest.mark.parametrize(("seconds", "shown"), [(60.0, 0.25), (0.0, 0.0)])
+def test_only_a_page_that_connects_at_once_continues_the_one_that_has_left(run, monkeypatch, seconds, shown):
+    monkeypatch.setattr(server, "RELOAD_SECONDS", seconds)
+    with Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer:
+        with Browser(viewer.port, random.Random(0)) as browser:
+            browser.set("time", 0.25)
+            until(lambda: [s for s in list(viewer.sessions.values()) if s.panel.time.value == 0.25])
+        until(lambda: viewer._left is not None)
+        with Browser(viewer.port, random.Random(1)) as browser:
+            browser.look()
+            until(lambda: viewer.sessions)
+            assert [session.panel.time.value for session in viewer.sessions.values()] == [shown]
+
+
 def test_a_port_in_use_is_refused_in_one_line(run, taken, capsys):
     error = error_line(capsys, "view", run, "--port", taken)
     assert f"cannot listen on 127.0.0.1, port {taken}: Address already in use; choose another --port" in error

@@ -21,6 +21,9 @@ MAX_PORT = 65535
 STOP_SECONDS = 0.5
 """Maximum time that the server may take to end [s]; what is left then are daemon threads."""
 
+RELOAD_SECONDS = 5.0
+"""Time within which a page that connects is the reload of the one that has left [s]: viser names no browser tabs."""
+
 CUDA_WIDTH, CPU_WIDTH = 1280, 640
 """Initial width of the images [px], by device."""
 
@@ -75,7 +78,7 @@ class Viewer:
         self._source, self._training = source, training
         self._rendering, self._lock = threading.Lock(), threading.Lock()
         self._stopped = False
-        self._left: PageState | None = None  # what the last page showed, for a reload
+        self._left: tuple[float, PageState] | None = None  # when the last page left, and what it showed
         self.sessions: dict[int, Session] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # without viser's banner
             self._server = _Server(host, port, label=LABEL, verbose=False)
@@ -123,7 +126,8 @@ class Viewer:
         width = CUDA_WIDTH if self._source.device.type == "cuda" else CPU_WIDTH
         set_camera(client.camera, self._start)
         with self._lock:
-            view, self._left = self._left, None
+            left, self._left = self._left, None
+        view = left[1] if left is not None and time.monotonic() - left[0] < RELOAD_SECONDS else None
         session = Session(client, self._source, self._training, self._rendering, width, view)
         with self._lock:
             is_connected = not self._stopped and client.client_id in self._server.get_clients()
@@ -136,7 +140,7 @@ class Viewer:
         with self._lock:
             session = self.sessions.pop(client.client_id, None)
             if session is not None:
-                self._left = session.view()
+                self._left = (time.monotonic(), session.view())
         if session is not None:
             session.stop()
 
