@@ -218,7 +218,7 @@ def test_keys_move_the_time_slider(page, session):
     until(lambda: session.panel.time.value == pytest.approx(before + 0.005))
 
 
-@pytest.mark.parametrize("layer", ["static", "dynamic", "depth", "alpha", "dynamic mask"])
+@pytest.mark.parametrize("layer", ["static", "dynamic", "depth", "alpha", "dynamic weight"])
 def test_the_menu_changes_the_layer(page, session, layer):
     before = seen(page, session)
     page.locator("input[role=combobox]:visible").first.click()

@@ -45,18 +45,18 @@ def test_alpha_is_white_where_the_image_is_opaque():
     assert image[0, 16].tolist() == BLACK
 
 
-def test_the_dynamic_mask_is_white_on_dynamic_gaussians():
-    left, right = sides("dynamic mask")
+def test_the_dynamic_weight_is_white_on_dynamic_gaussians():
+    left, right = sides("dynamic weight")
     assert left == BLACK
     assert min(right) > 200
 
 
-def test_the_dynamic_mask_omits_hidden_gaussians():
+def test_the_dynamic_weight_omits_hidden_gaussians():
     scene = splats()
     front = scene.means.clone()
     front[1] = 2.0 * front[0]  # the dynamic Gaussian is now behind the static one
     hidden = Splats(front, scene.quats, scene.scales, scene.opacities, sh=scene.sh, is_dynamic=scene.is_dynamic)
-    assert max(sides("dynamic mask", hidden)[0]) < 20
+    assert max(sides("dynamic weight", hidden)[0]) < 20
 
 
 def test_depth_is_red_near_blue_far_and_black_where_empty():

@@ -43,7 +43,7 @@ def alpha(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     return _grey(render(splats, camera, settings=settings).joint.alpha[..., None])
 
 
-def dynamic_mask(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
+def dynamic_weight(splats: Splats, camera: Camera, settings: RenderSettings) -> Image:
     """Blend weight of the dynamic Gaussians in the joint image, in grey: those hidden by static ones have none."""
     assert splats.is_dynamic is not None
     weights = replace(splats, colors=splats.is_dynamic.float()[:, None], sh=None, sh_degree=None)
@@ -56,7 +56,7 @@ LAYERS: dict[str, Callable[[Splats, Camera, RenderSettings], Image]] = {
     "dynamic": dynamic,
     "depth": depth,
     "alpha": alpha,
-    "dynamic mask": dynamic_mask,
+    "dynamic weight": dynamic_weight,
 }
 """Layers by name, in the order of the menu. To add one, write its function and add a line here."""
 
