@@ -150,6 +150,10 @@ def test_with_cuda_graphs_joint_images_at_full_resolution_are_replayed(page, ses
     assert np.abs(seen(page, session) - moved).max() < 3
 
 
+def test_the_panel_has_the_name_of_the_run(page, run):
+    page.get_by_text(run.name, exact=True).wait_for()
+
+
 def test_the_panel_lies_beside_the_image(page, session):
     box = page.get_by_role("button", name="Play", exact=True).bounding_box()
     assert session._canvas()[0] < box["x"]

@@ -16,7 +16,6 @@ from .session import Session
 from .source import Source
 from .training_cameras import TrainingCameras
 
-LABEL = "warpgs"
 MAX_PORT = 65535
 STOP_SECONDS = 0.5
 """Maximum time that the server may take to end [s]; what is left then are daemon threads."""
@@ -81,7 +80,7 @@ class Viewer:
         self._left: tuple[float, PageState] | None = None  # when the last page left, and what it showed
         self.sessions: dict[int, Session] = {}
         with contextlib.redirect_stdout(io.StringIO()):  # without viser's banner
-            self._server = _Server(host, port, label=LABEL, verbose=False)
+            self._server = _Server(host, port, label=source.run.folder.resolve().name, verbose=False)
         self.port = self._server.get_port()
         if port not in (0, self.port):
             self.stop()
