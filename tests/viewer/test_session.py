@@ -187,6 +187,14 @@ def test_truth_is_shown_where_and_when_it_was_recorded():
     assert looking(elsewhere, view.time, 0.5)._request().truth is None
 
 
+@pytest.mark.parametrize(("sent", "shown"), [(999, 5), (-3, 1)])
+def test_a_number_beyond_the_training_cameras_is_corrected(sent, shown):
+    here = session(view=sent)
+    here._snap = lambda _: None
+    here._select(TRAINING)
+    assert here.panel.view.value == shown
+
+
 def test_an_outdated_event_shows_nothing():
     """The last click counts, in whichever order the threads run."""
     here = session(show_cameras=False)

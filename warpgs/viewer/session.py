@@ -152,7 +152,7 @@ class Session:
         if training is not None:
             self._client.camera.on_update(lambda _: self._fit(training))
             panel.wipe.on_update(lambda _: self._wake.set())
-            panel.view.on_update(lambda _: self._snap(training))
+            panel.view.on_update(lambda _: self._select(training))
             panel.snap.on_click(lambda _: self._snap(training))
             panel.show_cameras.on_update(lambda _: self._show_cameras(training))
 
@@ -194,6 +194,14 @@ class Session:
             return
         name = f"{self._source.run.folder.resolve().name}-{request.layer.replace(' ', '-')}-{request.time:.3f}.png"
         self._client.send_file_download(name, encode_png(image), save_immediately=True)
+
+    def _select(self, training: TrainingCameras) -> None:
+        """Looks through the selected training camera, and shows its number if there is none of the number typed in."""
+        selected = self._selected(training) + 1
+        if self.panel.view.value != selected:
+            set_value(self.panel.view, selected)  # its handler comes back here
+        else:
+            self._snap(training)
 
     def _snap(self, training: TrainingCameras) -> None:
         """Looks through the training camera that the slider selects, at its time."""
