@@ -253,7 +253,7 @@ def _geometry(capture: Capture, samples: int) -> Iterator[Finding]:
         yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
     if len(capture.points) == 0:
         remedy = "warpgs prepare CAPTURE --add points adds some (after warpgs import, if the layout needs it)"
-        text = f"there are no sparse points: Gaussians are initialized at random positions; {remedy}"
+        text = f"there are no sparse points: Gaussians are randomly initialized; {remedy}"
         yield Finding("warning", "points", text)
         return
     names = _sampled(capture.train, samples)
