@@ -117,6 +117,7 @@ class Capture:
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
+        notes: What the loader says about the files, one sentence each: what it left out or had to interpret.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
@@ -139,6 +140,7 @@ class Capture:
     estimated_masks: bool = False
     read_taken: Callable[[str], TakenFrame] | None = None
     background: Background = "black"
+    notes: Sequence[str] = ()
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)
     extent: float = field(init=False)
@@ -146,7 +148,7 @@ class Capture:
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError(f"{self.name} has no frames to train on")
-        self.train, self.val = tuple(self.train), tuple(self.val)
+        self.train, self.val, self.notes = tuple(self.train), tuple(self.val), tuple(self.notes)
         self.extent = extent_of([self.cameras[name] for name in self.train])
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()

@@ -132,7 +132,9 @@ def check_capture(root: Path, dataset: str | None = None, factor: int | None = N
 
 
 def quick_findings(capture: Capture) -> list[Finding]:
-    """Errors and warnings from the cameras, the points and three frames of an opened capture, in less than a second.
+    """Notes of the loader, and errors and warnings from the cameras, the points and three frames of a capture.
+
+    It takes less than a second.
 
     A capture that is assumed to be static (``Capture.assuming``) may have a single time.
 
@@ -140,7 +142,7 @@ def quick_findings(capture: Capture) -> list[Finding]:
         ValueError: If one of the three frames cannot be read.
     """
     findings = [*_counts(capture), *_geometry(capture.assuming("masks"), QUICK_SAMPLES)]
-    return [f for f in findings if f.level != "note"]
+    return [f for f in findings if f.level != "note" or f.topic == "files"]
 
 
 def _sampled(names: Sequence[str], count: int) -> list[str]:
@@ -148,7 +150,8 @@ def _sampled(names: Sequence[str], count: int) -> list[str]:
 
 
 def _counts(capture: Capture) -> Iterator[Finding]:
-    """Numbers of frames and their times."""
+    """Notes of the loader, numbers of frames and their times."""
+    yield from (Finding("note", "files", text) for text in capture.notes)
     sizes = sorted({camera.size for camera in capture.cameras.values()})
     shown = ", ".join(f"{w}×{h}" for w, h in sizes[:4])
     yield Finding("note", "counts", f"{len(capture.train)} frames to train on, {len(capture.val)} to evaluate, {shown}")

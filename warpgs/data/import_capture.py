@@ -61,9 +61,15 @@ def import_capture(
             f"{source} is read as {describe_layout(source, dataset)}: {len(names)} frames, {counts[0]} with masks, "
             f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
         )
-        if capture.assumption == "dynamic":
-            log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
+        _log_remarks(capture, log)
         log(f"{target} is finished: next run {command('check', target)}")
+
+
+def _log_remarks(capture: Capture, log: Callable[[str], None]) -> None:
+    for note in capture.notes:
+        log(f"note: {note}")
+    if capture.assumption == "dynamic":
+        log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")
 
 
 def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: bool) -> tuple[int, int]:

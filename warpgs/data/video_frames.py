@@ -32,6 +32,7 @@ class VideoFrames:
     Attributes:
         path: The video.
         size: (width, height) of the frames [px].
+        count: Number of frames that the file claims; 0 if it does not say.
 
     Raises:
         ValueError: If the file is missing or not a video.
@@ -41,6 +42,7 @@ class VideoFrames:
         self.path = path
         require_file(path, MAX_BYTES)
         self._kept: dict[int, np.ndarray] = {}
+        self.count = 0
         self._restart()
         self._lock = threading.Lock()
         first = self.read(0)
@@ -82,6 +84,7 @@ class VideoFrames:
                 if not container.streams.video:
                     raise ValueError(f"{self.path} has no video")
                 stream = container.streams.video[0]
+                self.count = stream.frames
                 width, height = stream.codec_context.width, stream.codec_context.height
                 if not 0 < width * height <= MAX_PIXELS:
                     raise ValueError(f"{self.path} claims {width}×{height} pixels, expected 1 to {MAX_PIXELS:,}")

@@ -2,6 +2,7 @@
 
 import math
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resiz
 from warpgs.data.units import SceneUnits
 from warpgs.files import read_numbers
 
+from .left_out import images_left_out
 from .options import LoadOptions
 from .posed import PosedFrame, World, posed_capture
 from .transforms import Transforms
@@ -39,20 +41,21 @@ class BlenderLoader:
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
-        transforms = Transforms(root / TRAIN, options.undistort)
-        train = _frames(transforms, "train")
-        val = []
-        if evaluated is not None:
-            val = _frames(Transforms(evaluated, options.undistort), evaluated.stem.split("_")[1])
+        indices = [Transforms(path, options.undistort) for path in (root / TRAIN, evaluated) if path is not None]
+        train, *others = (_frames(index, index.path.stem.split("_")[1]) for index in indices)
+        val = [frame for frames in others for frame in frames]
         frames = [*train, *val]
         masked = any(frame.static_mask is not None for frame in train)
-        is_white = any(_is_transparent(transforms.image(entry)) for entry in transforms.frames)
+        images = [[index.image(entry) for entry in index.frames] for index in indices]
+        is_white = any(map(_is_transparent, images[0]))
+        listed = f"not listed in {' or '.join(index.path.name for index in indices)}"
         world = World(
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
             assumption="masks" if masked else "dynamic",
             own_times=True,
             background="white" if is_white else "black",
+            notes=images_left_out(root, chain(*images), listed),
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
 

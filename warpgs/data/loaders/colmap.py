@@ -9,6 +9,7 @@ from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.files import first_file, natural_order
 
+from .left_out import images_left_out
 from .options import LoadOptions
 from .posed import (
     PosedFrame,
@@ -44,7 +45,10 @@ class ColmapLoader:
         times = times_of_names(names)
         files = _Files(root, options.factor or 1)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
-        world = World(model.points, model.colors)
+        left_out = images_left_out(
+            root, files.used, f"the model in {folder.relative_to(root)} has no pose for them", files.images
+        )
+        world = World(model.points, model.colors, notes=left_out)
         return posed_capture(root, frames, every_eighth(names), world, options)
 
 
@@ -55,6 +59,7 @@ class _Files:
         reduced = root / f"images_{factor}"
         self.images = reduced if factor > 1 and reduced.is_dir() else root / "images"
         self.masks, self.depths = root / MASKS, root / DEPTHS
+        self.used: list[Path] = []
 
     def frame(self, name: str, image: ModelImage, time: float) -> PosedFrame:
         """A frame of the model.
@@ -66,6 +71,7 @@ class _Files:
         path = first_file(self.images / f for f in (image.name, f"{stem}.png", f"{stem}.jpg"))
         if path is None:
             raise ValueError(f"{self.images / image.name} is missing: the COLMAP model has a camera for it")
+        self.used.append(path)
         mask = first_file(self.masks / f for f in (f"{image.name}.png", f"{stem}.png"))
         depth = first_file(self.depths / f for f in (f"{stem}.npy", f"{stem}.png"))
         return PosedFrame(

@@ -30,6 +30,7 @@ from warpgs.data.writer import ESTIMATED, GIVEN
 from warpgs.errors import command
 from warpgs.files import first_file, read_json
 
+from .left_out import images_left_out
 from .options import LoadOptions
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
@@ -85,6 +86,7 @@ class NerfiesLoader(ABC):
 
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
         depths = [files[name].depth for name in split.train]
+        listed = f"the split of {split.source.name} uses them neither for training nor for evaluation"
         return Capture(
             root.resolve().name,
             cameras,
@@ -97,6 +99,7 @@ class NerfiesLoader(ABC):
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             read_taken=taken_reader(reader.read_with, lenses),
+            notes=images_left_out(root, (file.image for file in files.values()), listed),
         )
 
 

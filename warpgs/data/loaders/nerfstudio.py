@@ -1,6 +1,7 @@
 """nerfstudio: transforms.json, as ns-process-data, Polycam, Record3D, KIRI Engine and instant-ngp write it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from warpgs.data.ply import read_ply_points
 from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
 from warpgs.files import natural_order, read_numbers
 
+from .left_out import images_left_out
 from .options import LoadOptions
 from .posed import (
     PosedFrame,
@@ -63,7 +65,11 @@ class NerfstudioLoader:
         by_image = {image.resolve(): name for image, name in zip(images, names, strict=True)}
         val, ignored = _evaluated(transforms, by_image)
         kept = [frame for frame in frames if frame.name not in ignored]
-        return posed_capture(root, kept, val, _world(transforms), options)
+        notes = images_left_out(root, images, f"not listed in {INDEX}")
+        if ignored:
+            lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
+            notes += (f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}",)
+        return posed_capture(root, kept, val, replace(_world(transforms), notes=notes), options)
 
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:

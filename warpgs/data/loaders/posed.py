@@ -75,7 +75,7 @@ class World:
         units: Scene units; around points and cameras if None, and wider than the cameras without points.
         assumption: What is dynamic where the frames have no masks.
         own_times: Whether times are in [0, 1] already.
-        background: Colour behind everything; see ``Capture``.
+        background, notes: See ``Capture``.
     """
 
     points: Float[np.ndarray, "P 3"] | None
@@ -84,6 +84,7 @@ class World:
     assumption: Assumption = "masks"
     own_times: bool = False
     background: Background = "black"
+    notes: Sequence[str] = ()
 
 
 def posed_capture(
@@ -105,9 +106,8 @@ def posed_capture(
     if not options.depth:
         frames = [replace(frame, inverse_depth=None) for frame in frames]
     by_name = {frame.name: frame for frame in frames}
-    points, colors = world.points, world.colors
-    if points is None:
-        points, colors = points_of_depth(frames, options.undistort)
+    given = None if world.points is None else (world.points, world.colors)
+    points, colors = given or points_of_depth(frames, options.undistort)
     centers = np.array([frame.center for frame in frames])
     units = world.units or (scene_units(points, centers) if len(points) else units_around(centers))
     cameras, lenses = _cameras(root, frames, units, world.own_times, options)
@@ -125,6 +125,7 @@ def posed_capture(
         world.assumption,
         read_taken=taken_reader(reader.read_with, lenses),
         background=world.background,
+        notes=world.notes,
     )
 
 

@@ -78,7 +78,11 @@ class VipeLoader:
                 )
             )
         val = every_eighth([frame.name for frame in frames])
-        return posed_capture(root, frames, val, World(points=None), options)
+        notes = []
+        if without := max(0, video.count - len(frames)):
+            where = f"pose/{name}.npz has no pose for them"
+            notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are left out: {where}")
+        return posed_capture(root, frames, val, World(points=None, notes=notes), options)
 
 
 def _video_name(root: Path) -> str:
