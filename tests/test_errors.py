@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.data.check import Finding
+from warpgs.data.findings import Finding
 from warpgs.errors import (
     ADVICE,
     CLOSED,

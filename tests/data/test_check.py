@@ -16,7 +16,8 @@ from tests.data import captures, layouts
 from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
 from warpgs.data import loaders
-from warpgs.data.check import DEPTH_PROBLEMS, check_capture, quick_findings
+from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.depth_check import DEPTH_PROBLEMS
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between

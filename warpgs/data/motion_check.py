@@ -1,6 +1,8 @@
 """Motion between two frames that their cameras do not explain, inside and outside the mask."""
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -9,7 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
 
-from .capture import Frame
+from .capture import Capture, Frame
+from .findings import Finding, Level
+from .sampling import evenly_spaced
 
 MIN_SIDE, MAX_ASPECT = 16, 16
 """Minimum side [px] and maximum ratio of the sides: OpenCV's optical flow crashes on images beyond them."""
@@ -27,6 +31,49 @@ frames of a slow video."""
 MAX_ANGLE = 30.0
 """Maximum angle between the orientations of two cameras; optical flow between views farther apart is no evidence
 [degrees]."""
+
+MAX_EPIPOLAR_DISTANCE = 3.0
+"""Maximum median distance of static pixels from their epipolar lines [px]; more means that cameras and images do not
+match."""
+
+
+def check_motion(capture: Capture, num_frames: int) -> Iterator[Finding]:
+    """Compares masks and cameras with the motion in the images."""
+    inside, outside = [], []
+    for first, second in _pairs(capture, num_frames):
+        found = motion_between(capture.frame(first), capture.frame(second))
+        if found is None:
+            continue
+        outside.append(found.static)
+        if found.dynamic is not None:
+            inside.append(found.dynamic - found.static)
+    if not outside:
+        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
+        yield Finding("note", "cameras", f"{text}, to compare their motion")
+        return
+    static = float(np.median(outside))
+    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
+    hint = ": the cameras may not match the images" if level == "warning" else ""
+    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
+    if len(inside) < 3:
+        return
+    more = float(np.mean(np.array(inside) > 0))
+    if more < 0.25 and float(np.median(inside)) < -0.2:
+        text = (
+            "static regions of the masks move more than dynamic ones: the masks may be inverted (0 must mean dynamic)"
+        )
+        yield Finding("error", "masks", text)
+    else:
+        text = f"dynamic pixels are farther off their epipolar lines than static ones in {more:.0%} of the frames"
+        yield Finding("note", "masks", text)
+
+
+def _pairs(capture: Capture, num_frames: int) -> list[tuple[str, str]]:
+    """Frames that follow each other in time, of cameras that are not far apart, evenly spread over the capture."""
+    cameras = capture.cameras
+    names = sorted(capture.train, key=lambda name: cameras[name].time)
+    pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
+    return evenly_spaced(pairs, num_frames)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,14 @@
 """Tells from a capture's images whether its camera only turns, whatever its cameras say."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
 
-from .capture import Frame
+from .capture import MIN_EXTENT, Capture, Frame
+from .findings import Finding
+from .sampling import evenly_spaced
 from .turning import MIN_MATCHES, Matches, Turning, find_turning
 
 COMPARED_SIDE = 512
@@ -22,6 +24,28 @@ MAX_RATIO = 0.8
 
 MAX_EPIPOLAR_ERROR = 2.0
 """Maximum distance of a match from its epipolar line, above which it does not count [px]."""
+
+
+def check_turning(capture: Capture, num_frames: int) -> Iterator[Finding]:
+    """Whether the images show parallax at all."""
+    names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+    found = turning_of([capture.frame(name) for name in evenly_spaced(names, num_frames)])
+    if found is None or not any(turning.only_turns for turning in found):
+        return
+    searched, known = (f"{turning.explained:.0%}" for turning in found)
+    if all(turning.only_turns for turning in found):
+        text = (
+            f"the camera only turns: a rotation explains {searched} of the matches between frames, so depth and "
+            "positions are undetermined; move the camera sideways"
+        )
+        # Cameras that all stand at one place say so themselves, as those of warpgs prepare --camera turning do.
+        yield Finding("error" if capture.extent > MIN_EXTENT else "warning", "cameras", text)
+    else:
+        text = (
+            f"a rotation explains {searched} of the matches between frames with the best focal length, {known} with "
+            "that of the cameras: the camera only turns and its focal length is wrong, or it moves before a plane"
+        )
+        yield Finding("warning", "cameras", text)
 
 
 def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:

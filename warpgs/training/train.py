@@ -8,8 +8,9 @@ from pathlib import Path
 
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
-from warpgs.data.check import Finding, quick_findings
+from warpgs.data.check import quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
+from warpgs.data.findings import Finding
 from warpgs.data.loaders import describe_layout
 from warpgs.errors import command
 from warpgs.evaluation.evaluate import check_views
