@@ -19,13 +19,16 @@ import pytest
 
 from warpgs.files import (
     complete_or_absent,
+    first_file,
     kept_if_used,
     natural_order,
     partial_path,
     read_array,
     read_bounded,
+    read_json,
     read_numbers,
     remove_numbered,
+    require_file,
     write_array,
     write_bytes,
     write_json,
@@ -276,9 +279,52 @@ def test_a_large_file_without_content_is_refused_by_its_size(tmp_path, read):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_a_file_that_holds_more_than_its_size_is_refused():
-    with pytest.raises(ValueError, match="/proc/self/status changes while it is read"):
-        read_bounded(Path("/proc/self/status"), 1 << 20)
+@pytest.mark.parametrize("read", [read_bounded, require_file, read_array])
+def test_a_file_whose_size_says_nothing_about_its_content_is_refused(read, tmp_path):
+    for name, message in (("status", "is not a plain file"), ("mem", "cannot be read"), ("clear_refs", "cannot be")):
+        with pytest.raises(ValueError, match=f"^/proc/self/{name} {message}"):
+            read(Path("/proc/self") / name, 1 << 20)
+    (tmp_path / "empty").touch()
+    assert require_file(tmp_path / "empty", 1 << 20) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": ' + "9" * 400 + "}", r"a has an integer of more than 64 bits, 9{18}\.\.\.9+$"),
+        ('{"a": {"b": [1, -' + "9" * 400 + "]}}", "b has an integer of more than 64 bits"),
+        ('{"a": ' + "9" * 5000 + "}", "is not valid JSON: an integer has thousands of digits$"),
+        ('{"a":' * 64 + "1" + "}" * 64, None),
+        ('{"a":' * 65 + "1" + "}" * 65, "is nested deeper than 64 levels$"),
+        ('{"a":' + "[" * 64 + "]" * 64 + "}", "is nested deeper than 64 levels$"),
+        ("[" * 100_000, "is not valid JSON: it is nested deeper than 64 levels$"),
+        ('{"a": 1, "b": 2, "a": 1}', "is not valid JSON: one object has 'a' twice$"),
+        ('{"a": 18446744073709551616, "b": 1.5}', None),
+        ('{"a": NaN, "b": 1e999}', None),  # whoever reads a number checks that it is finite
+        ("\ufeff{}", None),
+        ("[1]", "must hold a JSON object, got list$"),
+    ],
+)
+def test_json_that_no_reader_expects_is_refused_by_name(path, text, message):
+    write_text(path, text)
+    if message is None:
+        assert isinstance(read_json(path), dict)
+    else:
+        with pytest.raises(ValueError, match=rf"^{re.escape(str(path))}:? {message}") as caught:
+            read_json(path)
+        assert len(str(caught.value)) < 200 + len(str(path))
+
+
+def test_the_last_of_many_names_that_is_there_twice_is_found_at_once(path):
+    write_text(path, "{" + ",".join(f'"{k}":0' for k in [*range(200_000), 199_999]) + "}")
+    start = time.process_time()
+    with pytest.raises(ValueError, match="one object has '199999' twice"):
+        read_json(path)
+    assert time.process_time() - start < 5.0
+
+
+def test_a_name_that_is_too_long_for_the_file_system_is_no_file(tmp_path):
+    assert first_file([tmp_path / ("a" * 5000), tmp_path / "missing"]) is None
 
 
 def test_numbers_are_read_with_their_shape():

@@ -16,6 +16,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from errno import ENAMETOOLONG
 from itertools import count
 from pathlib import Path
 from tokenize import TokenError
@@ -25,6 +26,9 @@ import cv2
 import numpy as np
 from filelock import FileLock, Timeout
 from jaxtyping import Float, Shaped, UInt
+
+from .command_line import posix
+from .parsed import parse_json
 
 MAX_JSON = 64 << 20
 """Maximum size of a JSON file [bytes]; metadata.json of a long capture has a few MiB."""
@@ -41,8 +45,18 @@ MAX_NPY_HEADER = 1 << 20
 
 
 def first_file(paths: Iterable[Path]) -> Path | None:
-    """The first of some paths that is a file."""
-    return next((path for path in paths if path.is_file()), None)
+    """The first of some paths that is a file; a name that the file system refuses is none."""
+    return next((path for path in paths if is_file(path)), None)
+
+
+def is_file(path: Path) -> bool:
+    """Whether a path is a file; one with a name that is too long for the file system is none."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        if error.errno != ENAMETOOLONG:
+            raise
+        return False
 
 
 def natural_order(name: str) -> tuple[list[str | tuple[int, str]], str]:
@@ -253,7 +267,20 @@ def require_file(path: Path, max_bytes: int, hint: str = "") -> int:
         raise ValueError(f"{path} is not a file")
     if info.st_size > max_bytes:
         raise ValueError(f"{path} has {info.st_size:,} bytes, more than the maximum of {max_bytes:,}")
+    if info.st_size == 0:
+        _require_empty(path)
     return info.st_size
+
+
+def _require_empty(path: Path) -> None:
+    """Refuses a file that states no size but has content, or cannot be read: such files of /proc may never end."""
+    try:
+        with open(os.open(path, posix.NONBLOCKING), "rb", buffering=0) as file:
+            content = file.read(1)  # None if it would have to wait
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    if content != b"":
+        raise ValueError(f"{path} is not a plain file: it has content, but its size is 0")
 
 
 def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
@@ -279,14 +306,7 @@ def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str
     Raises:
         ValueError: If the file is missing or too large, is not JSON, or holds something other than an object.
     """
-    data = read_bounded(path, max_bytes, hint)
-    try:
-        value = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(value, dict):
-        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}")
-    return value
+    return parse_json(path, read_bounded(path, max_bytes, hint))
 
 
 _parsing_headers = threading.Lock()

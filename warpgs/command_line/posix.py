@@ -18,6 +18,9 @@ PR_SET_PDEATHSIG = 1
 M_ARENA_MAX = -8
 """Option of glibc's mallopt: the maximum number of its pools of memory."""
 
+NONBLOCKING = getattr(os, "O_NONBLOCK", 0)
+"""Flag with which opening and reading a file never waits; 0 on Windows, which has no such files."""
+
 
 def lower_priority(niceness: int) -> None:
     """Lets other processes have the processor first; not on Windows."""

@@ -23,6 +23,15 @@ LINES = {0: 1, 2: 1, 3: 16}
 PIXEL_TYPES: dict[int, np.dtype] = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 
 
+MAX_CHANNELS = 64
+"""Maximum number of channels."""
+
+MAX_RATIO = 1032
+"""Bytes that deflate makes of one at most."""
+
+DAMAGED = "damaged or truncated OpenEXR data"
+
+
 class _Header(NamedTuple):
     channels: list[tuple[str, np.dtype]]
     compression: int
@@ -32,24 +41,41 @@ class _Header(NamedTuple):
     end: int
 
 
-def read_exr_channel(data: bytes, channel: str) -> Float[np.ndarray, "H W"]:
+def exr_size(data: bytes) -> tuple[int, int]:
+    """Width and height of the content of a file, without decoding it; raises as ``read_exr_channel``."""
+    header = _header(data)
+    return header.width, header.height
+
+
+def read_exr_channel(data: bytes, channel: str, max_pixels: int = MAX_PIXELS) -> Float[np.ndarray, "H W"]:
     """A channel of floating-point numbers, as float32.
 
     Args:
         data: Content of the file.
         channel: Name of the channel, such as "Z".
+        max_pixels: Maximum number of pixels.
 
     Raises:
-        ValueError: If the data are damaged or truncated, of another kind, or lack the channel.
+        ValueError: If the data are damaged or truncated, of another kind, too large, or lack the channel; before
+            memory is allocated for more than they can hold.
     """
+    header = _header(data)
+    if header.width * header.height > max_pixels:
+        raise ValueError(f"an OpenEXR image of {header.width}×{header.height} pixels, more than {max_pixels:,}")
     try:
-        header = _header(data)
         return _pixels(data, header, channel)
-    except (struct.error, zlib.error, IndexError, UnicodeDecodeError) as error:
-        raise ValueError("damaged or truncated OpenEXR data") from error
+    except (struct.error, zlib.error) as error:
+        raise ValueError(DAMAGED) from error
 
 
 def _header(data: bytes) -> _Header:
+    try:
+        return _parse_header(data)
+    except (struct.error, IndexError, UnicodeDecodeError) as error:
+        raise ValueError(DAMAGED) from error
+
+
+def _parse_header(data: bytes) -> _Header:
     (flags,) = struct.unpack_from("<I", data, 4)
     if data[:4] != MAGIC or flags & (TILED | MULTI_PART | DEEP):
         raise ValueError("not an OpenEXR file of scan lines in one part")
@@ -59,7 +85,7 @@ def _header(data: bytes) -> _Header:
         _, start = _string(data, start)
         (size,) = struct.unpack_from("<i", data, start)
         if not 0 <= size <= len(data) - start - 4:
-            raise ValueError("damaged or truncated OpenEXR data")
+            raise ValueError(DAMAGED)
         attributes[name] = data[start + 4 : start + 4 + size]
         start += 4 + size
     if not {"channels", "compression", "dataWindow"} <= attributes.keys():
@@ -77,7 +103,7 @@ def _header(data: bytes) -> _Header:
 def _string(data: bytes, start: int) -> tuple[str, int]:
     end = data.index(b"\0", start, start + 256) if b"\0" in data[start : start + 256] else -1
     if end < 0:
-        raise ValueError("damaged or truncated OpenEXR data")
+        raise ValueError(DAMAGED)
     return data[start:end].decode("ascii"), end + 1
 
 
@@ -91,6 +117,10 @@ def _channels(data: bytes) -> list[tuple[str, np.dtype]]:
             raise ValueError(f"an OpenEXR channel {name} that is subsampled or of unknown type")
         found.append((name, PIXEL_TYPES[kind]))
         start += 16
+    if len(found) > MAX_CHANNELS or len(dict(found)) < len(found):
+        raise ValueError(
+            f"an OpenEXR file of {len(found)} channels, expected at most {MAX_CHANNELS} of different names"
+        )
     return found
 
 
@@ -99,30 +129,41 @@ def _pixels(data: bytes, header: _Header, channel: str) -> Float[np.ndarray, "H 
     if channel not in names or dict(header.channels)[channel].kind != "f":
         raise ValueError(f"no floating-point channel {channel} among the OpenEXR channels {', '.join(names)}")
     line = np.dtype([(name, kind, (header.width,)) for name, kind in header.channels])
-    lines = LINES[header.compression]
-    num_blocks = -(-header.height // lines)
+    blocks = _stored_blocks(data, header, line.itemsize)
     result = np.empty((header.height, header.width), np.float32)
-    for offset in struct.unpack_from(f"<{num_blocks}Q", data, header.end):
-        y, size = struct.unpack_from("<ii", data, offset) if offset < len(data) else (header.top - 1, 0)
-        row = y - header.top
-        if not 0 <= row < header.height or row % lines or not 0 < size <= len(data) - offset - 8:
-            raise ValueError("damaged or truncated OpenEXR data")
-        count = min(lines, header.height - row)
-        block = _block(data[offset + 8 : offset + 8 + size], count * line.itemsize)
-        result[row : row + count] = np.frombuffer(block, line, count)[channel]
+    for row, stored in blocks.items():
+        count = min(LINES[header.compression], header.height - row)
+        result[row : row + count] = np.frombuffer(_block(stored, count * line.itemsize), line, count)[channel]
     return result
 
 
-def _block(stored: bytes, size: int) -> bytes:
+def _stored_blocks(data: bytes, header: _Header, line_size: int) -> dict[int, memoryview]:
+    """The stored bytes of every block by its first row; there must be enough of them for the pixels of the header."""
+    lines, view = LINES[header.compression], memoryview(data)
+    blocks: dict[int, memoryview] = {}
+    for offset in struct.unpack_from(f"<{-(-header.height // lines)}Q", data, header.end):
+        y, size = struct.unpack_from("<ii", data, offset) if offset < len(data) else (header.top - 1, 0)
+        row = y - header.top
+        if not 0 <= row < header.height or row % lines or row in blocks or not 0 < size <= len(data) - offset - 8:
+            raise ValueError(DAMAGED)
+        if min(lines, header.height - row) * line_size > MAX_RATIO * size:
+            raise ValueError(DAMAGED)
+        blocks[row] = view[offset + 8 : offset + 8 + size]
+    if sum(map(len, blocks.values())) > len(data):  # one piece of it in many blocks
+        raise ValueError(DAMAGED)
+    return blocks
+
+
+def _block(stored: memoryview, size: int) -> bytes | memoryview:
     """The bytes of a block: stored as they are if that is shorter; else differences of reordered bytes, deflated."""
     if len(stored) == size:
         return stored
     inflated = zlib.decompressobj().decompress(stored, size + 1)
     if len(inflated) != size:
-        raise ValueError("damaged or truncated OpenEXR data")
-    values = np.frombuffer(inflated, np.uint8).astype(np.int64)
-    values[1:] -= 128
-    ordered = (np.cumsum(values) & 255).astype(np.uint8)
+        raise ValueError(DAMAGED)
+    values = np.frombuffer(inflated, np.uint8).copy()
+    values[1:] -= np.uint8(128)  # modulo 256, as the sums
+    ordered = np.cumsum(values, dtype=np.uint8)
     result, half = np.empty(size, np.uint8), (size + 1) // 2
     result[0::2], result[1::2] = ordered[:half], ordered[half:]
-    return result.tobytes()
+    return result.data

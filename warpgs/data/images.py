@@ -228,6 +228,11 @@ def is_bright(stored: Shaped[np.ndarray, "H W ..."]) -> Bool[np.ndarray, "H W"]:
     return stored > largest // 2
 
 
+def max_depth_pixels(size: tuple[int, int]) -> int:
+    """Maximum number of pixels of the depth of an image of a (width, height)."""
+    return max(MIN_MAX_DEPTH_PIXELS, min(MAX_PIXELS, MAX_DEPTH_FACTOR**2 * size[0] * size[1]))
+
+
 def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     """An 8- or 16-bit image, scaled to [0, 1], or a .npy file, resized to ``size`` (width, height).
 
@@ -239,7 +244,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
         ValueError: If the file is missing or damaged, or does not hold an [H, W] array.
     """
     values: np.ndarray
-    max_pixels = max(MIN_MAX_DEPTH_PIXELS, min(MAX_PIXELS, MAX_DEPTH_FACTOR**2 * size[0] * size[1]))
+    max_pixels = max_depth_pixels(size)
     if path.suffix == ".npy":
         values = read_array(path, max_pixels).astype(np.float32)
         values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values

@@ -5,8 +5,8 @@ fx, fy, cx, cy [px], rgb/<video>.mp4 the frames, depth/<video>.zip depth in the 
 mask/<video>.zip instances of objects that can move (<frame>.png, 0 = none), mask/<video>.txt their names.
 """
 
-import zipfile
-import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,14 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from warpgs.data.archive import Archive
 from warpgs.data.capture import Capture
-from warpgs.data.exr import read_exr_channel
-from warpgs.data.images import decode_bytes
+from warpgs.data.exr import exr_size, read_exr_channel
+from warpgs.data.images import decode_bytes, max_depth_pixels
 from warpgs.data.lens import Lens
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import check_shape, inverse_of, resize, resize_mask
 from warpgs.data.video_frames import VideoFrames
-from warpgs.files import read_bounded, require_file
+from warpgs.files import read_bounded
 
 from .options import LoadOptions
 from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
@@ -31,13 +32,14 @@ PINHOLE = "PINHOLE"
 NOT_OBJECTS = ("sky",)
 """Instances that do not move."""
 
-MAX_ARCHIVE = 64 << 30
-"""Maximum size of a .zip file [bytes]."""
-
 MAX_MEMBER = 1 << 30
-"""Maximum size of a file in it [bytes]."""
+"""Maximum size of an image or depth in a .zip file [bytes]."""
 
 MAX_TEXT = 64 << 20
+"""Maximum size of other files [bytes]."""
+
+MAX_DIGITS = 9
+"""Maximum number of digits of the number of an instance."""
 
 
 class VipeLoader:
@@ -57,15 +59,15 @@ class VipeLoader:
         video = VideoFrames(root / f"rgb/{name}.mp4")
         _check_cameras(root / f"intrinsics/{name}_camera.txt")
         lenses = _lenses(root / f"intrinsics/{name}.npz", video.size)
-        depths = _Archive.open(root / f"depth/{name}.zip") if options.depth else None
-        masks = _Archive.open(root / f"mask/{name}.zip")
+        depths = _archive(root / f"depth/{name}.zip") if options.depth else None
+        masks = _archive(root / f"mask/{name}.zip")
         still = _still_instances(root / f"mask/{name}.txt")
         frames = []
         for index, pose in sorted(poses.items()):
             if index not in lenses:
                 raise ValueError(f"{root}/intrinsics/{name}.npz has no intrinsics of frame {index}")
-            read_mask = masks and masks.reader(f"{index:05d}.png")
-            read_depth = depths and depths.reader(f"{index:05d}.exr")
+            read_mask = _member(masks, f"{index:05d}.png")
+            read_depth = _member(depths, f"{index:05d}.exr")
             frames.append(
                 PosedFrame(
                     f"{index:05d}",
@@ -140,47 +142,18 @@ def _still_instances(path: Path) -> list[int]:
     if not path.is_file():
         return []
     lines = read_bounded(path, MAX_TEXT).decode(errors="replace").splitlines()
-    pairs = (line.partition(":") for line in lines)
-    return [int(k) for k, _, phrase in pairs if k.strip().isdecimal() and phrase.strip() in NOT_OBJECTS]
-
-
-class _Archive:
-    """A .zip file whose members are read one at a time."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        require_file(path, MAX_ARCHIVE)
-        try:
-            with zipfile.ZipFile(path) as archive:
-                self._sizes = {info.filename: info.file_size for info in archive.infolist()}
-        except (zipfile.BadZipFile, OSError, NotImplementedError) as error:
-            raise ValueError(f"{path} is damaged or not a .zip file: {error}") from error
-
-    @staticmethod
-    def open(path: Path) -> "_Archive | None":
-        """The archive; None if there is no such file."""
-        return _Archive(path) if path.exists() else None
-
-    def reader(self, name: str) -> "_Member | None":
-        """The member of a name; None if there is none."""
-        return _Member(self, name) if name in self._sizes else None
-
-    def read(self, name: str) -> bytes:
-        """The content of a member."""
-        if self._sizes[name] > MAX_MEMBER:
-            raise ValueError(f"{self.path}: {name} has {self._sizes[name]:,} bytes, more than {MAX_MEMBER:,}")
-        try:
-            with zipfile.ZipFile(self.path) as archive, archive.open(name) as file:
-                return file.read(MAX_MEMBER)
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError) as error:
-            raise ValueError(f"{self.path}: {name} is damaged: {error}") from error
+    pairs = [(k.strip(), phrase.strip()) for k, _, phrase in (line.partition(":") for line in lines)]
+    still = [k for k, phrase in pairs if k.isdecimal() and phrase in NOT_OBJECTS]
+    if invalid := [k for k in still if len(k) > MAX_DIGITS]:
+        raise ValueError(f"{path}: an instance has a number of {len(invalid[0])} digits, expected at most {MAX_DIGITS}")
+    return [int(k) for k in still]
 
 
 @dataclass(frozen=True)
 class _Member:
     """A file in an archive; ``path`` is for messages."""
 
-    archive: _Archive
+    archive: Archive
     name: str
 
     @property
@@ -188,7 +161,17 @@ class _Member:
         return self.archive.path / self.name
 
     def read(self) -> bytes:
-        return self.archive.read(self.name)
+        return self.archive.read(self.name, MAX_MEMBER)
+
+
+def _archive(path: Path) -> Archive | None:
+    """An archive; None if there is no such file."""
+    return Archive(path) if path.exists() else None
+
+
+def _member(archive: Archive | None, name: str) -> _Member | None:
+    """The member of a name; None if there is none."""
+    return None if archive is None or name not in archive.sizes else _Member(archive, name)
 
 
 def _image(video: VideoFrames, index: int, size: Size) -> np.ndarray:
@@ -204,9 +187,19 @@ def _static_mask(member: _Member, still: list[int], size: Size) -> Bool[np.ndarr
 
 
 def _inverse_depth(member: _Member, size: Size) -> Float[np.ndarray, "H W"]:
-    try:
-        depth = read_exr_channel(member.read(), "Z")
-    except ValueError as error:
-        raise ValueError(f"{member.path}: {error}") from error
-    check_shape(member.path, "the depth", (depth.shape[1], depth.shape[0]), size)
+    data = member.read()
+    with _naming(member.path):
+        stored = exr_size(data)
+    check_shape(member.path, "the depth", stored, size)
+    with _naming(member.path):
+        depth = read_exr_channel(data, "Z", max_depth_pixels(size))
     return inverse_of(depth, size)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Puts a path before the message of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error

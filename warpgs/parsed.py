@@ -1,0 +1,74 @@
+"""Parsed JSON and TOML, with bounds on what no reader expects: deep nesting, huge integers, a name twice."""
+
+import json
+import reprlib
+from pathlib import Path
+from typing import Any
+
+MAX_NESTING = 64
+"""Maximum depth of objects and lists inside each other."""
+
+MAX_INTEGER = 1 << 64
+"""Maximum magnitude of an integer: larger ones do not fit into arrays, or into floating-point numbers at all."""
+
+
+def parse_json(source: Path | str, data: bytes | str) -> dict[str, Any]:
+    """The JSON object of a text.
+
+    Args:
+        source: Where the text comes from, for messages.
+        data: The text.
+
+    Raises:
+        ValueError: If it is not JSON, holds something other than an object, or fails ``check_parsed``.
+    """
+    try:
+        value = json.loads(data, object_pairs_hook=_distinct)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{source} is not valid JSON: {reason(error)}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{source} must hold a JSON object, got {type(value).__name__}")
+    check_parsed(source, value)
+    return value
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        seen: set[str] = set()
+        for name, _ in pairs:
+            if name in seen:
+                raise ValueError(f"one object has {reprlib.repr(name)} twice")
+            seen.add(name)
+    return values
+
+
+def reason(error: Exception) -> str:
+    """Why a parser of JSON or TOML refused a text, without advice for programmers."""
+    if isinstance(error, RecursionError):
+        return f"it is nested deeper than {MAX_NESTING} levels"
+    return "an integer has thousands of digits" if "int_max_str_digits" in str(error) else str(error)
+
+
+def check_parsed(source: Path | str, value: dict[str, Any]) -> None:
+    """Refuses what no reader expects in parsed JSON or TOML.
+
+    Args:
+        source: Where it comes from, for messages.
+        value: The parsed object.
+
+    Raises:
+        ValueError: If it is nested deeper than ``MAX_NESTING``, or has an integer larger than ``MAX_INTEGER``.
+    """
+    level: list[tuple[str, Any]] = [("", value)]
+    for _ in range(MAX_NESTING):
+        below: list[tuple[str, Any]] = []
+        for name, outer in level:
+            for key, inner in outer.items() if isinstance(outer, dict) else ((name, inner) for inner in outer):
+                if isinstance(inner, dict | list):
+                    below.append((key, inner))
+                elif isinstance(inner, int) and abs(inner) > MAX_INTEGER:
+                    raise ValueError(f"{source}: {key:.60} has an integer of more than 64 bits, {reprlib.repr(inner)}")
+        level = below
+    if level:
+        raise ValueError(f"{source} is nested deeper than {MAX_NESTING} levels")
