@@ -1,5 +1,6 @@
 """One training step: render the three images, compare them with the ground truth, take one step of Adam."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -26,6 +27,9 @@ from .schedule import IterationPlan, Phase
 from .step_inputs import StepInputs
 from .views import View, Views
 
+STEPS = "iterations"
+"""Name of the number of iterations among the sums of loss terms."""
+
 DECIBELS = -10.0
 """PSNR is this times the base-10 logarithm of the mean squared error."""
 
@@ -50,10 +54,12 @@ class Means(NamedTuple):
     """Means over the iterations since the last check.
 
     Attributes:
-        terms: Each loss term, weighted; 0 where it was not active.
+        loss: The whole loss.
+        terms: Each loss term, weighted, over the iterations that computed it; without terms that none computed.
         psnr: PSNR of the joint image [dB], without the Gaussians that ``model.dropout`` omits.
     """
 
+    loss: float
     terms: dict[str, float]
     psnr: float
 
@@ -92,9 +98,10 @@ class Step:
         self.config, self.scene, self.views, self.extent = config, scene, views, extent
         device = views.device
         self.alignments, self._depth_trust = alignments, depth_trust
-        sums = (*TERMS, "psnr", "iterations")
+        sums = (*TERMS, "psnr", STEPS)
         self._inputs = StepInputs(sums, optim.GROUPS, device)
         self._sums = torch.zeros(len(sums), device=device)
+        self._counts: Counter[str] = Counter()  # iterations with each term since the last check, and of all
         self._zero, self._one = torch.zeros((), device=device), torch.ones((), device=device)
         self.optimizer = optim.make_optimizer(self.parameters(), self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
@@ -116,13 +123,14 @@ class Step:
     def __call__(self, plan: IterationPlan, sample: Sample) -> None:
         """Runs one iteration."""
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
+        self._counts.update([STEPS, *(name for name in self._active(plan.phase) if weights[name])])
         background = background_color(self.views.background)
         self._inputs.send(
             time_noise=sample.time_noise,
             dropout_seed=sample.dropout_seed,
             background=background,
             dynamic_background=background if self.views.background == "white" else sample.background.tolist(),
-            scales={**weights, "psnr": DECIBELS, "iterations": 1.0},
+            scales={**weights, "psnr": DECIBELS, STEPS: 1.0},
             learning_rates=optim.learning_rates(self.config.optim, self.extent, plan),
         )
         self.views.select(sample.view)
@@ -138,9 +146,13 @@ class Step:
     def take_means(self) -> Means:
         """Means over the iterations of all ranks since the last call; waits for the device."""
         ranks.add_(self._sums)
-        *terms, psnr, iterations = self._sums.tolist()
+        *sums, psnr, iterations = self._sums.tolist()
         self._sums.zero_()
-        return Means({name: value / iterations for name, value in zip(TERMS, terms, strict=True)}, psnr / iterations)
+        means = {name: value / iterations for name, value in zip(TERMS, sums, strict=True)}
+        # Each rank does as many iterations as this one.
+        counts, self._counts = self._counts, Counter()
+        terms = {name: means[name] * (counts[STEPS] / counts[name]) for name in TERMS if counts[name]}
+        return Means(sum(means.values()), terms, psnr / iterations)
 
     def _run(self, phase: Phase) -> tuple[Tensor, ...]:
         """All that happens on the device."""
@@ -157,7 +169,7 @@ class Step:
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
-        terms = {name: term.compute(inputs) for name, term in TERMS.items() if term.is_active(phase, config)}
+        terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()
         optim.average_gradients(self.optimizer)
@@ -166,6 +178,10 @@ class Step:
         self.statistics.observe(rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
+
+    def _active(self, phase: Phase) -> list[str]:
+        """The terms of the loss that are computed in a phase."""
+        return [name for name, term in TERMS.items() if term.is_active(phase, self.config.loss)]
 
     @torch.no_grad()
     def _is_hidden(self, view: View) -> Bool[Tensor, " N"]:

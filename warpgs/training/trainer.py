@@ -272,12 +272,11 @@ class Trainer:
         Gaussians that are not finite are culled, so the loss alone does not reveal them.
         """
         means = self.step.take_means()
-        loss = sum(means.terms.values())
         finite = torch.stack([parameter.isfinite().all() for parameter in self.step.parameters().values()]).all()
-        if not math.isfinite(loss) or not bool(finite):
+        if not math.isfinite(means.loss) or not bool(finite):
             return None
         counts = len(self.scene.static), len(self.scene.dynamic)
-        status = Status(self.iteration, phase.stage, loss, means.psnr, means.terms, *counts)
+        status = Status(self.iteration, phase.stage, means.loss, means.psnr, means.terms, *counts)
         logger.report(status)
         return status
 
