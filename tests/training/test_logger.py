@@ -42,7 +42,10 @@ def test_a_report_is_one_line(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("start", "reports", "speed", "later"),
-    [(0, {100.0: 100, 20.0: 200}, "1.0", "5.0 it/s  60 s"), (400, {5.0: 450, 20.0: 460}, "10.0", "0.5 it/s  80 s")],
+    [
+        (0, {100.0: 100, 20.0: 200}, "1.0", "5.0 it/s  0:01:00"),
+        (400, {5.0: 450, 20.0: 460}, "10.0", "0.5 it/s  0:01:20"),
+    ],
 )
 def test_speed_and_remaining_time_cover_the_iterations_since_the_last_report(
     tmp_path, capsys, clock, start, reports, speed, later
@@ -61,7 +64,26 @@ def test_the_remaining_time_follows_the_mean_speed_of_several_reports(tmp_path, 
         for seconds, iteration in ((99.0, 100), (10.0, 200), (50.0, 300), (12.0, 400)):
             clock[0] += seconds
             log.report(status(iteration))
-    assert "8.3 it/s  144 s left" in capsys.readouterr().out.splitlines()[-1]  # 600 iterations at 300 in 72 s
+    assert "8.3 it/s  0:02:24 left" in capsys.readouterr().out.splitlines()[-1]  # 600 iterations at 300 in 72 s
+
+
+def test_kernels_that_are_compiled_later_do_not_count_as_the_speed_of_what_is_left(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 1000, 0) as log:
+        for seconds, iteration in ((99.0, 100), (20.0, 200), (20.0, 300), (300.0, 400), (20.0, 500)):
+            clock[0] += seconds
+            log.report(status(iteration))
+    # Five times the median is the most that counts: 500 iterations at 400 in 160 s.
+    assert "5.0 it/s  0:03:20 left" in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_the_remaining_time_counts_iterations_by_their_cost(tmp_path, capsys, clock):
+    with TrainingLogger(tmp_path, 400, 0, remaining_cost=lambda done: 400 - done + min(400 - done, 200)) as log:
+        for seconds, iteration in ((99.0, 100), (20.0, 200), (40.0, 300)):
+            clock[0] += seconds
+            log.report(status(iteration))
+    *_, before, after = capsys.readouterr().out.splitlines()
+    assert "0:01:20 left" in before
+    assert "0:00:40 left" in after
 
 
 def test_after_a_return_to_a_checkpoint_the_speed_is_that_of_the_iterations_since(tmp_path, capsys, clock):
@@ -75,7 +97,7 @@ def test_after_a_return_to_a_checkpoint_the_speed_is_that_of_the_iterations_sinc
             log.report(status(iteration))
     *_, third, last = capsys.readouterr().out.splitlines()
     assert third.endswith(" 1.0 it/s")
-    assert "2.0 it/s  150 s left" in last
+    assert "2.0 it/s  0:02:30 left" in last
 
 
 def test_lines_have_a_minimum_distance_in_time(tmp_path, capsys, clock):
@@ -138,7 +160,21 @@ def test_a_terminal_shows_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):
     output = capsys.readouterr().out
     assert "150/500" in output
     assert "a line above the bar" in output
-    assert "s left" not in output
+    assert "it/s  " not in output
+
+
+@pytest.mark.parametrize(("reports", "shown"), [(1, "-:--:--"), (2, "0:00:40")])
+def test_the_bar_shows_no_time_left_before_kernels_are_compiled_and_then_that_of_the_speed_since(
+    capsys, monkeypatch, clock, reports, shown
+):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    with TrainingLogger(None, 500, 0) as log:
+        for seconds, iteration in ((300.0, 50), (5.0, 100))[:reports]:
+            clock[0] += seconds
+            log.report(status(iteration))
+    assert re.findall(r"\d:\d\d:\d\d|-:--:--", capsys.readouterr().out)[-1] == shown
 
 
 @pytest.mark.parametrize("columns", [80, 125, 126])

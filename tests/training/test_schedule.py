@@ -238,8 +238,10 @@ def test_iterations_do_what_the_schedule_says(name, changes, expected):
 
 
 @pytest.mark.parametrize("changes", [changes for name, changes, _ in ACTIONS.values() if name == "use_appearance"])
-def test_iterations_with_the_appearance_network_are_counted(changes):
-    assert protocol(**changes).appearance_iterations == len(iterations_where("use_appearance", **changes))
+def test_iterations_with_the_appearance_network_cost_twice_as_much_as_others(changes):
+    costs, doubled = protocol(**changes).remaining_cost, iterations_where("use_appearance", **changes)
+    assert [costs(k) - costs(k + 1) for k in range(END)] == [2 if k in doubled else 1 for k in range(END)]
+    assert costs(END) == 0
 
 
 def rising_from(first):

@@ -6,7 +6,6 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -113,9 +112,8 @@ class Board:
         with suppress(OSError):  # there is no log yet
             for line in reversed(last_lines(self._log_of(cell))):
                 if match := LINE.fullmatch(line):
-                    done, total, seconds = match.groups()
-                    left = "" if seconds is None else str(timedelta(seconds=int(seconds)))
-                    return f"{int(done):,} / {int(total):,}", left
+                    done, total, left = match.groups()
+                    return f"{int(done):,} / {int(total):,}", left or ""
                 if f": {STARTED}" in line:  # the lines above are those of an earlier attempt
                     break
         return "", ""

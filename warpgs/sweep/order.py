@@ -11,16 +11,10 @@ from .cells import Cell
 
 
 def remaining_cost(cell: Cell) -> int:
-    """About how long the training of a cell still takes, relative to other cells of its capture.
-
-    It is the number of iterations, where those with the appearance network count twice: in the sweep `ablation`, the
-    network takes 0.7 to 1.3 times as long as the rest of an iteration. Visibility-driven pruning saves a fifth of the
-    time there; to count that, too, would leave the order as it is.
-    """
+    """About how long the training of a cell still takes, relative to other cells of its capture."""
     protocol = Protocol(scaled(cell.config), has_depth=cell.config.depth)
     done = max((int(path.stem) for path in list_checkpoints(cell.folder) if path.stem.isdecimal()), default=0)
-    left = max(0, protocol.num_iterations - done)
-    return left + min(left, protocol.appearance_iterations)  # which are the last ones of the run
+    return protocol.remaining_cost(done)
 
 
 def longest_first(cells: Iterable[Cell]) -> list[Cell]:

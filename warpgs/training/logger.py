@@ -1,20 +1,26 @@
 """Progress of a training run: a bar or plain lines on the console, and TensorBoard events."""
 
 import re
+import statistics
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from torch.utils.tensorboard.writer import SummaryWriter
 
 NUM_RECENT = 20
 """Number of reports whose mean speed gives the remaining time: some include pruning or a checkpoint."""
+
+MAX_SLOWNESS = 5.0
+"""How much slower than the median a report counts: some include the compilation of kernels or the fit of motion."""
 
 LINE_EVERY = 10.0
 """Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
@@ -22,8 +28,11 @@ LINE_EVERY = 10.0
 WIDE = 126
 """Minimum width of a terminal that shows the bar and all numbers; others show the most important ones in full."""
 
-LINE = re.compile(r"(\d+)/(\d+) .* it/s(?:  (\d+) s left)?")
-"""A line of progress: iterations done, iterations of the whole run, and the remaining time [s] if it is known."""
+LINE = re.compile(r"(\d+)/(\d+) .* it/s(?:  (.+) left)?")
+"""A line of progress: iterations done, iterations of the whole run, and the remaining time (h:mm:ss) if it is known."""
+
+UNKNOWN = "-:--:--"
+"""Stands in the bar where the remaining time is not known yet."""
 
 
 def ignore(text: str) -> None:
@@ -38,7 +47,7 @@ class Status(NamedTuple):
         stage: Name of the stage.
         loss: Mean since the last check.
         psnr: PSNR of the joint training image, mean since the last check [dB].
-        terms: Each loss term, weighted, mean since the last check.
+        terms: Each loss term, weighted, mean since the last check; without those that were off.
         num_static: Number of static Gaussians.
         num_dynamic: Number of dynamic Gaussians.
     """
@@ -53,15 +62,31 @@ class Status(NamedTuple):
 
 
 class TrainingLogger:
-    """A context that shows progress and writes TensorBoard events, unless ``folder`` is None."""
+    """A context that shows progress and writes TensorBoard events, unless ``folder`` is None.
+
+    Args:
+        folder: Folder of the events.
+        num_iterations: Iterations of the whole run.
+        first_iteration: Iterations that are done when it begins.
+        quiet: Whether to print nothing.
+        remaining_cost: How much is left to do after an iteration, in any unit; the number of iterations if None.
+    """
 
     _first: int
     _last: tuple[int, float]
 
-    def __init__(self, folder: Path | None, num_iterations: int, first_iteration: int, quiet: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        num_iterations: int,
+        first_iteration: int,
+        quiet: bool = False,
+        remaining_cost: Callable[[int], float] | None = None,
+    ) -> None:
         self._console = Console(quiet=quiet)
         self._events = None if folder is None else SummaryWriter(str(folder), purge_step=first_iteration)
         self._total = num_iterations
+        self._remaining_cost = remaining_cost or (lambda iteration: num_iterations - iteration)
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         self.begin(first_iteration)
@@ -72,10 +97,12 @@ class TrainingLogger:
                 *([BarColumn()] if self._is_wide else []),
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[status]}"),
-                TimeRemainingColumn(),
+                TextColumn("[progress.remaining]{task.fields[left]}"),
                 console=self._console,
             )
-            self._task = self._bar.add_task("starting", total=num_iterations, completed=first_iteration, status="")
+            self._task = self._bar.add_task(
+                "starting", total=num_iterations, completed=first_iteration, status="", left=UNKNOWN
+            )
 
     def __enter__(self) -> "TrainingLogger":
         if self._bar is not None:
@@ -104,7 +131,9 @@ class TrainingLogger:
         done, seconds = status.iteration - last_iteration, max(now - last_time, 1e-9)
         rate, self._last = done / seconds, (status.iteration, now)
         if last_iteration > self._first:  # the first interval includes the compilation of kernels
-            self._recent.append((done, seconds))
+            cost = self._remaining_cost(last_iteration) - self._remaining_cost(status.iteration)
+            self._recent.append((max(cost, 1e-9), seconds))
+        left = self._time_left(status.iteration)
         text = (
             f"loss {status.loss:.4f}  train PSNR {status.psnr:.2f}  "
             f"static {status.num_static:,}  dynamic {status.num_dynamic:,}  {rate:.1f} it/s"
@@ -113,15 +142,23 @@ class TrainingLogger:
             num = status.num_static + status.num_dynamic
             narrow = f"train PSNR {status.psnr:.2f}  {num:,} Gaussians  {rate:.0f} it/s"
             shown = text if self._is_wide else narrow
-            self._bar.update(self._task, completed=status.iteration, description=status.stage, status=shown)
+            self._bar.update(
+                self._task, completed=status.iteration, description=status.stage, status=shown, left=left or UNKNOWN
+            )
         elif now - self._last_line > LINE_EVERY or status.iteration == self._total:
             self._last_line = now
-            remaining = ""
-            if self._recent:
-                done, seconds = map(sum, zip(*self._recent, strict=True))
-                remaining = f"  {(self._total - status.iteration) * seconds / max(done, 1):.0f} s left"
+            remaining = f"  {left} left" if left else ""
             self.log(f"{status.iteration}/{self._total} {status.stage}  {text}{remaining}")
         self._write(status, rate)
+
+    def _time_left(self, iteration: int) -> str:
+        """The remaining time after an iteration, from the recent speed; empty if that is not known yet."""
+        if not self._recent:
+            return ""
+        limit = MAX_SLOWNESS * statistics.median_low(seconds / cost for cost, seconds in self._recent)
+        seconds = sum(min(seconds, limit * cost) for cost, seconds in self._recent)
+        left = self._remaining_cost(iteration) * seconds / sum(cost for cost, _ in self._recent)
+        return str(timedelta(seconds=round(left)))
 
     def add_scalar(self, name: str, value: float, iteration: int) -> None:
         """Adds a number to the events."""
@@ -137,7 +174,7 @@ class TrainingLogger:
         """Measures the speed from this iteration on, as when a training begins or returns to a checkpoint."""
         self._first = iteration
         self._last = (iteration, time.monotonic())
-        self._recent: deque[tuple[int, float]] = deque(maxlen=NUM_RECENT)
+        self._recent: deque[tuple[float, float]] = deque(maxlen=NUM_RECENT)
 
     def skip(self, seconds: float) -> None:
         """Leaves out time in which nothing was trained [s]."""

@@ -129,7 +129,7 @@ def held_out_psnr(
         trainer.callbacks = [compare]
         if trainer.num_cut is not None:
             _warn_of_unknown_depth(whole, log)
-        with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet) as logger:
+        with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet, trainer.protocol.remaining_cost) as logger:
             finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()
     if not finished:

@@ -140,7 +140,7 @@ def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], qu
     with (
         run.lock() if is_first else contextlib.nullcontext(),
         Interrupt() as interrupt,
-        TrainingLogger(events, num_iterations, trainer.iteration, quiet) as logger,
+        TrainingLogger(events, num_iterations, trainer.iteration, quiet, trainer.protocol.remaining_cost) as logger,
     ):
         if is_first:
             if is_changed:
