@@ -6,6 +6,7 @@ from unittest.mock import Mock
 import pytest
 from rich.console import Console
 
+from tests.terminal import Terminal
 from warpgs.sweep import board as module
 from warpgs.sweep.board import Board
 from warpgs.sweep.cells import plan_cells
@@ -13,6 +14,32 @@ from warpgs.sweep.scheduler import Event
 from warpgs.sweep.spec import read_spec
 from warpgs.training import logger
 from warpgs.training.logger import Status, TrainingLogger
+
+SWEEP = """
+import sys, time
+from pathlib import Path
+from warpgs.sweep import board
+from warpgs.sweep.cells import plan_cells
+from warpgs.sweep.scheduler import Result, run_jobs
+from warpgs.sweep.spec import read_spec
+
+class Pool:
+    device = "cpu"
+
+    def submit(self, job, avoid=frozenset()): pass
+
+    def nodes(self): return {"one"}
+
+    def wait(self, seconds):
+        time.sleep(0.05)
+        return [Result("as-full-seed0", "broken")] if (out / "end").exists() else []
+
+out, board.REFRESH_SECONDS = Path(sys.argv[1]), 0.1
+cells = plan_cells(read_spec("seeds"), {"as": "/as"}, out, {"iterations": 300})[:1]
+with board.Board(out, cells, print) as shown:
+    run_jobs(Pool(), shown.jobs("cpu"), shown.tell, shown.poll)
+print("ended")
+"""
 
 
 @pytest.fixture
@@ -77,6 +104,35 @@ def test_running_cells_show_iterations_and_time_left_of_this_attempt(board, tmp_
         "as-full-seed3 running node7",
         "as-full-seed4 queued",
     ]
+
+
+def test_a_terminal_shows_the_table_from_the_start_and_the_progress_of_cells_while_they_run(tmp_path):
+    for folder in ("running", "logs"):
+        (tmp_path / folder).mkdir()
+    line = "{}/12000 stage1  loss 0.7500  train PSNR 21.50  static 12,345  dynamic 67  2.5 it/s  0:51:20 left\n"
+    with Terminal(SWEEP, str(tmp_path), columns=100) as terminal:
+        terminal.read_until("1 queued")
+        (tmp_path / "running/as-full-seed0").write_text("node7")
+        for shown, iteration in (("4,250 / 12,000", 4250), ("4,300 / 12,000", 4300)):
+            (tmp_path / "logs/as-full-seed0.log").write_text(line.format(iteration))
+            terminal.read_until(shown)
+        assert "0:51:20" in terminal.read_until("node7")
+        (tmp_path / "end").touch()
+        terminal.read_until("ended")
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_the_table_fits_the_terminal_with_one_line_per_cell(board, monkeypatch, columns):
+    monkeypatch.setenv("LINES", "8")
+    for seed in range(5):
+        board.tell(Event(f"as-full-seed{seed}", "failed", "CUDA error: out of memory, " * 9))
+    console = Console(file=io.StringIO(), width=columns)
+    console.print(board.table())
+    shown = console.file.getvalue().splitlines()
+    assert len(shown) < 8
+    assert all(len(line) <= columns for line in shown)
+    assert sum("as-full" in line for line in shown) == 3
+    assert "5 failed" in shown[0]
 
 
 def test_brackets_are_shown_as_they_are(board):

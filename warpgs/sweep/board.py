@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rich import get_console
+from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Column, Table
 from rich.text import Text
@@ -25,6 +27,11 @@ CELLS = "cells.csv"
 
 MAX_LINES = 30
 """Maximum number of cells in the live table; those that run and fail come first."""
+
+FRAME_LINES = 5
+"""Lines of a terminal that the live table needs besides its cells: title, heads, rule and cursor."""
+
+HEADS = ("cell", "state", "iterations", "time left", "PSNR [dB]", "")
 
 REFRESH_SECONDS = 2.0
 ORDER = ("running", "failed", "retried", "lost", "queued", "stopped", "finished")
@@ -151,7 +158,7 @@ class Board:
         with suppress(OSError):  # files come and go meanwhile
             for path in self._running.iterdir():
                 self._hosts[path.name] = path.read_text("utf-8")[:60]
-        self._live.update(self.table())
+        self._live.update(self.table(), refresh=True)
 
     def table(self) -> Table:
         """The live table: one line per cell, running and failed ones first."""
@@ -161,23 +168,28 @@ class Board:
         }
         counts = Counter(states.values())
         title = ", ".join(f"{counts[state]} {state}" for state in ORDER if counts[state])
-        heads = ("cell", "state", "iterations", "time left", "PSNR [dB]", "")
-        table = Table(*(Column(Text(head)) for head in heads), title=title, title_justify="left")
-        for cell in sorted(self.cells, key=lambda cell: ORDER.index(states[cell.name]))[:MAX_LINES]:
+        # Where the terminal is too narrow, notes are cut first.
+        columns = [Column(Text(head), no_wrap=bool(head), overflow="ellipsis") for head in HEADS]
+        table = Table(
+            *columns, title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+        )
+        num_lines = min(MAX_LINES, max(1, get_console().height - FRAME_LINES))  # what scrolls away cannot be erased
+        for cell in sorted(self.cells, key=lambda cell: ORDER.index(states[cell.name]))[:num_lines]:
             psnr = self.metrics.get(cell.name, {}).get("psnr")
             note = self.errors.get(cell.name) or self._hosts.get(cell.name, "")
             progress = self._progress(cell) if states[cell.name] == "running" else ("", "")
             values = (cell.name, states[cell.name], *progress, "" if psnr is None else f"{psnr:.2f}", note)
-            table.add_row(*map(Text, values))  # without markup: names and errors may have brackets
+            # Without markup: names and errors may have brackets.
+            table.add_row(*(Text(value, no_wrap=True) for value in values))
         return table
 
     def __enter__(self) -> "Board":
         with suppress(FileNotFoundError):  # what a killed sweep left behind
             for path in self._running.iterdir():
                 path.unlink()
-        if sys.stdout.isatty():
+        if sys.stdout.isatty() and get_console().is_interactive:  # which TERM=dumb is not
             self._live = Live(self.table(), transient=True, auto_refresh=False)
-            self._live.start()
+            self._live.start(refresh=True)
         return self
 
     def __exit__(self, *_: object) -> None:
