@@ -3,7 +3,9 @@
 import sys
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from warpgs.command_line.parsing import RunFolder
 from warpgs.command_line.posix import share_free_memory
@@ -20,6 +22,9 @@ class View:
     """Address to listen on. By default only this machine can connect; 0.0.0.0 accepts connections from everywhere."""
     port: int = 8080
     """Port to listen on; 0 chooses a free one."""
+    allow_origin: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="ORIGIN")] = ()
+    """Accept connections of the page at this address, such as https://gpu.example.org, where a proxy serves it; may be
+    repeated. By default only of the viewer's own page."""
     while_training: bool = False
     """Follow a run in training: show what is trained now. Nothing is read while no browser is connected."""
     device: Literal["cuda", "cpu"] | None = None

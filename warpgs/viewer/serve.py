@@ -27,13 +27,15 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
 
     Raises:
         ImportError: If viser is not installed.
-        ValueError: If the run cannot be shown.
+        ValueError: If the run cannot be shown, or an allowed origin is none.
         OSError: If the server cannot listen on the address.
     """
     if importlib.util.find_spec("viser") is None:
         raise ImportError(f"the viewer needs viser: {install_command('viewer')}")
+    from .origin import allowed_origins
     from .server import Viewer, check_address
 
+    allowed = allowed_origins(options.allow_origin)
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
     if options.while_training and not options.run_folder.exists():
         report(f"waiting for a training to create {options.run_folder} (press Ctrl-C to stop)")
@@ -43,7 +45,8 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
     check_address(options.host, options.port)
     if options.while_training and source.device.type == "cpu":
         lower_priority(NICENESS)
-    with Viewer(source, training_cameras(source, warn), options.host, options.port) as viewer:
+    training = training_cameras(source, warn)
+    with Viewer(source, training, options.host, options.port, allowed, warn) as viewer:
         host = f"[{options.host}]" if ":" in options.host else options.host
         gc.collect()
         gc.freeze()  # what is there by now stays: collections after visits need not visit it

@@ -6,11 +6,13 @@ import os
 import socket
 import threading
 import time
+import warnings
+from collections.abc import Callable, Collection
 
 import viser
 
 from .browser_camera import set_camera, start_camera
-from .origin import refuse_foreign_pages
+from .origin import Origin, refuse_foreign_pages
 from .page_state import PageState
 from .session import Session
 from .source import Source
@@ -63,6 +65,8 @@ class Viewer:
         training: The training cameras, if the capture can be read.
         host: Host to listen on.
         port: Port to listen on; 0 chooses a free one.
+        allowed: Origins of pages that may connect besides the viewer's own.
+        warn: Called with one line for each origin that is refused.
 
     Attributes:
         port: The port that the server listens on.
@@ -72,7 +76,15 @@ class Viewer:
         OSError: If the server cannot listen on the address.
     """
 
-    def __init__(self, source: Source, training: TrainingCameras | None, host: str, port: int) -> None:
+    def __init__(
+        self,
+        source: Source,
+        training: TrainingCameras | None,
+        host: str,
+        port: int,
+        allowed: Collection[Origin] = (),
+        warn: Callable[[str], object] = warnings.warn,
+    ) -> None:
         check_address(host, port)
         self._source, self._training = source, training
         self._rendering, self._lock = threading.Lock(), threading.Lock()
@@ -89,7 +101,7 @@ class Viewer:
             control_width="small", show_logo=False, show_share_button=False, dark_mode=True
         )
         self._server.gui.main_panel.dock_right()  # beside the image, not over it
-        refuse_foreign_pages(self._server, host)
+        refuse_foreign_pages(self._server, host, allowed, warn)
         self._start = start_camera(source, training)
         self._set_initial_camera()
         self._server.on_client_connect(self._add_session)
