@@ -33,6 +33,9 @@ CLOSED = 141
 ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a GPU has too little"
 """What to do without enough memory, where a command has no advice of its own."""
 
+MAX_MESSAGE = 4000
+"""Maximum number of characters of a message: names and values in it come from files."""
+
 OUT_OF_MEMORY = re.compile(
     r"CUDA error: out of memory"  # torch, outside of its allocator: CUDA graphs and pinned memory
     r"|can't allocate memory|not enough memory: you tried to allocate"  # torch on the CPU; the second on Windows
@@ -176,8 +179,9 @@ def _ignore_interrupts() -> None:
 
 
 def one_line(error: BaseException) -> str:
-    """The message of an error without line breaks and control characters."""
-    return visible(" ".join(str(error).split()))
+    """The message of an error without line breaks and control characters; of a very long one its ends."""
+    text = visible(" ".join(str(error).split()))
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} … {text[-MAX_MESSAGE // 2 :]}"
 
 
 def command(*words: object) -> str:

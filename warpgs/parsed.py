@@ -1,15 +1,28 @@
 """Parsed JSON and TOML, with bounds on what no reader expects: deep nesting, huge integers, a name twice."""
 
 import json
+import re
 import reprlib
+import sys
 from pathlib import Path
 from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 MAX_NESTING = 64
 """Maximum depth of objects and lists inside each other."""
 
 MAX_INTEGER = 1 << 64
 """Maximum magnitude of an integer: larger ones do not fit into arrays, or into floating-point numbers at all."""
+
+MAX_KEY_PARTS = 100
+"""Maximum number of parts of a dotted key of TOML, whose parser takes time by its square."""
+
+QUOTED = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#.*')
+"""Strings and comments of TOML, which may have any number of dots."""
 
 
 def parse_json(source: Path | str, data: bytes | str) -> dict[str, Any]:
@@ -28,6 +41,23 @@ def parse_json(source: Path | str, data: bytes | str) -> dict[str, Any]:
         raise ValueError(f"{source} is not valid JSON: {reason(error)}") from error
     if not isinstance(value, dict):
         raise ValueError(f"{source} must hold a JSON object, got {type(value).__name__}")
+    check_parsed(source, value)
+    return value
+
+
+def parse_toml(source: Path | str, data: bytes) -> dict[str, Any]:
+    """The tables of a TOML text; arguments as for ``parse_json``.
+
+    Raises:
+        ValueError: If it is not TOML, has a key of more than ``MAX_KEY_PARTS`` parts, or fails ``check_parsed``.
+    """
+    try:
+        text = data.decode()
+        if any(line.count(".") > MAX_KEY_PARTS for line in QUOTED.sub("", text).split("\n")):
+            raise ValueError(f"a key has more than {MAX_KEY_PARTS} parts")
+        value = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{source} is not valid TOML: {reason(error)}") from error
     check_parsed(source, value)
     return value
 
@@ -68,7 +98,8 @@ def check_parsed(source: Path | str, value: dict[str, Any]) -> None:
                 if isinstance(inner, dict | list):
                     below.append((key, inner))
                 elif isinstance(inner, int) and abs(inner) > MAX_INTEGER:
-                    raise ValueError(f"{source}: {key:.60} has an integer of more than 64 bits, {reprlib.repr(inner)}")
+                    number = reprlib.repr(inner)
+                    raise ValueError(f"{source} is damaged: {key:.60} has more than 64 bits: {number}")
         level = below
     if level:
         raise ValueError(f"{source} is nested deeper than {MAX_NESTING} levels")

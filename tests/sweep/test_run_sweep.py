@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -487,3 +488,18 @@ def test_a_built_in_capture_keeps_its_name_in_the_config_of_a_run(finished_run, 
     config = dataclasses.replace(read_config(finished_run), data=Path("builtin:room"))
     write_config(tmp_path, config)
     assert read_config(tmp_path).data == Path("builtin:room")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("sweep.json", '{"as-full-seed0": 3}', r"sweep\.json is damaged: it has no command of as-full-seed0"),
+        ("sweep.json", '{"as-full-seed0": "warpgs \'"}', r"sweep\.json is damaged: it has no command of"),
+        ("cells.csv", "cell,state,error\n" + 200_000 * "a", r"cells\.csv is damaged: field larger than field limit"),
+    ],
+)
+def test_a_damaged_file_of_the_sweep_is_refused_by_name(sweep, tmp_path, capsys, name, content, message):
+    assert sweep("--seeds", "1")[0] == 0
+    (tmp_path / "out" / name).write_text(content)
+    assert sweep("--seeds", "1", "--tables-only")[0] == 2
+    assert re.search(message, capsys.readouterr().err)

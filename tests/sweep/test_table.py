@@ -137,6 +137,9 @@ def test_peers_stand_below_with_their_numbers_and_the_mean_of_captures_they_all_
         ({"D": {"x": {"psnr": [1, 2, 3]}}}, "psnr must be a number"),
         ({"D": {"x": 3}}, "D, x must be an object, got 3"),
         ({"D": 3}, "D must be an object, got 3"),
+        ({"D": {"x": {"psnr": 10**400}}}, r"peers\.json is damaged: psnr has more than 64 bits"),
+        ({"D": {"x": {"psnr": [1, -(10**400)]}}}, r"peers\.json is damaged: psnr has more than 64 bits"),
+        ({"D": {"x": {"psnr": 1e16}}}, r"peers\.json: D, x: psnr must be a number or .*, got 1e\+16"),
     ],
 )
 def test_wrong_numbers_of_peers_are_named(tmp_path, values, message):

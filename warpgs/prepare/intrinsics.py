@@ -7,6 +7,7 @@ measures pixels from the centre of the first one, half a pixel from the corner, 
 """
 
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +20,13 @@ from jaxtyping import Float
 from warpgs.data.colmap import lens_of_parameters
 from warpgs.data.lens import Lens
 from warpgs.files import read_bounded, read_json, read_numbers
+from warpgs.parsed import reason
 
 MAX_BYTES = 1 << 20
 """Maximum size of a file [bytes]."""
 
-MAX_NESTING = 40
-"""Maximum depth of what a YAML or XML file nests."""
+MAX_NESTING = 100
+"""Maximum depth of what a YAML file nests; OpenCV's parser uses up the stack at some thousands."""
 
 MAX_DIFFERENCE = 0.01
 """Maximum difference of the aspect ratios of the file's images and the frames: sides are rounded."""
@@ -33,8 +35,6 @@ MATRIX, DISTORTION = "camera_matrix", "distortion_coefficients"
 
 KEYS = (MATRIX, DISTORTION, "image_width", "image_height", "distortion_model", "fisheye_model")
 """Fields that are read; others are ignored."""
-
-SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".xml")
 
 
 def read_intrinsics(path: Path, size: tuple[int, int] | None = None) -> Lens:
@@ -50,12 +50,9 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None = None) -> Lens:
             another aspect ratio.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: intrinsics are read from files that end with {', '.join(SUFFIXES)}")
-    if suffix == ".txt":
-        lens = _of_colmap(path)
-    else:
-        lens = _of_opencv(path, read_json(path, max_bytes=MAX_BYTES) if suffix == ".json" else _stored(path), size)
+    if suffix != ".txt" and suffix not in READERS:
+        raise ValueError(f"{path}: intrinsics are read from files that end with {', '.join(('.txt', *READERS))}")
+    lens = _of_colmap(path) if suffix == ".txt" else _of_opencv(path, READERS[suffix](path), size)
     if size is None:
         return lens
     width, height = size
@@ -76,14 +73,14 @@ def _of_colmap(path: Path) -> Lens:
     try:
         return lens_of_parameters(model, (int(width), int(height)), [float(p) for p in params])
     except (ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {reason(error)}") from error
 
 
-def _stored(path: Path) -> dict[str, Any]:
-    """The fields of a YAML or XML file, by OpenCV."""
-    text = read_bounded(path, MAX_BYTES).decode("utf-8-sig", "replace")
+def _of_yaml(path: Path) -> dict[str, Any]:
+    """The fields of a YAML file, by OpenCV."""
+    text = _text(path)
     _check_nesting(path, text)
-    if path.suffix.lower() != ".xml" and not text.startswith("%YAML"):
+    if not text.startswith("%YAML"):
         text = "%YAML:1.0\n---\n" + text.removeprefix("---")  # ROS omits the first line
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -93,14 +90,22 @@ def _stored(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not a file of OpenCV: {str(error).splitlines()[0]}") from error
 
 
+def _text(path: Path) -> str:
+    return read_bounded(path, MAX_BYTES).decode("utf-8-sig", "replace")
+
+
 def _check_nesting(path: Path, text: str) -> None:
-    """Refuses what is nested so deep that OpenCV's parser, which is recursive, would use up the stack."""
-    depth = deepest = 0
-    for opened, closed in re.findall(r"([\[{]|<[^/?!][^>]*(?<!/)>)|([\]}]|</)", text):
-        depth += bool(opened) - bool(closed)
-        deepest = max(deepest, depth)
-    steps = (len(found) for found in re.findall(r"^(?: |- ?|\? )+", text, re.MULTILINE))
-    if max(deepest, max(steps, default=0) // 2) > MAX_NESTING:
+    """Refuses what may be nested so deep that OpenCV's parser, which is recursive, would use up the stack.
+
+    It nests with indentation, with brackets, and within a line at every colon, dash and question mark.
+    """
+    depth = brackets = 0
+    for opened in re.findall(r"([\[{])|[\]}]", text):
+        depth += 1 if opened else -1
+        brackets = max(brackets, depth)
+    steps = max((len(found) for found in re.findall(r"^(?: |- ?|\? )+", text, re.MULTILINE)), default=0) // 2
+    within = max(len(re.findall(r"[:?]|-\s", part)) for part in re.split(r"[,\[\]{}\n]", text))
+    if (1 + steps + brackets) * max(1, within) > MAX_NESTING:
         raise ValueError(f"{path} is nested deeper than {MAX_NESTING} levels")
 
 
@@ -111,6 +116,40 @@ def _plain(node: Any) -> Any:
     if node.isSeq():
         return [_plain(node.at(k)) for k in range(node.size())]
     return node.string() if node.isString() else node.real()
+
+
+def _of_xml(path: Path) -> dict[str, Any]:
+    """The fields of an XML file: below its root, numbers, strings, and matrices with their numbers in ``data``."""
+    text = _text(path)
+    if "<!DOCTYPE" in text:  # whose entities may stand for gigabytes
+        raise ValueError(f"{path} has a document type declaration, which files of OpenCV do not have")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is not a file of OpenCV: {error}") from error
+    fields = {}
+    for element in root:
+        data = element.find("data")
+        if element.tag in KEYS and element.tag in fields:
+            raise ValueError(f"{path} has {element.tag} twice")
+        words = (element if data is None else data).text or ""
+        fields[element.tag] = [_value(word) for word in words.split()]
+    return {key: value[0] if len(value) == 1 else value for key, value in fields.items() if key in KEYS}
+
+
+def _value(word: str) -> float | str:
+    try:
+        return float(word)
+    except ValueError:
+        return word.strip('"')
+
+
+def _of_json(path: Path) -> dict[str, Any]:
+    return read_json(path, max_bytes=MAX_BYTES)
+
+
+READERS = {".json": _of_json, ".yaml": _of_yaml, ".yml": _of_yaml, ".xml": _of_xml}
+"""Readers of OpenCV's and ROS's fields by the suffix of the file."""
 
 
 def _of_opencv(path: Path, fields: dict[str, Any], size: tuple[int, int] | None) -> Lens:

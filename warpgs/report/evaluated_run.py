@@ -28,6 +28,21 @@ MAX_EVENTS = 1 << 30
 MAX_VALUE = 1e18
 """Maximum magnitude of their numbers."""
 
+HIGHER = {
+    "psnr",
+    "ssim",
+    "ms_ssim",
+    "psnr_static",
+    "psnr_dynamic",
+    "ssim_static",
+    "ssim_dynamic",
+    "masked_psnr",
+    "masked_ssim",
+    "fps",
+}
+LOWER = {"lpips", "masked_lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
+"""Metrics of which higher, or lower, values are better."""
+
 REQUIRED = ("name", "time", "psnr")
 """Required columns of views.csv; all others are metrics like psnr."""
 
@@ -95,19 +110,25 @@ def read_runs(folders: Sequence[Path]) -> list[EvaluatedRun]:
 
 def _read(label: str, folder: Path) -> EvaluatedRun:
     config = read_config(folder)
-    metrics = _read_metrics(folder)
+    metrics = read_metrics(folder)
     views, curves = _read_views(folder / "views.csv"), _read_curves(folder / "events")
     return EvaluatedRun(label, folder, config, metrics, views, curves)
 
 
-def _read_metrics(folder: Path) -> dict[str, Any]:
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """The content of metrics.json of a run folder: numbers, texts, yes or no, and None where not measured.
+
+    Raises:
+        ValueError: If the run was not evaluated, or the file is damaged; the message names it.
+    """
     path = folder / "metrics.json"
     _check_evaluated(path)
     values = read_json(path, max_bytes=MAX_FILE)
     if any(isinstance(value, dict | list) for value in values.values()):
         raise ValueError(f"{path} is damaged: expected an object with numbers and strings")
     for name, value in values.items():
-        if isinstance(value, int | float) and not abs(value) <= MAX_VALUE:
+        is_text = isinstance(value, str) and name in HIGHER | LOWER
+        if is_text or (isinstance(value, int | float) and not abs(value) <= MAX_VALUE):
             raise ValueError(f"{path} is damaged: {reprlib.repr(name)} cannot be {reprlib.repr(value)}")
     return values
 

@@ -9,21 +9,6 @@ from warpgs.config.presets import PRESETS
 
 from .evaluated_run import EvaluatedRun
 
-HIGHER = {
-    "psnr",
-    "ssim",
-    "ms_ssim",
-    "psnr_static",
-    "psnr_dynamic",
-    "ssim_static",
-    "ssim_dynamic",
-    "masked_psnr",
-    "masked_ssim",
-    "fps",
-}
-LOWER = {"lpips", "masked_lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
-"""Metrics of which higher, or lower, values are better."""
-
 TITLES = {
     "psnr": "PSNR [dB]",
     "ssim": "SSIM",

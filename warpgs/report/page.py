@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 from warpgs.visualize.images import ERROR_RANGE
 
 from .charts import Series, chart, color_of
-from .evaluated_run import EvaluatedRun, groups
+from .evaluated_run import HIGHER, LOWER, EvaluatedRun, groups
 from .image_strips import Strips
-from .metrics_table import HIGHER, LOWER, TITLES, config_rows, summary_rows
+from .metrics_table import TITLES, config_rows, summary_rows
 
 CURVES = ("psnr/train", "loss/total")
 """Tags of the first charts."""

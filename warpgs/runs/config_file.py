@@ -95,12 +95,12 @@ def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
 def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
     """A (nested) dataclass from parsed JSON; the prefix has the names of those around it, with dots."""
     if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected an object for {cls.__name__}, got {values!r}")
+        raise ValueError(f"{path}: expected an object for {cls.__name__}, got {reprlib.repr(values)}")
     values = {RENAMED.get(name, name): value for name, value in values.items()}
     hints = typing.get_type_hints(cls)
     if unknown := sorted(set(values) - set(hints)):
         close = suggestion(unknown[0], set(hints) - set(values))
-        raise ValueError(f"{path} has fields of another version: {', '.join(unknown)}{close}")
+        raise ValueError(f"{path} has fields of another version: {', '.join(unknown):.200}{close}")
     fields = {}
     for name, value in values.items():
         hint = hints[name]

@@ -15,6 +15,7 @@ from rich.live import Live
 from rich.table import Column, Table
 from rich.text import Text
 
+from warpgs.files import read_bounded
 from warpgs.training.logger import LINE
 
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
@@ -24,6 +25,9 @@ from .worker import STARTED, Job, last_lines
 
 CELLS = "cells.csv"
 """File in the folder of a sweep with the state of each cell, and why those failed that did."""
+
+MAX_BYTES = 64 << 20
+"""Maximum size of that file, and of those that name the hosts of cells that run [bytes]."""
 
 MAX_LINES = 30
 """Maximum number of cells in the live table; those that run and fail come first."""
@@ -73,8 +77,12 @@ class Board:
     def recall(self) -> None:
         """Takes note of what had not finished when the sweep ended, and why, as ``CELLS`` says."""
         path = self.out / CELLS
-        lines = path.read_text("utf-8", "replace").splitlines() if path.is_file() else []
-        for line in csv.DictReader(lines):
+        text = read_bounded(path, MAX_BYTES).decode("utf-8", "replace") if path.is_file() else ""
+        try:
+            lines = list(csv.DictReader(text.splitlines()))
+        except csv.Error as damage:
+            raise ValueError(f"{path} is damaged: {damage}") from damage
+        for line in lines:
             name, state, error = (line.get(key) or "" for key in ("cell", "state", "error"))
             if error and self.states.get(name, "finished") != "finished":
                 self.errors[name] = error
@@ -155,9 +163,9 @@ class Board:
             return
         self._refreshed = time.monotonic()
         self._hosts = {}
-        with suppress(OSError):  # files come and go meanwhile
+        with suppress(OSError, ValueError):  # files come and go meanwhile
             for path in self._running.iterdir():
-                self._hosts[path.name] = path.read_text("utf-8")[:60]
+                self._hosts[path.name] = read_bounded(path, MAX_BYTES).decode("utf-8", "replace")[:60]
         self._live.update(self.table(), refresh=True)
 
     def table(self) -> Table:

@@ -14,7 +14,6 @@ from warpgs.config import TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import is_builtin, parse_builtin
 from warpgs.errors import one_line, visible
-from warpgs.files import read_json
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config
 
@@ -260,10 +259,11 @@ def finished_metrics(cell: Cell) -> dict[str, Any] | None:
     Raises:
         ValueError: If metrics.json is damaged; the message names it.
     """
-    path = cell.folder / "metrics.json"
-    if not path.is_file():
+    from warpgs.report.evaluated_run import read_metrics  # imports TensorBoard
+
+    if not (cell.folder / "metrics.json").is_file():
         return None
-    metrics = read_json(path)
+    metrics = read_metrics(cell.folder)
     return metrics if metrics.get("iterations") == cell.num_iterations else None
 
 

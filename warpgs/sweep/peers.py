@@ -6,10 +6,11 @@ by method, capture and metric of metrics.json; a pair is mean and standard devia
 captures; without it, that is computed where a method has numbers of every capture.
 """
 
-import math
+import reprlib
 from pathlib import Path
 from typing import Any
 
+from warpgs.config.bounds import MAX_VALUE
 from warpgs.files import read_json
 
 from .table import METRICS, Statistic
@@ -36,15 +37,15 @@ def read_peers(path: Path) -> dict[str, dict[str, dict[str, Statistic]]]:
 
 def _table(where: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{where} must be an object, got {value!r}")
+        raise ValueError(f"{where} must be an object, got {reprlib.repr(value)}")
     return value
 
 
 def _statistic(where: str, key: str, value: Any) -> Statistic:
     if key not in (known := [metric.key for metric in METRICS]):
-        raise ValueError(f"{where}: there is no metric {key}, expected {', '.join(known)}")
+        raise ValueError(f"{where}: there is no metric {key:.60}, expected {', '.join(known)}")
     numbers = value if isinstance(value, list) else [value]
-    valid = all(isinstance(n, int | float) and not isinstance(n, bool) and math.isfinite(n) for n in numbers)
+    valid = all(isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= MAX_VALUE for n in numbers)
     if not valid or len(numbers) not in (1, 2):
-        raise ValueError(f"{where}: {key} must be a number or [mean, standard deviation], got {value!r}")
+        raise ValueError(f"{where}: {key} must be a number or [mean, standard deviation], got {reprlib.repr(value)}")
     return Statistic(float(numbers[0]), float(numbers[1]) if len(numbers) == 2 else None)

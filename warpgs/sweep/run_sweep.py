@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -145,7 +146,13 @@ def _overrides(options: Sweep) -> dict[str, Any]:
 def _known_commands(out: Path) -> dict[str, str]:
     """The command of each cell when the sweep last started in this folder."""
     path = out / INDEX
-    return read_json(path) if path.exists() else {}
+    commands = read_json(path) if path.exists() else {}
+    for name, command in commands.items():
+        try:
+            shlex.split(command if isinstance(command, str) else "'")
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: it has no command of {name:.100}") from error
+    return commands
 
 
 def _write_index(out: Path, cells: list[Cell], known: dict[str, str]) -> None:

@@ -16,21 +16,18 @@ optim.networks = 4e-4
 query = "depth=network"                  # appended to the name of a built-in capture, after "?"
 """
 
-import sys
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig
+from warpgs.config.bounds import MAX_VALUE
 from warpgs.config.presets import PRESETS
 from warpgs.errors import not_one_of, suggestion
 from warpgs.files import read_bounded
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from warpgs.parsed import parse_toml
 
 FOLDER = Path(__file__).parent / "sweeps"
 """The sweeps that ship, as <name>.toml."""
@@ -106,11 +103,7 @@ def read_spec(name: str) -> SweepSpec:
     if not name.endswith(".toml") and name not in shipped():
         known = f"{', '.join(shipped())} or a .toml file"
         raise ValueError(f"there is no sweep {name!r}, expected {known}{suggestion(name, shipped())}")
-    try:
-        values = tomllib.loads(read_bounded(path, MAX_BYTES).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is not valid TOML: {error}") from error
-    return _parse(path, Path(name), values)
+    return _parse(path, Path(name), parse_toml(path, read_bounded(path, MAX_BYTES)))
 
 
 def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
@@ -125,9 +118,9 @@ def _parse(path: Path, source: Path, values: dict[str, Any]) -> SweepSpec:
     check_options(f"{path}: options", options)
     title, data = values.get("title", path.stem), values.get("data", [])
     if not isinstance(title, str):
-        raise ValueError(f"{path}: title must be a text, got {title!r}")
+        raise ValueError(f"{path}: title must be a text, got {reprlib.repr(title)}")
     if not isinstance(data, list) or not all(isinstance(item, str) for item in data):
-        raise ValueError(f"{path}: data must be a list of captures, got {data!r}")
+        raise ValueError(f"{path}: data must be a list of captures, got {reprlib.repr(data)}")
     parsed = tuple(_variant(path, name, variant) for name, variant in variants.items())
     seeds = _seeds(path, values.get("seeds", 1))
     return SweepSpec(source, title, preset, seeds, tuple(data), options, parsed)
@@ -143,9 +136,10 @@ def check_name(where: str, name: str) -> None:
     Raises:
         ValueError: If it is empty, longer than ``MAX_NAME``, or has a character that file systems refuse.
     """
+    shown = repr(name) if len(name) < 200 else f"{name[:200]!r}…"
     if not name.isprintable() or set(name) & set('/\\:*?"<>|') or not 0 < len(name.encode()) <= MAX_NAME:
         raise ValueError(
-            f"{where}: {name!r} cannot be a name: folders are named after it, so it must have 1 to {MAX_NAME} bytes, "
+            f"{where}: {shown} cannot be a name: folders are named after it, so it must have 1 to {MAX_NAME} bytes, "
             'none of / \\ : * ? " < > |'
         )
 
@@ -154,10 +148,10 @@ def _variant(path: Path, name: str, values: Any) -> Variant:
     check_name(f"{path}: variants", name)
     where = f"{path}: variant {name}"
     if not isinstance(values, dict):
-        raise ValueError(f"{where} must be a table, got {values!r}")
+        raise ValueError(f"{where} must be a table, got {reprlib.repr(values)}")
     label, query = values.get("label", name), values.get("query", "")
     if not isinstance(label, str) or not isinstance(query, str):
-        raise ValueError(f"{where}: label and query must be texts, got {label!r} and {query!r}")
+        raise ValueError(f"{where}: label and query must be texts, got {reprlib.repr(label)} and {reprlib.repr(query)}")
     options = {key: value for key, value in values.items() if key not in ("label", "query")}
     check_options(where, options)
     return Variant(name, label, options, query)
@@ -165,10 +159,11 @@ def _variant(path: Path, name: str, values: Any) -> Variant:
 
 def _seeds(path: Path, seeds: Any) -> tuple[int, ...]:
     chosen = list(range(min(seeds, MAX_SEEDS + 1))) if type(seeds) is int else seeds
-    valid = isinstance(chosen, list) and all(type(seed) is int and seed >= 0 for seed in chosen)
+    valid = isinstance(chosen, list) and all(type(seed) is int and 0 <= seed <= MAX_VALUE for seed in chosen)
     if not valid or not 0 < len(chosen) <= MAX_SEEDS or len(set(chosen)) < len(chosen):
         raise ValueError(
-            f"{path}: seeds must be a number of seeds (1 to {MAX_SEEDS}) or a list of different ones, got {seeds!r}"
+            f"{path}: seeds must be a number of seeds (1 to {MAX_SEEDS}) or a list of different ones, "
+            f"got {reprlib.repr(seeds)}"
         )
     return tuple(chosen)
 
@@ -186,12 +181,12 @@ def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str
         ValueError: If there is an unknown option; the message names it.
     """
     if not isinstance(options, dict):
-        raise ValueError(f"{where}: {prefix.rstrip('.') or 'options'} must be a table, got {options!r}")
+        raise ValueError(f"{where}: {prefix.rstrip('.') or 'options'} must be a table, got {reprlib.repr(options)}")
     known = {field.name: field for field in fields(cls)}
     for name, value in options.items():
         if name not in known:
             close = suggestion(name, known, f"{prefix}{{}}".format)
-            raise ValueError(f"{where}: there is no option {prefix}{name}{close}")
+            raise ValueError(f"{where}: there is no option {prefix}{name:.60}{close}")
         if not prefix and name in RESERVED:
             raise ValueError(f"{where}: {name} is not an option of one training: the sweep sets it")
         default = known[name].default_factory
@@ -201,4 +196,4 @@ def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str
 
 def _check_keys(where: str, values: dict[str, Any], known: Sequence[str]) -> None:
     if unknown := sorted(set(values) - set(known)):
-        raise ValueError(f"{where}: there is no entry {unknown[0]}, expected {', '.join(known)}")
+        raise ValueError(f"{where}: there is no entry {unknown[0]:.60}, expected {', '.join(known)}")
