@@ -15,7 +15,7 @@ from warpgs.files import read_numbers
 
 from .left_out import images_left_out
 from .options import LoadOptions
-from .posed import PosedFrame, World, posed_capture
+from .posed import PosedFrame, World, plain_names, posed_capture
 from .transforms import Transforms
 
 TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
@@ -55,7 +55,7 @@ class BlenderLoader:
             assumption="masks" if masked else "dynamic",
             own_times=True,
             background="white" if is_white else "black",
-            notes=images_left_out(root, chain(*images), listed),
+            notes=(*chain(*(index.notes for index in indices)), *images_left_out(root, chain(*images), listed)),
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
 
@@ -75,8 +75,11 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
     """The frames of a file; their names begin with the split, because all splits have an r_000."""
     size: tuple[int, int] | None = None
     frames = []
-    for entry in transforms.frames:
-        image = transforms.image(entry)
+    images = [transforms.image(entry) for entry in transforms.frames]
+    names = [image.stem for image in images]
+    if len(set(names)) < len(names):
+        names = plain_names([entry["file_path"] for entry in transforms.frames])
+    for entry, image, name in zip(transforms.frames, images, names, strict=True):
         if size is None:  # the images of these datasets have one size
             first = transforms.lens(entry, image)
             size = first.width, first.height
@@ -86,7 +89,7 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
             raise ValueError(f"{transforms.path}: time must be in [0, 1], got {time}")
         frames.append(
             PosedFrame(
-                f"{split}_{image.stem}",
+                f"{split}_{name}",
                 transforms.lens({"w": size[0], "h": size[1], **entry}, image),
                 transforms.pose(entry),
                 time,

@@ -7,9 +7,10 @@ from warpgs.data.capture import Capture
 from warpgs.data.colmap import MODEL_FOLDERS, ModelImage, find_model, load_model
 from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
-from warpgs.files import first_file, natural_order
+from warpgs.files import natural_order
 
 from .left_out import images_left_out
+from .listed import ListedFiles, find_file, without_image_suffix
 from .options import LoadOptions
 from .posed import (
     PosedFrame,
@@ -46,9 +47,9 @@ class ColmapLoader:
         files = _Files(root, options.factor or 1)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
         left_out = images_left_out(
-            root, files.used, f"the model in {folder.relative_to(root)} has no pose for them", files.images
+            root, files.used, f"the model in {folder.relative_to(root)} has no pose for them", files.folder
         )
-        world = World(model.points, model.colors, notes=left_out)
+        world = World(model.points, model.colors, notes=(*files.images.notes, *left_out))
         return posed_capture(root, frames, every_eighth(names), world, options)
 
 
@@ -57,7 +58,8 @@ class _Files:
 
     def __init__(self, root: Path, factor: int) -> None:
         reduced = root / f"images_{factor}"
-        self.images = reduced if factor > 1 and reduced.is_dir() else root / "images"
+        self.folder = reduced if factor > 1 and reduced.is_dir() else root / "images"
+        self.images = ListedFiles(self.folder, "the COLMAP model")
         self.masks, self.depths = root / MASKS, root / DEPTHS
         self.used: list[Path] = []
 
@@ -67,13 +69,13 @@ class _Files:
         Raises:
             ValueError: If its image is missing.
         """
-        stem = Path(image.name).with_suffix("")
-        path = first_file(self.images / f for f in (image.name, f"{stem}.png", f"{stem}.jpg"))
+        path = self.images.find(image.name, is_image=True)
         if path is None:
-            raise ValueError(f"{self.images / image.name} is missing: the COLMAP model has a camera for it")
+            raise ValueError(self.images.missing(image.name, "the COLMAP model has a camera for it"))
         self.used.append(path)
-        mask = first_file(self.masks / f for f in (f"{image.name}.png", f"{stem}.png"))
-        depth = first_file(self.depths / f for f in (f"{stem}.npy", f"{stem}.png"))
+        stem = without_image_suffix(image.name)
+        mask = _first(self.masks, f"{image.name}.png", f"{stem}.png")
+        depth = _first(self.depths, f"{stem}.npy", f"{stem}.png")
         return PosedFrame(
             name,
             image.lens,
@@ -83,3 +85,8 @@ class _Files:
             None if mask is None else partial(read_resized_mask, mask),
             None if depth is None else partial(read_depth, depth),
         )
+
+
+def _first(folder: Path, *names: str) -> Path | None:
+    """The file of the first of some names in a folder; None if it has none of them."""
+    return next((path for name in names if (path := find_file(folder, name))), None)

@@ -20,10 +20,11 @@ from warpgs.data.images import image_size, read_depth
 from warpgs.data.lens import Lens
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.data.units import scene_units
-from warpgs.files import first_file, natural_order, read_array
+from warpgs.files import natural_order, read_array
 
+from .listed import find_file
 from .options import LoadOptions
-from .posed import PosedFrame, World, every_eighth, posed_capture, world_to_camera
+from .posed import PosedFrame, World, every_eighth, plain_names, posed_capture, world_to_camera
 
 INDEX = "poses_bounds.npy"
 
@@ -52,12 +53,10 @@ class LlffLoader:
         if len(paths) != len(poses):
             raise ValueError(f"{root / INDEX} has {len(poses)} poses, but {paths[0].parent} has {len(paths)} images")
         lenses = [_lens(root, path, size) for path, size in zip(paths, sizes, strict=True)]
-        names = [path.stem for path in paths]
+        names = plain_names([path.name for path in paths])
         frames = [
-            PosedFrame(
-                path.stem, lens, pose, float(k), partial(read_resized_image, path), *_mask_and_depth(root, path.stem)
-            )
-            for k, (path, lens, pose) in enumerate(zip(paths, lenses, poses, strict=True))
+            PosedFrame(name, lens, pose, float(k), partial(read_resized_image, path), *_mask_and_depth(root, path.stem))
+            for k, (name, path, lens, pose) in enumerate(zip(names, paths, lenses, poses, strict=True))
         ]
         others = list(_other_cameras(root, frames))
         val = [frame.name for frame in others] if others else every_eighth(names)
@@ -126,8 +125,8 @@ def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
 
 
 def _mask_and_depth(root: Path, name: str) -> tuple[partial | None, partial | None]:
-    mask = first_file([root / MASKS / f"{name}.png"])
-    depth = first_file([root / DEPTHS / f"{name}.npy"])
+    mask = find_file(root / MASKS, f"{name}.png")
+    depth = find_file(root / DEPTHS, f"{name}.npy")
     return (
         None if mask is None else partial(_read_static, mask),
         None if depth is None else partial(read_depth, depth),
@@ -150,7 +149,7 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
             raise ValueError(f"{path} must be a camera from cam01 to cam{NUM_CAMERAS} at the time of a frame")
         if time % NUM_CAMERAS == camera:
             continue  # the video itself
-        mask = first_file([root / EVALUATION_MASKS / path.parent.name / f"{path.stem}.png"])
+        mask = find_file(root / EVALUATION_MASKS / path.parent.name, f"{path.stem}.png")
         source = frames[camera]
         name = f"{path.parent.name}_{path.stem}"
         read_mask = None if mask is None else partial(_read_static, mask)

@@ -28,9 +28,10 @@ from warpgs.data.taken import taken_reader
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN
 from warpgs.errors import command
-from warpgs.files import first_file, read_json
+from warpgs.files import read_json
 
 from .left_out import images_left_out
+from .listed import ListedFiles, find_file
 from .options import LoadOptions
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
@@ -77,7 +78,7 @@ class NerfiesLoader(ABC):
         files = _find_files(root, factor, split, incomplete_masks, options.depth)
         cameras, lenses = {}, {}
         for name, time in times.items():
-            path = root / f"camera/{name}.json"
+            path = find_file(root / "camera", f"{name}.json") or root / f"camera/{name}.json"
             cameras[name], lenses[name] = read_camera(path, units, factor, time, options.lens)
         points, colors = read_points(root, units)
 
@@ -177,14 +178,14 @@ def _find_files(
     masks = next((p for p in (root / "resized_mask", root / "mask") if p.is_dir()), None)
     if masks is not None and not (masks / size).is_dir() and not incomplete_masks:
         raise ValueError(f"{masks / size} is missing: images are read from {rgb / size}, masks must have the same size")
-    files = {}
+    files, listed = {}, ListedFiles(rgb / size, "dataset.json")
     for name in [*split.train, *split.val]:
-        image = first_file(rgb / size / f"{name}{ending}" for ending in (".png", ".jpg"))
+        image = listed.find(name, (".png", ".jpg", ".jpeg"))
         if image is None:
-            raise ValueError(f"{rgb / size / name}.png is missing: dataset.json lists the frame")
+            raise ValueError(listed.missing(f"{name}.png", "dataset.json lists the frame"))
         mask = None if masks is None else find_mask(masks, factor, name)
         depth = find_depth(root, factor, name) if with_depth else None
-        covisible = first_file([root / "covisible" / size / "val" / f"{name}.png"])
+        covisible = find_file(root / "covisible" / size / "val", f"{name}.png")
         files[name] = _FrameFiles(image, mask, depth, covisible)
     for name in split.train:
         if masks is not None and files[name].mask is None and not incomplete_masks:
@@ -197,14 +198,14 @@ def _find_files(
 
 def find_mask(folder: Path, factor: int, name: str) -> Path | None:
     """The mask of a frame at a downscaling factor in ``folder``, resized_mask or mask; None if it has none."""
-    return first_file(folder / f"{factor}x/{name}{ending}" for ending in (".png.png", ".png"))
+    return find_file(folder / f"{factor}x", name, (".png.png", ".png"))
 
 
 def find_depth(root: Path, factor: int, name: str) -> Path | None:
     """The depth of a frame for images at a downscaling factor; None if it has none."""
     # Depth is resized to the image, so the full size serves every factor.
     folders = [root / f"depth/{size}x" for size in (factor, 1)]
-    return first_file(folder / f"{name}{ending}" for folder in folders for ending in (".npy", ".png"))
+    return next((path for folder in folders if (path := find_file(folder, name, (".npy", ".png")))), None)
 
 
 @dataclass(frozen=True)

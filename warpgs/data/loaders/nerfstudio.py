@@ -69,7 +69,7 @@ class NerfstudioLoader:
         if ignored:
             lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
             notes += (f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}",)
-        return posed_capture(root, kept, val, replace(_world(transforms), notes=notes), options)
+        return posed_capture(root, kept, val, replace(_world(transforms), notes=(*transforms.notes, *notes)), options)
 
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:

@@ -24,6 +24,7 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader, without_distortion
 from warpgs.data.units import SceneUnits, scene_units, units_around
 
+from .listed import without_image_suffix
 from .options import LoadOptions
 
 HOLDOUT = 8
@@ -192,11 +193,17 @@ def times_of_names(names: Sequence[str]) -> list[float]:
 
 
 def plain_names(paths: Sequence[str]) -> list[str]:
-    """Ids of images: their paths without suffixes and folders that all share, with underscores for slashes."""
-    found = []
-    for path in paths:
-        parts = Path(path.replace("\\", "/").replace("\0", "")).with_suffix("").parts
-        found.append([part for part in parts if part not in ("/", "..", ".")])
+    """Ids of images: their paths without suffixes and folders that all share, with underscores for slashes.
+
+    Suffixes are kept if there would be two of one name otherwise, such as a.png and a.jpg.
+    """
+    plain = [path.replace("\\", "/").replace("\0", "").strip() for path in paths]
+    names = _joined([without_image_suffix(path) for path in plain])
+    return names if len(set(names)) == len(names) else _joined(plain)
+
+
+def _joined(paths: Sequence[str]) -> list[str]:
+    found = [[part for part in Path(path).parts if part not in ("/", "..", ".")] for path in paths]
     while all(len(parts) > 1 and parts[0] == found[0][0] for parts in found):
         found = [parts[1:] for parts in found]
     return ["_".join(parts) for parts in found]

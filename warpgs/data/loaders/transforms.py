@@ -16,8 +16,9 @@ from jaxtyping import Float
 
 from warpgs.data.images import image_size
 from warpgs.data.lens import Lens
-from warpgs.files import first_file, read_json, read_numbers
+from warpgs.files import read_json, read_numbers
 
+from .listed import ListedFiles
 from .posed import opencv_from_opengl, world_to_camera
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -27,6 +28,9 @@ FISHEYE = "OPENCV_FISHEYE"
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """Suffixes that ``file_path`` may lack."""
+
+IMAGES = ("file_path", "mask_path")
+"""Fields whose files may have been converted to another image format."""
 
 
 class Transforms:
@@ -47,6 +51,7 @@ class Transforms:
 
     def __init__(self, path: Path, undistort: bool) -> None:
         self.path, self.fields, self._undistort = path, read_json(path), undistort
+        self._files = ListedFiles(path.parent, path.name)
         frames = self.fields.get("frames")
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
@@ -70,10 +75,15 @@ class Transforms:
             return None
         if not isinstance(given, str) or not given or "\0" in given:
             raise ValueError(f"{self.path}: {key} must name a file, got {given!r:.60}")
-        path = first_file(self.path.parent / f"{given}{suffix}" for suffix in SUFFIXES)
+        path = self._files.find(given, SUFFIXES, is_image=key in IMAGES)
         if path is None:
-            raise ValueError(f"{self.path.parent / given} is missing: {self.path.name} lists it as {key}")
+            raise ValueError(self._files.missing(given, f"{self.path.name} lists it as {key}"))
         return path
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was interpreted in the file so far."""
+        return self._files.notes
 
     def image(self, frame: dict[str, Any]) -> Path:
         """The image of a frame; raises as ``file``."""
