@@ -40,6 +40,7 @@ their products overflow in single precision."""
 OWNED = ".warpgs.lock"
 """File that the process which writes a temporary folder keeps locked."""
 
+
 MAX_NPY_HEADER = 1 << 20
 """Maximum size of what precedes the numbers of a .npy file [bytes]."""
 
@@ -74,13 +75,13 @@ def partial_path(path: Path) -> Path:
     return path.with_name(path.name + ".partial")
 
 
-def _reworded(error: OSError, message: str) -> OSError:
+def reworded(error: OSError, message: str) -> OSError:
     """An error of the same number and built-in class with another message."""
     # The constructors of other classes, such as PyAV's, may take something else than a message.
     classes = (kind for kind in type(error).__mro__ if kind.__module__ == "builtins" and issubclass(kind, OSError))
-    reworded: OSError = next(classes)(message)
-    reworded.errno = error.errno
-    return reworded
+    renamed: OSError = next(classes)(message)
+    renamed.errno = error.errno
+    return renamed
 
 
 @contextmanager
@@ -96,7 +97,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         yield partial
         os.replace(partial, path)
     except OSError as error:
-        raise _reworded(error, f"{path} could not be written: {error.strerror or error}") from error
+        raise reworded(error, f"{path} could not be written: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -119,7 +120,7 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
     except OSError as error:
-        raise _reworded(error, f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
+        raise reworded(error, f"{folder.name} cannot be kept in {folder.parent}: {error.strerror}") from error
     partial = beside / folder.name  # only its owner may open ``beside``
     try:
         with _locked(beside):
@@ -135,7 +136,7 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
             raise
         # The temporary name would make equal errors of two attempts differ, and nobody finds that folder afterwards.
         message = str(error).replace(str(partial), str(folder)).replace(str(beside), str(folder))
-        raise _reworded(error, message) from error
+        raise reworded(error, message) from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 

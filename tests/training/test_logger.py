@@ -1,5 +1,6 @@
 """Progress on the console and TensorBoard events."""
 
+import errno
 import re
 
 import numpy as np
@@ -149,6 +150,34 @@ def test_events_are_written_when_training_fails(tmp_path):
     with pytest.raises(ValueError, match="wrong"):
         fail()
     assert events(tmp_path)["loss/total"] == [(50, 0.75)]
+
+
+def test_a_disk_that_is_full_is_one_error_that_names_the_event_file(tmp_path, monkeypatch):
+    def fail(data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with TrainingLogger(tmp_path, 500, 0, quiet=True) as log:
+        monkeypatch.setattr(log._events._records, "write", fail)
+        with pytest.raises(OSError, match=r"events\.out\.\S+ could not be written: No space left on device$") as raised:
+            log.report(status(50))
+    assert raised.value.errno == errno.ENOSPC
+
+
+def test_events_follow_a_folder_that_is_moved(tmp_path):
+    with TrainingLogger(tmp_path / "run/events", 500, 0, quiet=True) as log:
+        (tmp_path / "run").rename(tmp_path / "moved")
+        log.report(status(50))
+    assert events(tmp_path / "moved/events")["loss/total"] == [(50, 0.75)]
+    assert not (tmp_path / "run").exists()
+
+
+def test_deleted_events_are_reported_once(tmp_path, capsys):
+    with TrainingLogger(tmp_path, 500, 0) as log:
+        (path,) = tmp_path.iterdir()
+        path.unlink()
+        for iteration in (50, 100):
+            log.report(status(iteration))
+    assert capsys.readouterr().out.count(f"warning: {path} was deleted") == 1
 
 
 def test_a_terminal_shows_a_bar_instead_of_lines(tmp_path, capsys, monkeypatch):

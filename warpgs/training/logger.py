@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import UInt8
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
-from torch.utils.tensorboard.writer import SummaryWriter
+from torch.utils.tensorboard import summary
+
+from .events import Events
 
 NUM_RECENT = 20
 """Number of reports whose mean speed gives the remaining time: some include pruning or a checkpoint."""
@@ -84,7 +86,8 @@ class TrainingLogger:
         remaining_cost: Callable[[int], float] | None = None,
     ) -> None:
         self._console = Console(quiet=quiet)
-        self._events = None if folder is None else SummaryWriter(str(folder), purge_step=first_iteration)
+        self._events = None if folder is None else Events(folder, first_iteration)
+        self._is_lost = False
         self._total = num_iterations
         self._remaining_cost = remaining_cost or (lambda iteration: num_iterations - iteration)
         self._bar: Progress | None = None
@@ -163,12 +166,13 @@ class TrainingLogger:
     def add_scalar(self, name: str, value: float, iteration: int) -> None:
         """Adds a number to the events."""
         if self._events is not None:
-            self._events.add_scalar(name, value, iteration)
+            self._events.add(iteration, summary=summary.scalar(name, value))
 
     def add_image(self, name: str, image: UInt8[np.ndarray, "H W 3"], iteration: int) -> None:
         """Adds an 8-bit RGB image to the events."""
         if self._events is not None:
-            self._events.add_image(name, image, iteration, dataformats="HWC")
+            self._events.add(iteration, summary=summary.image(name, image, dataformats="HWC"))
+            self._events.flush()
 
     def begin(self, iteration: int) -> None:
         """Measures the speed from this iteration on, as when a training begins or returns to a checkpoint."""
@@ -192,3 +196,9 @@ class TrainingLogger:
         }
         for name, value in values.items():
             self.add_scalar(name, float(value), status.iteration)
+        if self._events is None:
+            return
+        self._events.flush()
+        if not self._is_lost and not self._events.path.exists():
+            self._is_lost = True
+            self.log(f"warning: {self._events.path} was deleted: TensorBoard shows nothing of this training")
