@@ -18,7 +18,7 @@ from warpgs.video.camera_paths import replay
 from warpgs.video.writer import Video
 from warpgs.visualize.images import comparison, to_bytes
 
-from .evaluate import OnView, evaluate, write_views
+from .evaluate import Evaluation, OnView, evaluate, write_views
 from .lpips import find
 from .machine import commit, device_name
 from .metrics import MIN_MS_SSIM_SIDE
@@ -64,23 +64,24 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
-    save_image, align = _image_writer(folder, len(capture.val)), alignment(scene, capture.extent)
+    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.extent)
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
-    write_json(folder / "metrics.json", {**trial, **values, "commit": commit()})
-    write_views(folder / "views.csv", evaluation)
+    _write_metrics(run, {**trial, **values, "commit": commit()}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
+    run.require_present()
     return _summary(values)
 
 
-def _image_writer(folder: Path, num_views: int) -> OnView:
+def _image_writer(run: Run, num_views: int) -> OnView:
     """A function that saves some of the views as images."""
     chosen = set(evenly_spaced_indices(num_views, NUM_IMAGES))
 
     def save(index: int, frame: Frame, truth: torch.Tensor, rendering: Rendering) -> None:
         if index in chosen:
-            write_png(folder / "images" / f"{frame.name}.png", comparison(truth, rendering))
+            run.require_present()
+            write_png(run.folder / "images" / f"{frame.name}.png", comparison(truth, rendering))
 
     return save
 
@@ -98,6 +99,12 @@ def _of_run(scene: TrainedScene, capture: Capture) -> dict[str, Any]:
         "num_static": len(scene.scene.static),
         "num_dynamic": len(scene.scene.dynamic),
     }
+
+
+def _write_metrics(run: Run, values: dict[str, Any], evaluation: Evaluation) -> None:
+    run.require_present()
+    write_json(run.folder / "metrics.json", values)
+    write_views(run.folder / "views.csv", evaluation)
 
 
 def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool) -> None:

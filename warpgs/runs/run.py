@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from filelock import FileLock, Timeout
 
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import is_builtin
 from warpgs.data.capture import Capture, extent_of
 from warpgs.errors import command, similar_path
 from warpgs.files import partial_path
+from warpgs.locks import LOCK, lock_folder
 from warpgs.model.trunk import in_single_precision
 from warpgs.ops.mlp import limit_of_multiprocessors
 
@@ -23,11 +23,11 @@ from .captures import open_capture
 from .config_file import NAME, read_config, write_config
 from .trained import TrainedScene
 
-LOCK = ".lock"
-"""File in a run folder that the process which trains there keeps locked."""
-
 MASK_TRIAL = "mask_trial.json"
 """File in a run folder: what the trial of the masks found, for metrics.json. It exists only after a trial."""
+
+TRAINED = "trained"
+"""What is done with a run folder that is locked."""
 
 Device = Literal["cuda", "cpu"]
 
@@ -60,8 +60,22 @@ def new_folder(config: TrainConfig, capture: Capture) -> Path:
 
 
 def _is_empty(folder: Path) -> bool:
-    """Whether a folder holds nothing but what a kill in the first write leaves."""
-    return {path.name for path in folder.iterdir()} <= {partial_path(folder / NAME).name}
+    """Whether a folder holds nothing but what a kill before or in the first write leaves."""
+    return {path.name for path in folder.iterdir()} <= {partial_path(folder / NAME).name, LOCK}
+
+
+@contextmanager
+def locked_new_folder(config: TrainConfig, capture: Capture) -> Iterator[Path]:
+    """Makes and locks the folder of a new run; in the end it is removed again if nothing was written into it.
+
+    Raises:
+        ValueError: As ``new_folder`` does, or if another process trains in the folder.
+        OSError: If it cannot be written.
+    """
+    folder = new_folder(config, capture)
+    with lock_folder(folder, TRAINED):
+        new_folder(dataclasses.replace(config, out=folder), capture)  # another process may have been faster
+        yield folder
 
 
 @dataclass(frozen=True)
@@ -165,25 +179,23 @@ class Run:
             in_single_precision(scene)
         return TrainedScene(scene.to(self.device).requires_grad_(False), self.config, loaded.metadata)
 
+    def require_present(self, *_: object) -> None:
+        """Refuses to go on if the folder was moved or deleted: files would be written into a new one of its name.
+
+        Takes any arguments, as a callback of training does.
+
+        Raises:
+            OSError: If it has no config.json.
+        """
+        if not (self.folder / NAME).is_file():
+            raise OSError(
+                f"{self.folder} was moved or deleted meanwhile: it has no {NAME}; if it was moved, warpgs train "
+                "--resume with its new place continues from its last checkpoint"
+            )
+
     def lock(self) -> AbstractContextManager[None]:
         """Locks the folder against other training processes; raises as ``lock_folder``."""
-        return lock_folder(self.folder)
-
-
-@contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Locks a folder against other processes that write to it; the lock ends with the process at the latest.
-
-    Raises:
-        ValueError: If another process holds the lock.
-        OSError: If the lock file cannot be written.
-    """
-    try:
-        held = FileLock(folder / LOCK).acquire(timeout=0)
-    except Timeout as error:
-        raise ValueError(f"{folder} is being trained by another process") from error
-    with held:
-        yield
+        return lock_folder(self.folder, TRAINED)
 
 
 def open_run(folder: Path | str, device: Device | None = None) -> TrainedScene:

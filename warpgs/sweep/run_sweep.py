@@ -14,8 +14,8 @@ from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.errors import FAILED, not_one_of, one_line
 from warpgs.evaluation.lpips import locate
-from warpgs.files import kept_if_used, read_json, write_json
-from warpgs.runs.run import LOCK, lock_folder
+from warpgs.files import read_json, write_json
+from warpgs.locks import lock_folder
 
 from .board import Board
 from .cells import (
@@ -78,7 +78,7 @@ def run_sweep(options: Sweep, log: Log) -> int:
         return 0
     if options.tables_only and not any(cell.name in known for cell in cells):
         raise ValueError(f"{out} has no training of this sweep: --tables-only needs the --out that it was started with")
-    with kept_if_used(out, (INDEX, LOCK)), lock_folder(out):
+    with lock_folder(out, "trained", (INDEX,)):
         if options.tables_only:
             board.recall()
         else:

@@ -21,7 +21,7 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
-from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, new_folder, open_capture
+from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_folder, open_capture
 
 from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
@@ -96,15 +96,16 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
         OSError: If a file cannot be written.
         SystemExit: Under torchrun, if another of its processes has failed and reports why.
     """
-    with ranks.joined():
-        is_first = ranks.is_first()
-        log = log if is_first else None
-        trainer = make_trainer(config, log)
-        _describe(trainer, log or ignore)
-        is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
-        _train(trainer, is_changed, callbacks, quiet=log is None)
-    if is_first:
-        _evaluate(trainer, log)
+    with contextlib.ExitStack() as locks:
+        with ranks.joined():
+            is_first = ranks.is_first()
+            log = log if is_first else None
+            trainer = make_trainer(config, log, locks)
+            _describe(trainer, log or ignore)
+            is_changed = config.resume is not None and (config.iterations is not None or config.data is not None)
+            _train(trainer, is_changed, callbacks, quiet=log is None)
+        if is_first:
+            _evaluate(trainer, log)
     return Run(trainer.run, trainer.config)
 
 
@@ -133,19 +134,18 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
 
 
 def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], quiet: bool) -> None:
-    """Trains in the locked run folder; raises TrainingInterrupted after Ctrl-C."""
+    """Trains in the run folder, which is locked; raises TrainingInterrupted after Ctrl-C."""
     num_iterations, is_first = trainer.protocol.num_iterations, ranks.is_first()
     run = Run(trainer.run, trainer.config)
     events = run.folder / "events" if is_first else None
     with (
-        run.lock() if is_first else contextlib.nullcontext(),
         Interrupt() as interrupt,
         TrainingLogger(events, num_iterations, trainer.iteration, quiet, trainer.protocol.remaining_cost) as logger,
     ):
         if is_first:
             if is_changed:
                 write_config(run.folder, run.config)
-            trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger))
+            trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger), run.require_present)
         try:
             finished = trainer.train(logger, interrupt)
         finally:
@@ -204,27 +204,34 @@ def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
     )
 
 
-def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
+def make_trainer(config: TrainConfig, log: Log | None = None, locks: contextlib.ExitStack | None = None) -> Trainer:
     """A trainer for a new run, or one that continues ``config.resume`` from its newest checkpoint.
+
+    The run folder is locked before anything is written into it.
 
     Args:
         config: The config.
         log: Receives warnings about the capture; if None, nothing is printed.
+        locks: Holds the lock until it is closed; if None, the lock ends when the trainer is made.
 
     Raises:
         UnfitCaptureError: If the capture has errors that would make training useless.
         ValueError: If the run, its capture or an option cannot be used.
         OSError: If the run folder cannot be written.
     """
-    quiet, log = log is None, log or ignore
-    if config.resume is not None:
-        return _continued(config, config.resume, log, quiet)
+    with contextlib.ExitStack() as until_made:
+        make = _begun if config.resume is None else _continued
+        return make(config, log or ignore, log is None, until_made if locks is None else locks)
+
+
+def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitStack) -> Trainer:
+    """The trainer of a new run."""
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     _check_precision(config)
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
     capture = check_capture(open_capture(config, quiet), config, log)
     _compare_ranks(config, capture)
-    folder = str(new_folder(config, capture)) if ranks.is_first() else ""
+    folder = str(locks.enter_context(locked_new_folder(config, capture))) if ranks.is_first() else ""
     _read_evaluation_frames(capture, config, quiet)
     if config.device == "cpu" and config.preset in ("best", "paper"):
         log(f"the preset {config.preset} is for a GPU; {_cpu_advice(config)}")
@@ -232,7 +239,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None) -> Trainer:
     config = fitted(config, capture, log)
     trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
     if ranks.is_first():
-        Run.create(trainer.run, config)  # last, so that a refused run leaves no folder behind
+        Run.create(trainer.run, config)  # last: the folder of a run that is refused before is removed again
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
@@ -253,8 +260,13 @@ def _cpu_advice(config: TrainConfig) -> str:
     return "on two CPU cores, --preset patient --factor 2 takes about 10 minutes, and quick 2"
 
 
-def _continued(config: TrainConfig, folder: Path, log: Log, quiet: bool) -> Trainer:
+def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitStack) -> Trainer:
     """The trainer of a run, restored from its newest checkpoint."""
+    assert config.resume is not None
+    folder = config.resume
+    found = Run(folder, read_config(folder))  # before it is locked: nothing is written into other folders
+    if ranks.is_first():
+        locks.enter_context(found.lock())
     saved = extended(read_config(folder), config.iterations)
     if config.data is not None:
         saved = dataclasses.replace(saved, data=config.data)
