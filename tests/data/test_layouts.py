@@ -18,7 +18,7 @@ from warpgs.data.colmap import lens_of
 from warpgs.data.images import is_transparent
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import blender, load_capture, recognize
-from warpgs.data.loaders.posed import plain_names, times_of_names
+from warpgs.data.loaders.posed import plain_names
 
 LAYOUTS = pytest.mark.parametrize("layout", layouts.ALL)
 INDEX = {name: k for k, name in enumerate(layouts.NAMES)}
@@ -409,14 +409,6 @@ def test_only_training_masks_are_perturbed(written):
     capture = load_capture(written["colmap"], perturbation=MaskPerturbation(dilate=2))
     assert not np.array_equal(capture.frame("frame_00000").static_mask.numpy(), layouts.static_mask(0))
     assert np.array_equal(capture.frame("frame_00004").static_mask.numpy(), layouts.static_mask(4))
-
-
-@pytest.mark.parametrize(
-    ("names", "times"),
-    [(["frame_00004", "frame_00010"], [4, 10]), (["cam1_7", "cam2_7"], [7, 7]), (["9", "10b", "11"], [0, 1, 2])],
-)
-def test_times_are_the_numbers_at_the_end_of_all_names_or_their_order(names, times):
-    assert times_of_names(names) == times
 
 
 @pytest.mark.parametrize(

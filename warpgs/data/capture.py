@@ -15,6 +15,7 @@ from warpgs.cameras import Camera
 from warpgs.errors import suggestion
 
 from .read_ahead import ReadAhead
+from .time_source import AS_GIVEN, TimeSource
 
 MIN_EXTENT = 0.05
 """Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
@@ -116,6 +117,7 @@ class Capture:
         read_taken: Reads a frame with the distortion of its lens; None if ``read`` undistorts no frame.
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
+        time_source: Where the times of the cameras come from.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         notes: What the loader says about the files, one sentence each: what it left out or had to interpret.
         assumption: What is taken as dynamic; see ``assuming``.
@@ -141,6 +143,7 @@ class Capture:
     read_taken: Callable[[str], TakenFrame] | None = None
     background: Background = "black"
     notes: Sequence[str] = ()
+    time_source: TimeSource = AS_GIVEN
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)
     extent: float = field(init=False)

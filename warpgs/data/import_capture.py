@@ -66,7 +66,7 @@ def import_capture(
 
 
 def _log_remarks(capture: Capture, log: Callable[[str], None]) -> None:
-    for note in capture.notes:
+    for note in (*capture.notes, capture.time_source):
         log(f"note: {note}")
     if capture.assumption == "dynamic":
         log("everything is taken as dynamic in it: train on the copy with --assume dynamic, or add masks")

@@ -312,7 +312,7 @@ def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) 
 
 
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
-    """The capture, after logging its warnings.
+    """The capture, after logging its warnings and where its times come from.
 
     Raises:
         UnfitCaptureError: If it has errors that would make training useless.
@@ -323,6 +323,8 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     for finding in findings:
         if finding not in errors:
             log(str(finding))
+    if not capture.time_source.problem:  # it is among the warnings
+        log(capture.time_source.text)
     if errors:
         raise UnfitCaptureError(errors)
     return capture

@@ -1,6 +1,6 @@
 """D-NeRF and other datasets rendered by Blender: transforms_train.json, transforms_val.json, transforms_test.json."""
 
-import math
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
@@ -10,8 +10,8 @@ import numpy as np
 from warpgs.data.capture import Capture
 from warpgs.data.images import is_transparent
 from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resized_over_white
+from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits
-from warpgs.files import read_numbers
 
 from .left_out import images_left_out
 from .options import LoadOptions
@@ -53,11 +53,27 @@ class BlenderLoader:
             np.zeros((0, 3)),
             units=SceneUnits(np.zeros(3), 1.0 / HALF_SIZE),
             assumption="masks" if masked else "dynamic",
+            time_source=_time_source(indices, frames),
             own_times=True,
             background="white" if is_white else "black",
             notes=(*chain(*(index.notes for index in indices)), *images_left_out(root, chain(*images), listed)),
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
+
+
+def _time_source(indices: Sequence[Transforms], frames: Sequence[PosedFrame]) -> TimeSource:
+    """Where the times come from.
+
+    Raises:
+        ValueError: If only some of the files have times.
+    """
+    with_times = [index.times(index.frames, "time") is not None for index in indices]
+    if len({*with_times}) > 1:
+        without, given = (indices[with_times.index(has)].path for has in (False, True))
+        raise ValueError(f"{without}: frames have no time, but those of {given.name} have: give every frame one")
+    if not with_times[0]:
+        return TimeSource(f"no frame has a time in {TRAIN}")
+    return TimeSource(with_steps("times from the field time of the frames", [frame.time for frame in frames]))
 
 
 def _is_transparent(image: Path) -> bool:
@@ -75,24 +91,24 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
     """The frames of a file; their names begin with the split, because all splits have an r_000."""
     size: tuple[int, int] | None = None
     frames = []
+    _, times = transforms.times(transforms.frames, "time") or ("", [0.0] * len(transforms.frames))
     images = [transforms.image(entry) for entry in transforms.frames]
     names = [image.stem for image in images]
     if len(set(names)) < len(names):
         names = plain_names([entry["file_path"] for entry in transforms.frames])
-    for entry, image, name in zip(transforms.frames, images, names, strict=True):
+    for entry, image, name, time in zip(transforms.frames, images, names, times, strict=True):
         if size is None:  # the images of these datasets have one size
             first = transforms.lens(entry, image)
             size = first.width, first.height
         mask, depth = transforms.file(entry, "mask_path"), transforms.file(entry, "depth_file_path")
-        time = float(read_numbers(transforms.path, {"time": 0.0, **entry}, "time", ()))
-        if not (math.isfinite(time) and 0.0 <= time <= 1.0):
+        if not 0.0 <= time <= 1.0:
             raise ValueError(f"{transforms.path}: time must be in [0, 1], got {time}")
         frames.append(
             PosedFrame(
                 f"{split}_{name}",
                 transforms.lens({"w": size[0], "h": size[1], **entry}, image),
                 transforms.pose(entry),
-                time,
+                float(time),
                 partial(read_resized_over_white, image),
                 None if mask is None else partial(read_resized_mask, mask),
                 None if depth is None else partial(read_metric_depth, depth, unit=1.0),

@@ -11,6 +11,7 @@ from warpgs.files import natural_order
 
 from .left_out import images_left_out
 from .listed import ListedFiles, find_file, without_image_suffix
+from .name_times import times_of_names
 from .options import LoadOptions
 from .posed import (
     PosedFrame,
@@ -18,7 +19,6 @@ from .posed import (
     every_eighth,
     plain_names,
     posed_capture,
-    times_of_names,
 )
 
 MASKS, DEPTHS = "masks", "depths"
@@ -43,13 +43,14 @@ class ColmapLoader:
         model = load_model(folder, options.undistort)
         images = sorted(model.images, key=lambda image: natural_order(image.name))
         names = plain_names([image.name for image in images])
-        times = times_of_names(names)
+        times, source, _ = times_of_names([image.name for image in images])
         files = _Files(root, options.factor or 1)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
         left_out = images_left_out(
             root, files.used, f"the model in {folder.relative_to(root)} has no pose for them", files.folder
         )
-        world = World(model.points, model.colors, notes=(*files.images.notes, *left_out))
+        notes = (*files.images.notes, *left_out)
+        world = World(model.points, model.colors, time_source=source, notes=notes)
         return posed_capture(root, frames, every_eighth(names), world, options)
 
 

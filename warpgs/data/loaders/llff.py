@@ -19,6 +19,7 @@ from warpgs.data.colmap import find_model, load_model
 from warpgs.data.images import image_size, read_depth
 from warpgs.data.lens import Lens
 from warpgs.data.resized import read_resized_image, read_resized_mask
+from warpgs.data.time_source import TimeSource
 from warpgs.data.units import scene_units
 from warpgs.files import natural_order, read_array
 
@@ -61,7 +62,9 @@ class LlffLoader:
         others = list(_other_cameras(root, frames))
         val = [frame.name for frame in others] if others else every_eighth(names)
         options = replace(options, factor=1)  # that of the folder
-        return posed_capture(root, [*frames, *others], frozenset(val), _world(root, poses, bounds), options)
+        source = TimeSource(f"times from the order of the images, one for each pose of {INDEX}")
+        world = replace(_world(root, poses, bounds), time_source=source)
+        return posed_capture(root, [*frames, *others], frozenset(val), world, options)
 
 
 class _Poses(NamedTuple):

@@ -3,15 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from warpgs.data.capture import Capture
 from warpgs.data.ply import read_ply_points
 from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
+from warpgs.data.time_source import TimeSource, with_steps
+from warpgs.errors import visible
 from warpgs.files import natural_order, read_numbers
 
 from .left_out import images_left_out
+from .name_times import times_of_names
 from .options import LoadOptions
 from .posed import (
     PosedFrame,
@@ -19,7 +23,6 @@ from .posed import (
     every_eighth,
     plain_names,
     posed_capture,
-    times_of_names,
 )
 from .transforms import Transforms
 
@@ -27,10 +30,6 @@ INDEX = "transforms.json"
 
 MILLIMETRES = 1e-3
 """World units per unit of a depth file, nerfstudio's default ``depth_unit_scale_factor``."""
-
-
-MAX_TIME = 1e18
-"""Maximum time of a frame: nanoseconds since 1970, and some."""
 
 
 class NerfstudioLoader:
@@ -46,7 +45,7 @@ class NerfstudioLoader:
         entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
         images = [transforms.image(entry) for entry in entries]
         names = plain_names([entry["file_path"] for entry in entries])
-        times = _times(transforms, entries, names)
+        times, source = _times(transforms, entries)
         frames = []
         for entry, image, name, time in zip(entries, images, names, times, strict=True):
             mask, depth = transforms.file(entry, "mask_path"), transforms.file(entry, "depth_file_path")
@@ -69,15 +68,26 @@ class NerfstudioLoader:
         if ignored:
             lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
             notes += (f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}",)
-        return posed_capture(root, kept, val, replace(_world(transforms), notes=(*transforms.notes, *notes)), options)
+        world = replace(_world(transforms), time_source=source, notes=(*transforms.notes, *notes))
+        return posed_capture(root, kept, val, world, options)
 
 
-def _times(transforms: Transforms, entries: Sequence[dict[str, Any]], names: Sequence[str]) -> list[float]:
-    """The field ``time`` (or ``timestamp``) of every frame; without it, the numbers in the names."""
-    for key in ("time", "timestamp"):
-        if all(key in entry for entry in entries):
-            return [float(read_numbers(transforms.path, entry, key, (), MAX_TIME)) for entry in entries]
-    return times_of_names(names)
+def _times(transforms: Transforms, entries: Sequence[dict[str, Any]]) -> tuple[list[float], TimeSource]:
+    """Times of sorted frames, from the first on: their field ``time`` or ``timestamp``, else those of their names."""
+    times, source, are_read = times_of_names([entry["file_path"] for entry in entries])
+    given = transforms.times(entries, "time", "timestamp")
+    if given is None:
+        return times, source
+    field, stated = given
+    first = min(stated)
+    text = with_steps(f"times from the field {field} of {INDEX}", [float(time - first) for time in stated])
+    by_name = sorted(zip(times, stated, entries, strict=True), key=lambda item: item[:2])
+    reversed_ = next(((a, b) for a, b in pairwise(by_name) if are_read and b[1] < a[1]), None)
+    problem = ""
+    if reversed_ is not None:
+        before, after = (visible(item[2]["file_path"]) for item in reversed_)
+        problem = f"the numbers in the names have another order: {after} is earlier than {before}"
+    return [float(time - first) for time in stated], TimeSource(text, problem)
 
 
 def _depth_unit(transforms: Transforms) -> float:

@@ -4,7 +4,6 @@ A loader makes a ``PosedFrame`` of every image, with functions that read its par
 ``posed_capture`` makes the ``Capture``.
 """
 
-import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader, without_distortion
+from warpgs.data.time_source import TimeSource
 from warpgs.data.units import SceneUnits, scene_units, units_around
 
 from .listed import without_image_suffix
@@ -32,6 +32,9 @@ HOLDOUT = 8
 
 MAX_DEPTH_FRAMES, DEPTH_SIDE = 24, 320
 """Number of frames that points are taken from where there are none, and longest side of their images [px]."""
+
+IN_ORDER = TimeSource("times from the order of the frames")
+"""Times of layouts whose frames are numbered."""
 
 Size = tuple[int, int]
 """(width, height) that a part of a frame is read in [px]."""
@@ -75,6 +78,7 @@ class World:
         colors: [P, 3] 8-bit RGB; None if unknown.
         units: Scene units; around points and cameras if None, and wider than the cameras without points.
         assumption: What is dynamic where the frames have no masks.
+        time_source: Where the times come from.
         own_times: Whether times are in [0, 1] already.
         background, notes: See ``Capture``.
     """
@@ -83,6 +87,7 @@ class World:
     colors: UInt8[np.ndarray, "P 3"] | None = None
     units: SceneUnits | None = None
     assumption: Assumption = "masks"
+    time_source: TimeSource = IN_ORDER
     own_times: bool = False
     background: Background = "black"
     notes: Sequence[str] = ()
@@ -127,6 +132,7 @@ def posed_capture(
         read_taken=taken_reader(reader.read_with, lenses),
         background=world.background,
         notes=world.notes,
+        time_source=world.time_source,
     )
 
 
@@ -180,16 +186,6 @@ def opencv_from_opengl(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.nd
 def every_eighth(names: Sequence[str]) -> list[str]:
     """The frames for evaluation where the files do not say which ones are: every eighth, from the fifth on."""
     return list(names[HOLDOUT // 2 :: HOLDOUT])
-
-
-def times_of_names(names: Sequence[str]) -> list[float]:
-    """Time of each frame from the number at the end of its name; from the order of the names if one has none.
-
-    Frames of several cameras with one number have one time.
-    """
-    numbers = [re.search(r"(\d{1,15})$", name) for name in names]
-    found = [float(number[1]) for number in numbers if number]
-    return found if len(found) == len(names) else [float(k) for k in range(len(names))]
 
 
 def plain_names(paths: Sequence[str]) -> list[str]:

@@ -7,6 +7,8 @@ fisheye lens ``k1`` to ``k4``. Each may be given once or per frame.
 """
 
 import math
+import reprlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from jaxtyping import Float
 
 from warpgs.data.images import image_size
 from warpgs.data.lens import Lens
+from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
 
 from .listed import ListedFiles
@@ -25,6 +28,9 @@ PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL",
 """Values of ``camera_model`` of a perspective lens; the other one that is read is ``FISHEYE``."""
 
 FISHEYE = "OPENCV_FISHEYE"
+
+MAX_TIME = 1e19
+"""Maximum magnitude of a time: today's nanoseconds since 1970 are 1.8e18."""
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """Suffixes that ``file_path`` may lack."""
@@ -91,6 +97,36 @@ class Transforms:
         if path is None:
             raise ValueError(f"{self.path}: a frame has no file_path")
         return path
+
+    def times(self, frames: Sequence[dict[str, Any]], *fields: str) -> tuple[str, list[int | float]] | None:
+        """The first of some fields that all frames have, and the time of each frame in it; None if no frame has any.
+
+        Raises:
+            ValueError: If only some frames have one, or a time is not a finite number.
+        """
+        given = {field: sum(frame.get(field) is not None for frame in frames) for field in fields}
+        field = max(fields, key=given.__getitem__)
+        if not given[field]:
+            return None
+        if given[field] < len(frames):
+            without = next(self._name(frame) for frame in frames if frame.get(field) is None)
+            raise ValueError(
+                f"{self.path}: {without} has no {field}, which {given[field]} of {len(frames)} frames have: "
+                "give every frame one; without any, names tell the times"
+            )
+        return field, [self._time(frame, field) for frame in frames]
+
+    def _time(self, frame: dict[str, Any], field: str) -> int | float:
+        time = frame[field]
+        if isinstance(time, bool) or not isinstance(time, int | float) or not -MAX_TIME <= time <= MAX_TIME:
+            raise ValueError(
+                f"{self.path}: {field} of {self._name(frame)} must be a finite number of at most {MAX_TIME:g} in "
+                f"magnitude, got {reprlib.repr(time)}"
+            )
+        return time
+
+    def _name(self, frame: dict[str, Any]) -> str:
+        return visible(str(frame.get("file_path")))[:80]
 
     def pose(self, frame: dict[str, Any]) -> Float[np.ndarray, "3 4"]:
         """[3, 4] world-to-camera pose of a frame, OpenCV axes.

@@ -1,0 +1,121 @@
+"""Time stamps in file names: dates with the time of day, seconds since 1970, seconds and nanoseconds.
+
+Cameras and phones write dates (IMG_20240131_142233, PXL_20240131_142233123, 2024-01-31 14.22.33), TUM's tools decimal
+seconds (1305031102.4, trailing zeros may be omitted), programs that read ROS bags nanoseconds (1403636579763555584) or
+seconds and nanoseconds, with zeros before the latter or without (1305031102_400000000, 1305031102_5000000).
+"""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+SECOND = 10**9
+"""Nanoseconds."""
+
+EARLIEST = 10**9
+"""Seconds of a calendar or since 1970 are more; smaller ones may be any number."""
+
+SHORTEST_COUNTED = SECOND // 10
+"""If the fractions of all seconds are shorter than this [ns], they are numbers of frames in a second, not fractions."""
+
+DATE = re.compile(
+    r"(?<![0-9])(?P<date>[12][0-9]{3}[-_.]?[0-9]{2}[-_.]?[0-9]{2})(?:[ _T.-]|[ _]at[ _])?"
+    r"(?P<clock>[0-9]{2}[-_.:h]?[0-9]{2}[-_.:m]?[0-9]{2})s?"
+    r"(?:(?P<mark>[._,-]?)(?P<part>[0-9]{9}|[0-9]{6}|[0-9]{3}|(?<=\.)[0-9]{1,9}))?(?![0-9])"
+)
+EPOCH = re.compile(r"(?<![0-9])(?P<seconds>[1-4][0-9]{9})(?:(?P<mark>[._-]?)(?P<part>[0-9]{1,9}))?(?![0-9])")
+"""Seconds since 1970, from 2001 on; what follows may be a fraction of a second or a number."""
+
+PAIR = re.compile(r"(?<![0-9])(?P<seconds>[0-9]{1,10})(?P<mark>[._-])(?P<part>[0-9]{9})(?![0-9])")
+"""Seconds since any time, and nanoseconds."""
+
+DECIMAL = re.compile(r"(?<![0-9])(?P<seconds>[0-9]{1,10})(?P<mark>\.)(?P<part>[0-9]{1,9})(?![0-9])")
+
+AFTER_LETTERS = re.compile(r"(?i)(?<![a-z])(t|ts|sec|time|stamp|timestamp)$")
+"""Words that a decimal number may follow directly: that of shot1.0001 is a shot, then a frame."""
+
+
+class Stamps(NamedTuple):
+    """A time stamp of every name: nanoseconds since any time, and the rest of the name, before and after it."""
+
+    nanoseconds: list[int]
+    rests: list[tuple[str, str]]
+
+
+def find_stamps(stems: Sequence[str]) -> Iterator[Stamps]:
+    """Ways to read time stamps that differ between the names, the most specific first.
+
+    Args:
+        stems: Names without suffixes.
+    """
+    for pattern, seconds_of in ((DATE, _calendar_seconds), (EPOCH, _seconds), (PAIR, _seconds), (DECIMAL, _decimal)):
+        matches = [[*pattern.finditer(stem)] for stem in stems]
+        counts = {len(found) for found in matches}
+        if len(counts) != 1:
+            continue
+        for k in reversed(range(counts.pop())):  # the last one that differs is that of the frame
+            stamps = _stamps([found[k] for found in matches], seconds_of)
+            if stamps is not None and len(set(stamps.nanoseconds)) > 1:
+                yield stamps
+
+
+def _stamps(matches: Sequence[re.Match[str]], seconds_of: Callable[[re.Match[str]], int | None]) -> Stamps | None:
+    """The time stamps of one match in every name; None if they are none."""
+    seconds = [second for match in matches if (second := seconds_of(match)) is not None]
+    if len(seconds) < len(matches):
+        return None
+    parts = [match["part"] or "" for match in matches]
+    marks = {match["mark"] for match in matches if match["part"]}
+    fractions = _fractions(parts, marks)
+    is_given = min(seconds) >= EARLIEST and marks <= {".", ""}
+    if fractions is not None and not is_given and max(fractions) < SHORTEST_COUNTED:
+        fractions = None
+    if fractions is None and ("" in marks or min(seconds) < EARLIEST):
+        return None  # digits of a longer number, or two numbers
+    ends = [match.start("part") if fractions is None and match["part"] else match.end() for match in matches]
+    values = [SECOND * whole + part for whole, part in zip(seconds, fractions or [0] * len(parts), strict=True)]
+    rests = [(match.string[: match.start()], match.string[end:]) for match, end in zip(matches, ends, strict=True)]
+    return Stamps(values, rests)
+
+
+def _fractions(parts: Sequence[str], marks: set[str]) -> list[int] | None:
+    """Fractions of a second [ns] from their digits, and from what separates them from the seconds.
+
+    None if they are none: as many digits as milliseconds, microseconds or nanoseconds have are expected, or fewer, if
+    no number begins with 0. After a decimal point trailing zeros may be omitted, instead.
+    """
+    widths = {len(part) for part in parts if part}
+    if not widths:
+        return [0] * len(parts)
+    has_zeros = len(widths) == 1 or any(len(part) > 1 and part[0] == "0" for part in parts)
+    if marks <= {".", ","} and (has_zeros or max(widths) < 9):
+        return [int(part.ljust(9, "0")) for part in parts]
+    if (
+        len(marks) > 1
+        or (has_zeros and widths not in ({3}, {6}, {9}))
+        or ("" in marks and not has_zeros and 9 not in widths)
+    ):
+        return None
+    unit = 10 ** (9 - next(width for width in (3, 6, 9) if width >= max(widths)))
+    return [unit * int(part or 0) for part in parts]
+
+
+def _calendar_seconds(match: re.Match[str]) -> int | None:
+    digits = re.sub(r"[^0-9]", "", match["date"] + match["clock"])
+    try:
+        moment = datetime.strptime(digits, "%Y%m%d%H%M%S")
+    except ValueError:
+        return None
+    return 86_400 * moment.toordinal() + 3600 * moment.hour + 60 * moment.minute + moment.second
+
+
+def _seconds(match: re.Match[str]) -> int:
+    return int(match["seconds"])
+
+
+def _decimal(match: re.Match[str]) -> int | None:
+    before = match.string[: match.start()]
+    if before[-1:].isalpha() and not AFTER_LETTERS.search(before):
+        return None
+    return int(match["seconds"])
