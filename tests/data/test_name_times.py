@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.data import layouts
-from tests.data.captures import edit_json
+from tests.data.captures import edit_json, write_json
 from warpgs.config import TrainConfig
 from warpgs.data.check import check_capture
 from warpgs.data.import_capture import import_capture
@@ -195,6 +195,28 @@ def test_blender_files_of_which_one_lacks_times_are_refused(edited):
     edit_json(root / "transforms_test.json", frames=frames)
     with pytest.raises(ValueError, match=r"transforms_test\.json: frames have no time, but those of transforms_train"):
         load_capture(root)
+
+
+def edit_steps(root, edit):
+    path = root / "metadata.json"
+    write_json(path, {name: edit(name, entry) for name, entry in json.loads(path.read_text()).items()})
+
+
+def test_times_begin_at_0_whatever_the_first_time_id_is(root):
+    before = {name: camera.time for name, camera in load_capture(root).cameras.items()}
+    edit_steps(root, lambda name, entry: {**entry, "time_id": entry["time_id"] + 1000})
+    capture = load_capture(root)
+    assert {name: camera.time for name, camera in capture.cameras.items()} == before
+    assert capture.time_source == TimeSource("times from time_id in metadata.json, 1 apart")
+
+
+def test_warp_ids_are_used_for_all_frames_if_one_lacks_a_time_id(root):
+    edit_steps(root, lambda name, entry: {**entry, "time_id": None if name == "left_000001" else 500})
+    capture = load_capture(root)
+    times = [capture.cameras[f"left_{k:06d}"].time for k in range(4)]
+    assert times == [0.0, 1 / 3, 2 / 3, 1.0]
+    assert capture.time_source.text.startswith("times from warp_id in metadata.json")
+    assert "left_000001 has no time_id" in capture.time_source.problem
 
 
 @pytest.mark.parametrize("layout", layouts.ALL)

@@ -41,8 +41,9 @@ def require_same_times(capture: Capture, metadata: Metadata) -> None:
         now = capture.cameras[name].time if name in capture.cameras else time
         if abs(now - time) > MAX_TIME_CHANGE:
             raise ValueError(
-                f"frame {name} of {capture.name} had time {time:.4g} in training and has {now:.4g} now: the last frame "
-                "has time 1, so it must stay the same (but its image may be replaced by one of the same size)"
+                f"frame {name} of {capture.name} had time {time:.4g} in training and has {now:.4g} now: the first "
+                "frame has time 0 and the last one time 1, so both must stay the same (but their images may be "
+                "replaced by others of the same size)"
             )
 
 

@@ -5,7 +5,6 @@ sparse/0, resized_mask/<factor>x/<id>.png.png (0 = dynamic), depth/<factor>x/<id
 covisible/<factor>x/val/<id>.png.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from warpgs.data.lens import Lens, undistort
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
+from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN
 from warpgs.errors import command
@@ -35,6 +35,10 @@ from .listed import ListedFiles, find_file
 from .options import LoadOptions
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
+
+
+MAX_STEP = 10**19
+"""Maximum time_id: today's nanoseconds since 1970 are 1.8e18."""
 
 
 class Split(NamedTuple):
@@ -73,7 +77,7 @@ class NerfiesLoader(ABC):
         metadata, units = read_json(root / "metadata.json", LAYOUT), read_units(root / "scene.json")
         split = self.split(root, dataset, metadata)
         _check_split(split)
-        times = _times(root / "metadata.json", metadata, [*split.train, *split.val])
+        times, time_source = _times(root / "metadata.json", metadata, [*split.train, *split.val])
         factor = options.factor or self.default_factor
         files = _find_files(root, factor, split, incomplete_masks, options.depth)
         cameras, lenses = {}, {}
@@ -100,6 +104,7 @@ class NerfiesLoader(ABC):
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             read_taken=taken_reader(reader.read_with, lenses),
+            time_source=time_source,
             notes=images_left_out(root, (file.image for file in files.values()), listed),
         )
 
@@ -139,17 +144,22 @@ def _check_split(split: Split) -> None:
         raise ValueError(f"{split.source}: frame {min(both)} is listed for both training and evaluation")
 
 
-def _times(path: Path, metadata: dict[str, Any], names: list[str]) -> dict[str, float]:
-    """Time of each frame: its time_id (warp_id in older captures) over the maximum of all frames."""
-    steps = {}
-    for name in names:
-        step = metadata_field(metadata, name, "time_id")
-        step = metadata_field(metadata, name, "warp_id") if step is None else step
-        if isinstance(step, bool) or not isinstance(step, int | float) or not 0 <= step < math.inf:
-            raise ValueError(f"{path} has no time_id or warp_id for frame {name}: {step!r}")
-        steps[name] = step
-    last = max(steps.values()) or 1  # if all frames have step 0, their time is 0
-    return {name: step / last for name, step in steps.items()}
+def _times(path: Path, metadata: dict[str, Any], names: list[str]) -> tuple[dict[str, float], TimeSource]:
+    """Time of each frame in [0, 1], from the first to the last: its time_id, or in older captures its warp_id."""
+    steps = {key: {name: metadata_field(metadata, name, key) for name in names} for key in ("time_id", "warp_id")}
+    given = {key: [name for name in names if steps[key][name] is not None] for key in steps}
+    key = max(steps, key=lambda key: len(given[key]))
+    for name, step in steps[key].items():
+        if isinstance(step, bool) or not isinstance(step, int | float) or not 0 <= step <= MAX_STEP:
+            raise ValueError(f"{path} has no time_id or warp_id for frame {name}: {step!r:.40}")
+    first, last = min(steps[key].values()), max(steps[key].values())
+    length = (last - first) or 1  # if all frames have one step, their time is 0
+    problem = ""
+    if key == "warp_id" and given["time_id"]:
+        without = next(name for name in names if name not in given["time_id"])
+        problem = f"{without} has no time_id, which {len(given['time_id'])} of {len(names)} frames have"
+    text = with_steps(f"times from {key} in {path.name}", [float(step) for step in steps[key].values()])
+    return {name: (step - first) / length for name, step in steps[key].items()}, TimeSource(text, problem)
 
 
 @dataclass(frozen=True)
