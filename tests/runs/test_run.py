@@ -10,11 +10,11 @@ import torch
 
 from tests import tiny
 from tests.scenes import error
-from warpgs.config import MaskPerturbation, RenderSettings, TrainConfig, scaled
+from warpgs.config import MaskPerturbation, ModelConfig, RenderSettings, Schedule, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
 from warpgs.runs import checkpoint
-from warpgs.runs.config_file import read_config
+from warpgs.runs.config_file import ALWAYS, read_config
 from warpgs.runs.run import Run, choose_device, new_folder, open_run
 from warpgs.training.schedule import Protocol
 
@@ -185,6 +185,43 @@ def test_a_rate_that_is_not_a_number_is_refused(run, value):
 def test_a_rate_may_be_a_whole_number(run):
     edit(run, lambda values: values["optim"].update(means=1))
     assert read_config(run).optim.means == 1.0
+
+
+@pytest.mark.parametrize("section", ["masks", "model", "loss", "optim", "densify", "schedule"])
+def test_a_missing_section_is_refused_by_its_name(run, section):
+    edit(run, lambda values: values.pop(section))
+    with pytest.raises(ValueError, match=rf"config\.json has no section {section}, which every version writes: "):
+        read_config(run)
+
+
+@pytest.mark.parametrize("name", ["seed", "dap", "schedule.stage1", "optim.means", "model.width", "loss.ssim"])
+def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, name):
+    *sections, field = name.split(".")
+    edit(run, lambda values: (values[sections[0]] if sections else values).pop(field))
+    with pytest.raises(ValueError, match=rf"config\.json has no {name}, which every version writes: "):
+        read_config(run)
+
+
+def test_a_run_of_the_first_version_opens_with_the_defaults_of_what_it_does_not_have(run):
+    before = read_config(run)
+
+    def reduce(values):
+        for section, names in ALWAYS.items():
+            part = values[section] if section else values
+            kept = {*names.split(), *filter(None, ALWAYS)} if not section else set(names.split())
+            for name in set(part) - kept:
+                del part[name]
+        values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from")
+
+    edit(run, reduce)
+    config = read_config(run)
+    assert config.schedule == dataclasses.replace(Schedule(), **kept_values(before.schedule, "schedule"))
+    assert config.model == dataclasses.replace(ModelConfig(), **kept_values(before.model, "model"))
+    assert config.max_alpha == TrainConfig().max_alpha
+
+
+def kept_values(section, name):
+    return {field: getattr(section, field) for field in ALWAYS[name].split()}
 
 
 def test_a_section_that_is_not_an_object_is_refused(run):

@@ -23,6 +23,22 @@ REMOVED = {"schedule": ("half_size_until", "mask_trial"), "loss": ("mask_toleran
 RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""
 
+ALWAYS = {
+    "": "antialias app assume checkpoint_every dap data dataset device factor graph iterations "
+    "keep_checkpoints lpips out preset resident_bytes resume seed stage2 static_appearance "
+    "static_geometry vdp",
+    "densify": "dense_fraction every gradient max_gaussians max_size min_opacity visibility",
+    "loss": "depth depth_dynamic depth_end dynamic dynamic_background joint ssim static",
+    "masks": "dilate erode holes",
+    "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
+    "sh_degree skip time_bands width",
+    "optim": "means networks networks_end opacities quats scales sh_dc sh_rest",
+    "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every realign_at "
+    "reset_every sh_degree_every stage1 stage2 warmup",
+}
+"""Fields of each section, "" for those outside, that every version since 0.1.0 writes: others may be missing. With the
+default of another one, a run would be resumed as another run."""
+
 
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Writes config.json into a run folder, with absolute paths.
@@ -40,8 +56,8 @@ def read_config(folder: Path) -> TrainConfig:
     """The training config of a run folder.
 
     Raises:
-        ValueError: If the folder or its config.json does not exist, or the file is damaged or has unknown or mistyped
-            fields.
+        ValueError: If the folder or its config.json does not exist, or the file is damaged, or has unknown or mistyped
+            fields, or lacks a section or a field that every version writes.
     """
     path = folder / NAME
     if not folder.exists():
@@ -49,7 +65,23 @@ def read_config(folder: Path) -> TrainConfig:
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
     values = _with_old_meaning(read_json(path, max_bytes=MAX_BYTES))
-    return dataclasses.replace(parse_config(values, path), out=folder)
+    config = parse_config(values, path)
+    _require_complete(values, path)
+    return dataclasses.replace(config, out=folder)
+
+
+def _require_complete(values: dict[str, Any], path: Path) -> None:
+    """Raises ValueError if a section or field is missing that every version writes, instead of taking its default."""
+    for section, names in ALWAYS.items():
+        present = {RENAMED.get(name, name) for name in (values.get(section, {}) if section else values)}
+        lacking = [name for name in names.split() if name not in present]
+        if lacking:
+            is_gone = section and section not in values
+            what = f"section {section}" if is_gone else ".".join(filter(None, (section, lacking[0])))
+            raise ValueError(
+                f"{path} has no {what}, which every version writes: restore the file from a copy, because with "
+                "defaults in its place this would be another run"
+            )
 
 
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
