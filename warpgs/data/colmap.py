@@ -13,13 +13,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from .colmap_files import read_model
-from .lens import Lens
+from .lens import Lens, unsupported_model
 
 if TYPE_CHECKING:
     import pycolmap
-
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
-"""Where a capture has its model."""
 
 SIMPLE = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models with one focal length."""
@@ -41,17 +38,12 @@ class ModelImage(NamedTuple):
 
 
 class Model(NamedTuple):
-    """A model: posed images, [P, 3] points and their RGB colours."""
+    """A model: posed images, [P, 3] points and their RGB colours, and what had to be interpreted, one sentence each."""
 
     images: list[ModelImage]
     points: Float[np.ndarray, "P 3"]
     colors: UInt8[np.ndarray, "P 3"]
-
-
-def find_model(root: Path) -> Path | None:
-    """The folder of a capture's model; None if it has none."""
-    found = (root / name for name in MODEL_FOLDERS)
-    return next((path for path in found if any((path / f"cameras.{s}").is_file() for s in ("bin", "txt"))), None)
+    notes: list[str]
 
 
 def load_model(folder: Path, undistort: bool = True) -> Model:
@@ -64,8 +56,9 @@ def load_model(folder: Path, undistort: bool = True) -> Model:
     Raises:
         ValueError: If a file is missing or damaged, or a camera model cannot be represented.
     """
-    model = read_model(folder)
-    images = []
+    images: list[ModelImage] = []
+    notes: list[str] = []
+    model = read_model(folder, notes.append)
     for image in model.images.values():
         if image.has_pose:
             camera = model.cameras[image.camera_id]
@@ -77,7 +70,7 @@ def load_model(folder: Path, undistort: bool = True) -> Model:
     found = [point for _, point in sorted(model.points3D.items())]
     points = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
-    return Model(images, points, colors)
+    return Model(images, points, colors, notes)
 
 
 def lens_of(camera: pycolmap.Camera, undistort: bool = True) -> Lens:
@@ -98,7 +91,7 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
         ValueError: If the camera model cannot be represented, or a number is missing or out of range.
     """
     if model not in NUM_PARAMETERS or any(params[9:]):
-        raise ValueError(f"the camera model {model} is not supported; first run colmap image_undistorter")
+        raise ValueError(unsupported_model(model, "first run colmap image_undistorter, whose output is read"))
     if len(params) != NUM_PARAMETERS[model]:
         raise ValueError(f"{model} has {NUM_PARAMETERS[model]} parameters, got {len(params)}")
     fx, fy, cx, cy, *distortion = (params[0], *params) if model in SIMPLE else params

@@ -14,6 +14,8 @@ file until memory is exhausted. So the sizes of all entries are added up first. 
 from __future__ import annotations
 
 import struct
+import tempfile
+from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -21,6 +23,7 @@ import numpy as np
 
 from warpgs.files import MAX_NUMBER, read_bounded, require_file
 
+from .colmap_text import lacks_features, rewrite_text_model
 from .images import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -32,32 +35,75 @@ MAX_BYTES = 1 << 30
 NUM_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 """Number of parameters of each camera model, by its index in COLMAP's ``CameraModelId``."""
 
+MISFIT = "one refers to a camera, image or point that another lacks; copy all files of one model again"
+
 REQUIRED, OPTIONAL = ("cameras", "images", "points3D"), ("rigs", "frames")
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
+def read_model(folder: Path, note: Callable[[str], None] = lambda text: None) -> pycolmap.Reconstruction:
     """A COLMAP model in binary or text files; its numbers are finite, and its image names stay within a folder.
+
+    Args:
+        folder: Folder of the files.
+        note: Receives what had to be left out or interpreted, one sentence each.
 
     Raises:
         ValueError: If a file is missing, too large or damaged, or refers to what is not there; the message names it.
     """
-    import pycolmap  # takes 0.2 s
-
-    suffix = next((s for s in (".bin", ".txt") if all((folder / f"{n}{s}").exists() for n in REQUIRED)), None)
-    if suffix is None:
-        raise ValueError(f"{folder} is not a COLMAP model: expected cameras, images and points3D as .bin or .txt")
-    for name in (*REQUIRED, *OPTIONAL):
+    suffix = _suffix(folder)
+    present = [name for name in (*REQUIRED, *OPTIONAL) if (folder / f"{name}{suffix}").exists()]
+    for name in present:
         path = folder / f"{name}{suffix}"
-        if name in REQUIRED or path.exists():
-            require_file(path, MAX_BYTES)
-            if suffix == ".bin":
-                _check_entries(path)
+        require_file(path, MAX_BYTES)
+        if suffix == ".bin":
+            _check_entries(path)
+    lonely = [name for name in OPTIONAL if name in present] if not set(OPTIONAL) <= set(present) else []
+    for name in lonely:
+        (other,) = (other for other in OPTIONAL if other != name)
+        note(f"{folder} has {name}{suffix} but not {other}{suffix}: poses are those of images{suffix}")
+    model = _opened(folder, suffix, [name for name in present if name not in lonely], note)
     try:
-        model = pycolmap.Reconstruction(str(folder))
         _check_values(model)
-    except (ValueError, RuntimeError, IndexError) as error:
+    except ValueError as error:
         raise ValueError(f"{folder} is not a COLMAP model of files that fit together: {error}") from error
     return model
+
+
+def _suffix(folder: Path) -> str:
+    """The suffix of the files of a model; binary files are preferred."""
+    missing = {s: [n + s for n in REQUIRED if not (folder / (n + s)).exists()] for s in (".bin", ".txt")}
+    suffix = min(missing, key=lambda s: len(missing[s]))
+    if len(missing[suffix]) == len(REQUIRED):
+        raise ValueError(f"{folder} is not a COLMAP model: expected cameras, images and points3D as .bin or .txt")
+    if missing[suffix]:
+        raise ValueError(
+            f"{folder} is not a COLMAP model: {' and '.join(missing[suffix])} must lie with its other files; "
+            "copy all files of the model from where COLMAP wrote them"
+        )
+    return suffix
+
+
+def _opened(folder: Path, suffix: str, names: list[str], note: Callable[[str], None]) -> pycolmap.Reconstruction:
+    """The model of some files of a folder."""
+    import pycolmap  # takes 0.2 s
+
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary)
+        for name in names:  # COLMAP would read others that it finds in the folder
+            (copy / (name + suffix)).symlink_to((folder / (name + suffix)).resolve())
+        try:
+            if suffix == ".bin" or not lacks_features(folder):
+                return pycolmap.Reconstruction(str(copy))
+        except (ValueError, RuntimeError, IndexError) as error:  # with expressions of COLMAP's source
+            if suffix == ".bin":
+                raise ValueError(f"{folder} is not a COLMAP model of files that fit together: {MISFIT}") from error
+        rewritten = copy / "rewritten"
+        rewritten.mkdir()
+        rewrite_text_model(folder, rewritten, note)
+        try:
+            return pycolmap.Reconstruction(str(rewritten))
+        except (ValueError, RuntimeError, IndexError) as error:
+            raise ValueError(f"{folder} is not a COLMAP model of files that fit together: {MISFIT}") from error
 
 
 def _check_entries(path: Path) -> None:
@@ -127,6 +173,13 @@ def _check_values(model: pycolmap.Reconstruction) -> None:
     for number, image in model.images.items():
         if image.has_pose and not (np.abs(image.cam_from_world().matrix()) <= MAX_NUMBER).all():
             raise ValueError(f"the pose of image {number} is not finite")
-        name = PurePosixPath(image.name.replace("\\", "/"))
+        name = PurePosixPath(_name(image, number).replace("\\", "/"))
         if name.is_absolute() or ".." in name.parts or not name.parts or "\0" in image.name:
             raise ValueError(f"the name of image {number} leads out of the folder: {image.name!r}")
+
+
+def _name(image: pycolmap.Image, number: int) -> str:
+    try:
+        return image.name
+    except UnicodeDecodeError as error:
+        raise ValueError(f"the name of image {number} is not in UTF-8: {error.object!r:.60}") from error

@@ -38,6 +38,20 @@ NUM_NEWTON_STEPS = 10
 MAX_ZOOM = 2.0
 """Maximum zoom of the undistorted image; distortion that needs more is considered an error in the file."""
 
+PANORAMAS = ("EQUIRECT", "SPHER", "PANORAMA", "LATLONG", "OMNI", "VR180", "360")
+"""Parts of the names that programs give to camera models of panoramas."""
+
+
+def unsupported_model(model: object, remedy: str) -> str:
+    """Message that a camera model is not read, and what to do: ``remedy``, unless it is one of panoramas."""
+    if any(part in str(model).upper() for part in PANORAMAS):
+        return (
+            f"the camera model {model} is not supported: it is one of 360° images, which must be cut into perspective "
+            "views before their poses are estimated, as by ns-process-data images --camera-type equirectangular of "
+            "nerfstudio or panorama_sfm.py of COLMAP"
+        )
+    return f"the camera model {model} is not supported; {remedy}"
+
 
 @dataclass(frozen=True)
 class Lens:

@@ -11,7 +11,7 @@ from typing import Protocol
 from warpgs.config import MaskPerturbation
 from warpgs.data.builtin import NAMES, PREFIX, builtin_folder, is_builtin
 from warpgs.data.capture import Capture
-from warpgs.data.colmap import find_model
+from warpgs.data.colmap_folders import find_models
 from warpgs.data.masks import check_perturbation
 from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.errors import command, missing, not_one_of
@@ -145,7 +145,7 @@ def require_capture(root: Path) -> None:
     for parent in root.resolve().parents[:2]:
         if is_capture(parent):
             raise ValueError(f"{root} is a part of a capture: give {parent}")
-    if find_model(root) is not None:
+    if find_models(root):
         raise ValueError(f"{root} has a COLMAP model, but not the folder images/ with its images")
     raise ValueError(
         f"{root} has no dataset.json and the files of no other layout ({', '.join(LOADERS)}); warpgs prepare makes a "

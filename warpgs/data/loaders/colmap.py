@@ -4,7 +4,8 @@ from functools import partial
 from pathlib import Path
 
 from warpgs.data.capture import Capture
-from warpgs.data.colmap import MODEL_FOLDERS, ModelImage, find_model, load_model
+from warpgs.data.colmap import ModelImage, load_model
+from warpgs.data.colmap_folders import PLACES, find_models, largest_model
 from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.files import natural_order
@@ -31,25 +32,25 @@ class ColmapLoader:
     def recognizes(self, root: Path) -> bool:
         """Whether there are a model and a folder of images, but not another program's index."""
         others = ("dataset.json", "transforms.json", "transforms_train.json")
-        return (
-            find_model(root) is not None and (root / "images").is_dir() and not any((root / o).exists() for o in others)
-        )
+        has_model = any(model.has_images for model in find_models(root))
+        return has_model and not any((root / other).exists() for other in others)
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
-        folder = find_model(root)
-        if folder is None:
-            raise ValueError(f"{root} has no COLMAP model in {', '.join(MODEL_FOLDERS)}")
-        model = load_model(folder, options.undistort)
+        found, notes = largest_model(root)
+        if found is None:
+            raise ValueError(f"{root} has no folder images/ with a COLMAP model in {PLACES}")
+        model = load_model(found.folder, options.undistort)
         images = sorted(model.images, key=lambda image: natural_order(image.name))
         names = plain_names([image.name for image in images])
         times, source, _ = times_of_names([image.name for image in images])
-        files = _Files(root, options.factor or 1)
+        files = _Files(found.part, options.factor or 1)
+        notes += model.notes
+        if found.part != root:
+            notes += _unused(root, found.part)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
-        left_out = images_left_out(
-            root, files.used, f"the model in {folder.relative_to(root)} has no pose for them", files.folder
-        )
-        notes = (*files.images.notes, *left_out)
+        reason = f"the model in {found.shown(root)} has no pose for them"
+        notes += [*files.images.notes, *images_left_out(root, files.used, reason, files.folder)]
         world = World(model.points, model.colors, time_source=source, notes=notes)
         return posed_capture(root, frames, every_eighth(names), world, options)
 
@@ -86,6 +87,13 @@ class _Files:
             None if mask is None else partial(read_resized_mask, mask),
             None if depth is None else partial(read_depth, depth),
         )
+
+
+def _unused(root: Path, part: Path) -> list[str]:
+    """Notes on masks and depth beside the original images of those that are read."""
+    names = [name for name in (MASKS, DEPTHS) if (root / name).is_dir() and not (part / name).is_dir()]
+    place = part.relative_to(root)
+    return [f"{name} is left out: those of the images in {place}/images are read from {place}/{name}" for name in names]
 
 
 def _first(folder: Path, *names: str) -> Path | None:

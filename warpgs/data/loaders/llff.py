@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from warpgs.data.capture import Capture
-from warpgs.data.colmap import find_model, load_model
+from warpgs.data.colmap import load_model
+from warpgs.data.colmap_folders import ModelFolder, find_models
 from warpgs.data.images import image_size, read_depth
 from warpgs.data.lens import Lens
 from warpgs.data.resized import read_resized_image, read_resized_mask
@@ -45,7 +46,7 @@ class LlffLoader:
     def recognizes(self, root: Path) -> bool:
         """Whether there is a poses_bounds.npy; without NSFF's folders, a COLMAP model is preferred."""
         dynamic = any((root / name).is_dir() for name in (MASKS, EVALUATION))
-        return (root / INDEX).is_file() and (dynamic or find_model(root) is None)
+        return (root / INDEX).is_file() and (dynamic or not _models(root))
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
@@ -164,11 +165,17 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
 
 def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarray, "N 2"]) -> World:
     """Points of a COLMAP model, if there is one; otherwise units that contain what lies between the bounds."""
-    model = find_model(root)
-    if model is not None:
-        _, points, colors = load_model(model, undistort=False)
+    if models := _models(root):
+        # Several models have unrelated worlds: that of the poses has as many images.
+        folder = next((model.folder for model in models if model.num_images() == len(poses)), models[0].folder)
+        _, points, colors, notes = load_model(folder, undistort=False)
         if len(points):
-            return World(points, colors)
+            return World(points, colors, notes=notes)
     centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
     along = centers[:, None] + bounds[:, :, None] * poses[:, None, 2, :3]
     return World(np.zeros((0, 3)), units=scene_units(along.reshape(-1, 3), centers))
+
+
+def _models(root: Path) -> list[ModelFolder]:
+    """COLMAP models of the images themselves, not of undistorted copies."""
+    return [model for model in find_models(root) if model.part == root]

@@ -18,7 +18,7 @@ from warpgs.data.archive import Archive
 from warpgs.data.capture import Capture
 from warpgs.data.exr import exr_size, read_exr_channel
 from warpgs.data.images import decode_bytes, max_depth_pixels
-from warpgs.data.lens import Lens
+from warpgs.data.lens import Lens, unsupported_model
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import check_shape, inverse_of, resize, resize_mask
 from warpgs.data.video_frames import VideoFrames
@@ -134,7 +134,7 @@ def _check_cameras(path: Path) -> None:
         lines = read_bounded(path, MAX_TEXT).decode(errors="replace").splitlines()
         models = {line.partition(":")[2].strip() for line in lines if line.strip()}
         if other := models - {PINHOLE}:
-            raise ValueError(f"{path}: the camera model {min(other)} is not supported, only {PINHOLE}")
+            raise ValueError(f"{path}: {unsupported_model(min(other), f'run ViPE with a {PINHOLE} camera')}")
 
 
 def _still_instances(path: Path) -> list[int]:
