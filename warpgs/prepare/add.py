@@ -20,7 +20,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize, require_finished
+from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
@@ -74,6 +74,8 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
         OSError: If a file cannot be written; the message names it.
     """
     _check_options(options)
+    if not root.exists():
+        raise ValueError(missing_capture(root))
     require_finished(root)
     layout = recognize(root)
     loader = LOADERS[layout]

@@ -13,6 +13,7 @@ from warpgs.data.builtin import NAMES, PREFIX, builtin_folder, is_builtin
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.masks import check_perturbation
+from warpgs.data.missing import missing_folder
 from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.errors import command, missing, not_one_of
 from warpgs.files import read_json
@@ -110,6 +111,8 @@ def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_
     root = builtin_folder(root, factor=factor) if is_builtin(root) else Path(root)
     if dataset is None:
         require_capture(root)
+    elif not root.exists():
+        raise ValueError(missing_capture(root))
     require_finished(root)
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
@@ -124,8 +127,9 @@ def is_capture(root: Path) -> bool:
 
 def missing_capture(root: Path) -> str:
     """Message that a folder does not exist, and what was meant."""
-    is_name = f"{PREFIX}{root}" in NAMES or str(root) == "builtin"
-    return f"{missing(root)}; built-in captures are {', '.join(NAMES)}" if is_name else missing(root)
+    if f"{PREFIX}{root}" in NAMES or str(root) == PREFIX.rstrip(":"):
+        return f"{missing(root)}; built-in captures are {', '.join(NAMES)}"
+    return missing_folder(root, is_capture)
 
 
 def require_capture(root: Path) -> None:
