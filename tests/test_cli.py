@@ -47,6 +47,11 @@ def test_help_of_train_is_short_and_help_all_complete(capsys):
     assert shown(capsys, "train", "--help") == short
 
 
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"train"}))
+def test_other_commands_show_all_options_at_once(command, capsys):
+    assert shown(capsys, command, "--help-all") == shown(capsys, command, "--help")
+
+
 @pytest.mark.parametrize(
     ("arguments", "shown"),
     [(["train", "--help-all"], b"max-gaussians INT"), (["check", "empty \N{RIGHTWARDS ARROW}"], rb"empty \u2192")],
@@ -98,6 +103,12 @@ def test_positional_arguments_have_names(command, metavars, capsys):
     [
         (["exprot"], "warpgs: there is no command exprot; did you mean export?"),
         (["xyz"], "warpgs: there is no command xyz; warpgs --help lists all"),
+        (["train", "--help-al"], "warpgs train: there is no option --help-al; did you mean --help-all?"),
+        (["check", "--helpall"], "warpgs check: there is no option --helpall; did you mean --help-all?"),
+        (["train", "--hel"], "warpgs train: there is no option --hel; did you mean --help?"),
+        (["train", "-help"], "warpgs train: unrecognized options: -help; did you mean --help?"),
+        (["view", "--versoin"], "warpgs view: there is no option --versoin; did you mean --version?"),
+        (["--help-al"], "warpgs: there is no command --help-al; did you mean --help-all?"),
         (["export", "--fromat", "ply"], "warpgs export: there is no option --fromat; did you mean --format?"),
         (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
         (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),

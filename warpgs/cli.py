@@ -45,6 +45,9 @@ COMMANDS = {
 }
 """All commands, in the order in which they are used."""
 
+HELP = ("--help", "-h", "--help-all")
+"""Options that show help."""
+
 TRAIN_OPTIONS = (
     *("data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "assume", "exposure"),
     *("antialias", "checkpoint_every", "keep_checkpoints", "lpips"),
@@ -57,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; wrong options and other errors of the user end with one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
-    if name in ("--help", "-h", "--help-all"):
+    if name in HELP:
         print(usage())
         return 0
     if name == "--version" or rest == ["--version"]:
@@ -66,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name.startswith("--tyro"):
         return _print_completion(arguments)
     if name not in COMMANDS:
-        advice = suggestion(name, COMMANDS) or "; warpgs --help lists all"
+        advice = suggestion(name, [*COMMANDS, *HELP, "--version"]) or "; warpgs --help lists all"
         say(f"there is no command {visible(name)}{advice}")
         return FAILED
     prog = f"warpgs {name}"
@@ -78,7 +81,8 @@ def _run(name: str, arguments: Sequence[str], prog: str) -> object:
         from .command_line.parsing import parse  # imports tyro
 
         command = COMMANDS[name].load()
-    return parse(command, arguments, prog).run()
+    plain = ["--help" if argument == "--help-all" else argument for argument in arguments]  # help shows all options
+    return parse(command, plain, prog).run()
 
 
 @program
@@ -96,7 +100,7 @@ def _train(arguments: Sequence[str], prog: str) -> int:
 
         config = COMMANDS["train"].load()
     help_all = "--help-all" in arguments
-    if not help_all and not {"-h", "--help"} & set(arguments):
+    if not set(HELP) & set(arguments):
         return training.main(arguments, prog)
     arguments = ["--help" if argument == "--help-all" else argument for argument in arguments]
     try:

@@ -38,6 +38,9 @@ def _choices(match: re.Match[str]) -> str:
     return not_one_of(match["option"], given, choices)
 
 
+ALWAYS = ("--help", "--help-all", "--version")
+"""Options of every command that are not fields of its dataclass."""
+
 REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"invalid literal for int\(\) with base 10: (.*)", r"expected INT, got \1"),
     (r"could not convert string to float: (.*)", r"expected FLOAT, got \1"),
@@ -75,7 +78,7 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
     Raises:
         ValueError: If an option is wrong.
     """
-    known = {*flags(options), "--help"}
+    known = {*flags(options), *ALWAYS}
     for argument in arguments:
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in known and not name.startswith("--tyro"):

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import tyro
 
-from warpgs.command_line.parsing import one_line_errors
+from warpgs.command_line.parsing import ALWAYS, flags, one_line_errors
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
-from warpgs.errors import ending_at_once, run_command
+from warpgs.errors import ending_at_once, run_command, suggestion
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
@@ -48,7 +48,12 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     default = PRESETS[preset]
     config, unknown = tyro.cli(TrainConfig, default=default, args=list(arguments), prog=prog, return_unknown_args=True)
     if unknown:
-        advice = "" if unknown[0].startswith("-") else f"; a capture is given by --data {unknown[0]}"
+        is_option = unknown[0].startswith("-")
+        advice = (
+            suggestion(f"-{unknown[0]}", [*flags(TrainConfig), *ALWAYS])
+            if is_option
+            else f"; a capture is given by --data {unknown[0]}"
+        )
         raise ValueError(f"unrecognized options: {', '.join(unknown)}{advice}")
     return config
 
