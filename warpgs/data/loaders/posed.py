@@ -109,8 +109,7 @@ def posed_capture(
         ValueError: If there are no frames, two have one name, or a camera is invalid.
     """
     _check_names(root, [frame.name for frame in frames])
-    if not options.depth:
-        frames = [replace(frame, inverse_depth=None) for frame in frames]
+    frames = frames if options.depth else [replace(frame, inverse_depth=None) for frame in frames]
     by_name = {frame.name: frame for frame in frames}
     given = None if world.points is None else (world.points, world.colors)
     points, colors = given or points_of_depth(frames, options.undistort)
