@@ -36,6 +36,44 @@ def test_the_sharpest_images_of_a_folder_are_taken(tmp_path, images):
     assert [frame.source for frame in frames.taken] == [f"shot{k:03d}.png" for k in (1, 5, 9, 13, 17)]
 
 
+def named_folder(root, images, names):
+    root.mkdir()
+    for image, name in zip(images, names, strict=False):
+        cv2.imwrite(str(root / name), image)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        ([f"{k}.png" for k in (3, 4, 5, 7, 8)], [0, 1, 2, 4, 5]),
+        ([f"1305031102.{k}.png" for k in ("4", "45", "5", "55", "6")], [0, 50, 100, 150, 200]),
+        (
+            [f"130503110{k}.png" for k in ("2_980000000", "3_13000000", "3_46000000", "3_79000000", "3_112000000")],
+            [0, 33, 66, 99, 132],
+        ),
+    ],
+)
+def test_frames_of_a_folder_have_the_order_and_times_that_their_names_tell(tmp_path, images, names, times):
+    folder, notes = named_folder(tmp_path / "shots", images, names), []
+    frames = take_frames(folder, tmp_path / "frames", Selection(), notes=notes)
+    assert [frame.source for frame in frames.taken] == names
+    assert [frame.time for frame in frames.taken] == times
+    assert [note.split(" in the names, ")[0] for note in notes] in (
+        ["times from the numbers"],
+        ["times from the time stamps"],
+    )
+
+
+def test_the_sorted_order_of_a_folder_whose_names_tell_no_times_is_noted(tmp_path, images):
+    folder, notes = named_folder(tmp_path / "shots", images, [f"{letter}.png" for letter in "abcde"]), []
+    frames = take_frames(folder, tmp_path / "frames", Selection(), notes=notes)
+    assert [(frame.source, frame.time) for frame in frames.taken] == [(f"{c}.png", k) for k, c in enumerate("abcde")]
+    assert "times from the sorted order of the names, because a.png has no number" in notes[0]
+    take_frames(write_folder(tmp_path / "numbered", images[:5]), tmp_path / "other", Selection(), notes=notes)
+    assert len(notes) == 1
+
+
 @pytest.mark.parametrize(("fps", "count"), [(5.0, 10), (1000.0, 20)])
 def test_fps_does_not_exceed_the_frame_rate_of_the_video(tmp_path, images, fps, count):
     video = write_video(tmp_path / "video.mp4", images, rate=10.0)

@@ -1,7 +1,7 @@
 """Frames taken from a video or a folder: evenly spaced over time, the sharpest of each interval, scaled down."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,7 +11,9 @@ from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_SIDE, decode
+from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.motion_check import MAX_ASPECT, MIN_SIDE
+from warpgs.data.time_source import TimeSource
 from warpgs.errors import similar_path
 from warpgs.files import natural_order, read_json, write_json, write_png
 
@@ -30,6 +32,9 @@ CONVERTIBLE = (".heic", ".heif", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".dn
 INDEX = "frames.json"
 """Index of the frames in their folder."""
 
+MAX_TIME = 2**53
+"""Maximum of a time, so that double precision represents it."""
+
 
 @dataclass(frozen=True)
 class SourceFrame:
@@ -39,7 +44,8 @@ class SourceFrame:
         name: Its id in the capture.
         source: Its origin, for messages: the name of a file, or the frame number in a video.
         step: Its index in the source.
-        time: Its time: milliseconds in a video, the index in a folder.
+        time: Its time: milliseconds in a video; in a folder seconds, milliseconds or numbers that its names tell, else
+            its index.
     """
 
     name: str
@@ -119,7 +125,9 @@ def take_frames(
     if not source.exists():
         raise ValueError(f"{source} is missing: expected a video or a folder of images{similar_path(source)}")
     notes = [] if notes is None else notes
-    images = read_folder(source, selection, quiet) if source.is_dir() else read_video(source, selection, quiet, notes)
+    images = (
+        read_folder(source, selection, quiet, notes) if source.is_dir() else read_video(source, selection, quiet, notes)
+    )
     taken: list[SourceFrame] = []
     size: tuple[int, int] | None = None
     for found in images:
@@ -155,8 +163,8 @@ def _checked(image: np.ndarray, origin: str, size: tuple[int, int], longest_side
     return image
 
 
-def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[TakenImage]:
-    """The sharpest image of each interval of a folder.
+def read_folder(source: Path, selection: Selection, quiet: bool, notes: list[str]) -> Iterator[TakenImage]:
+    """The sharpest image of each interval of a folder; appends to ``notes`` where unusual times come from.
 
     Raises:
         ValueError: If it has no images or too many, or one is damaged.
@@ -175,10 +183,34 @@ def read_folder(source: Path, selection: Selection, quiet: bool) -> Iterator[Tak
     count = min(selection.count or len(paths), len(paths))
     if count > MAX_FRAMES:
         raise ValueError(f"{source} holds {count} images, the maximum is {MAX_FRAMES}: choose with --count")
+    paths, times = _in_order_of_time(paths, notes)
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
-        yield TakenImage(int(best[0]), int(best[0]), paths[best[0]].name, best[1], max(best[1].shape[:2]))
+        yield TakenImage(int(best[0]), times[best[0]], paths[best[0]].name, best[1], max(best[1].shape[:2]))
+
+
+def _in_order_of_time(paths: Sequence[Path], notes: list[str]) -> tuple[list[Path], list[int]]:
+    """Images in the order of time, and their times, which their names tell; see ``SourceFrame``.
+
+    Args:
+        paths: Images in the order of their names.
+        notes: Receives where the times come from, unless they count the images.
+    """
+    named, source, are_read = times_of_names([path.name for path in paths])
+    scale = 1 if all(time.is_integer() for time in named) else 1000
+    times = [round(scale * time) for time in named]
+    if len({*times}) < len(times) or max(times) > MAX_TIME:
+        are_read, source = (
+            False,
+            TimeSource("times from the sorted order of the names", "some names have the same time"),
+        )
+    if not are_read:
+        times = [*range(len(times))]
+    order = sorted(range(len(times)), key=times.__getitem__)
+    if source.problem or [times[k] for k in order] != [*range(len(times))]:
+        notes.append(str(source))
+    return [paths[k] for k in order], [times[k] for k in order]
 
 
 def _is_image(path: Path) -> bool:

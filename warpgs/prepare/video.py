@@ -37,7 +37,7 @@ class TakenImage(NamedTuple):
 
     Attributes:
         step: Its index in the source.
-        time: Its time: milliseconds from the first frame of a video, or the index in a folder.
+        time: Its time: milliseconds from the first frame of a video; see ``SourceFrame`` for a folder.
         origin: Its origin, for messages.
         image: [H, W, 3] RGB.
         longest_side: Longer side of the frame in the source [px].
