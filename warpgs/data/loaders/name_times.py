@@ -15,6 +15,9 @@ from .rigs import follows_camera, share_times
 
 SUFFIX = re.compile(r"(?i)\.(png|jpe?g|heic|heif|webp|tiff?|bmp|exr|dng)$")
 
+MAX_NAME = 4096
+"""Number of characters of a path that are looked at; no file has a longer one."""
+
 NUMBER = re.compile(r"([0-9]{1,40})")
 
 MAX_GAP, MAX_STEPS, MIN_TIMES = 0.9, 10.0, 4
@@ -71,10 +74,8 @@ def times_of_names(paths: Sequence[str]) -> NamedTimes:
 
 
 def _stem(path: str) -> str:
-    stem = path.replace("\\", "/")
-    while (shorter := SUFFIX.sub("", stem)) != stem:  # IMG_0001.HEIC.jpg
-        stem = shorter
-    return stem
+    stem = path[-MAX_NAME:].replace("\\", "/")
+    return SUFFIX.sub("", SUFFIX.sub("", stem))  # IMG_0001.HEIC.jpg has two
 
 
 def _numbers(stems: Sequence[str]) -> Iterator[_Reading]:

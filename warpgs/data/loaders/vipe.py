@@ -21,6 +21,7 @@ from warpgs.data.images import decode_bytes, max_depth_pixels
 from warpgs.data.lens import Lens, unsupported_model
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import check_shape, inverse_of, resize, resize_mask
+from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.video_frames import VideoFrames
 from warpgs.files import read_bounded
 
@@ -80,11 +81,13 @@ class VipeLoader:
                 )
             )
         val = every_eighth([frame.name for frame in frames])
+        text = f"times from the numbers of the frames in rgb/{name}.mp4"
+        source = TimeSource(with_steps(text, [frame.time for frame in frames]))
         notes = []
         if without := max(0, video.count - len(frames)):
             where = f"pose/{name}.npz has no pose for them"
             notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are left out: {where}")
-        return posed_capture(root, frames, val, World(points=None, notes=notes), options)
+        return posed_capture(root, frames, val, World(points=None, time_source=source, notes=notes), options)
 
 
 def _video_name(root: Path) -> str:
