@@ -25,6 +25,7 @@ from warpgs.data.units import scene_units
 from warpgs.files import natural_order, read_array
 
 from .listed import find_file
+from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
 from .posed import PosedFrame, World, every_eighth, plain_names, posed_capture, world_to_camera
 
@@ -50,7 +51,7 @@ class LlffLoader:
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
-        poses, bounds, sizes = _read_poses(root / INDEX)
+        poses, bounds, sizes, notes = _read_poses(root / INDEX)
         paths = _images(_image_folder(root, options.factor))
         if len(paths) != len(poses):
             raise ValueError(f"{root / INDEX} has {len(poses)} poses, but {paths[0].parent} has {len(paths)} images")
@@ -64,16 +65,18 @@ class LlffLoader:
         val = [frame.name for frame in others] if others else every_eighth(names)
         options = replace(options, factor=1)  # that of the folder
         source = TimeSource(f"times from the order of the images, one for each pose of {INDEX}")
-        world = replace(_world(root, poses, bounds), time_source=source)
+        world = _world(root, poses, bounds)
+        world = replace(world, time_source=source, notes=(*world.notes, *notes))
         return posed_capture(root, [*frames, *others], frozenset(val), world, options)
 
 
 class _Poses(NamedTuple):
-    """[N, 3, 4] world-to-camera poses, [N, 2] bounds, and [N, 3] height, width, focal length [px]."""
+    """[N, 3, 4] world-to-camera poses, [N, 2] bounds, [N, 3] height, width, focal length [px], and notes."""
 
     poses: Float[np.ndarray, "N 3 4"]
     bounds: Float[np.ndarray, "N 2"]
     sizes: Float[np.ndarray, "N 3"]
+    notes: tuple[str, ...]
 
 
 def _read_poses(path: Path) -> _Poses:
@@ -83,12 +86,14 @@ def _read_poses(path: Path) -> _Poses:
     matrices, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
     down, right, backward, center = (matrices[:, :, k : k + 1] for k in range(4))
     try:
-        poses = [world_to_camera(pose) for pose in np.concatenate([right, down, -backward, center], 2)]
+        found = np.concatenate([right, down, -backward, center], 2)
+        scale = scale_of_rotations(found)
+        poses = [world_to_camera(without_scale(pose, scale)) for pose in found]
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if not ((bounds[:, 0] > 0) & (bounds[:, 1] > bounds[:, 0])).all() or not (matrices[:, :, 4] > 0).all():
         raise ValueError(f"{path}: bounds, sizes and focal lengths must be positive, and near less than far")
-    return _Poses(np.array(poses), bounds, matrices[:, :, 4])
+    return _Poses(np.array(poses), bounds, matrices[:, :, 4], scale_note(path.name, scale))
 
 
 def _image_folder(root: Path, factor: int | None) -> Path:

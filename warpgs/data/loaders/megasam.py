@@ -12,6 +12,7 @@ from warpgs.data.lens import Lens
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import inverse_of, resize
 
+from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
 from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
 
@@ -50,7 +51,9 @@ class MegaSamLoader:
         focal, center = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
         try:
             lens = Lens(width, height, focal, center).checked()
-            poses = [world_to_camera(matrix[:3].astype(np.float64)) for matrix in matrices]
+            matrices = matrices[:, :3].astype(np.float64)
+            scale = scale_of_rotations(matrices)
+            poses = [world_to_camera(without_scale(matrix, scale)) for matrix in matrices]
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
         frames = [
@@ -65,7 +68,7 @@ class MegaSamLoader:
             for k in range(count)
         ]
         val = every_eighth([frame.name for frame in frames])
-        return posed_capture(root, frames, val, World(points=None), options)
+        return posed_capture(root, frames, val, World(points=None, notes=scale_note(path.name, scale)), options)
 
 
 def _file(root: Path) -> Path:

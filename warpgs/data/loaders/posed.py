@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
-from warpgs.data.camera_files import is_rotation
+from warpgs.data.camera_files import MAX_ROTATION_ERROR, is_rotation
 from warpgs.data.capture import Assumption, Background, Capture, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
@@ -173,8 +173,16 @@ def world_to_camera(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarr
     if not np.isfinite(camera_to_world).all():
         raise ValueError("the pose is not finite")
     if not is_rotation(rotation):
-        raise ValueError("the pose is not a rotation and a translation")
+        raise ValueError(f"the pose is not a rotation and a translation: {_flaw(rotation)}")
     return np.hstack([rotation, -rotation @ camera_to_world[:, 3:]])
+
+
+def _flaw(matrix: Float[np.ndarray, "3 3"]) -> str:
+    """What is wrong with a matrix that should be a rotation."""
+    lengths = np.linalg.norm(matrix, axis=1)
+    if np.abs(lengths - 1.0).max() > MAX_ROTATION_ERROR:
+        return f"the axes of the camera have lengths {', '.join(f'{length:.4g}' for length in lengths)}, expected 1"
+    return "its axes are mirrored" if np.linalg.det(matrix) < 0 else "its axes are not at right angles"
 
 
 def opencv_from_opengl(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:

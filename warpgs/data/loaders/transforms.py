@@ -1,9 +1,9 @@
 """Fields of transforms.json files, which nerfstudio, instant-ngp and Blender's datasets share.
 
 ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). Intrinsics are pixels from the
-corner of the image: ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h``, or ``camera_angle_x`` (the horizontal field of
-view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``, ``p2``, ``k3``, or of a
-fisheye lens ``k1`` to ``k4``. Each may be given once or per frame.
+corner of the image: ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h``, or a matrix ``K``, or ``camera_angle_x`` (the
+horizontal field of view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``,
+``p2``, ``k3``, or of a fisheye lens ``k1`` to ``k4``. Each may be given once or per frame.
 """
 
 import math
@@ -17,17 +17,27 @@ import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.images import image_size
-from warpgs.data.lens import Lens
+from warpgs.data.lens import Lens, unsupported_model
 from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
 
 from .listed import ListedFiles
+from .matrices import scale_note, scale_of_rotations, with_intrinsics, without_scale
 from .posed import opencv_from_opengl, world_to_camera
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Values of ``camera_model`` of a perspective lens; the other one that is read is ``FISHEYE``."""
 
 FISHEYE = "OPENCV_FISHEYE"
+
+INSTANT_NGP = {
+    "is_fisheye": FISHEYE,
+    "equirectangular": "EQUIRECTANGULAR",
+    "latlong": "LATLONG",
+    "ftheta_p0": "FTHETA",
+    "orthographic": "ORTHOGRAPHIC",
+}
+"""Fields of instant-ngp instead of ``camera_model``."""
 
 MAX_TIME = 1e19
 """Maximum magnitude of a time: today's nanoseconds since 1970 are 1.8e18."""
@@ -56,19 +66,19 @@ class Transforms:
     """
 
     def __init__(self, path: Path, undistort: bool) -> None:
-        self.path, self.fields, self._undistort = path, read_json(path), undistort
+        self.path, self._undistort = path, undistort
+        self.fields = with_intrinsics(path, read_json(path))
         self._files = ListedFiles(path.parent, path.name)
         frames = self.fields.get("frames")
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
-        self.frames: list[dict[str, Any]] = frames
+        self.frames: list[dict[str, Any]] = [with_intrinsics(path, frame) for frame in frames]
+        self._scale = scale_of_rotations(self._matrix(frame) for frame in frames)
         for frame in frames:
             model = self._model(frame)
             if model not in (*PERSPECTIVE, FISHEYE):
-                raise ValueError(
-                    f"{path}: the camera model {model} is not supported, expected one of "
-                    f"{', '.join((*PERSPECTIVE, FISHEYE))}; undistort the images first"
-                )
+                expected = f"expected one of {', '.join((*PERSPECTIVE, FISHEYE))}"
+                raise ValueError(f"{path}: {unsupported_model(model, f'{expected}: export undistorted images')}")
 
     def file(self, frame: dict[str, Any], key: str) -> Path | None:
         """The file that a field of a frame names; None if there is no such field.
@@ -89,7 +99,7 @@ class Transforms:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was interpreted in the file so far."""
-        return self._files.notes
+        return (*self._files.notes, *scale_note(self.path.name, self._scale))
 
     def image(self, frame: dict[str, Any]) -> Path:
         """The image of a frame; raises as ``file``."""
@@ -134,13 +144,21 @@ class Transforms:
         Raises:
             ValueError: If transform_matrix is missing or not rigid.
         """
-        given = frame.get("transform_matrix")
-        rows = len(given) if isinstance(given, list) else 4
-        matrix = read_numbers(self.path, frame, "transform_matrix", (3 if rows == 3 else 4, 4))[:3]
         try:
-            return world_to_camera(opencv_from_opengl(matrix))
+            return world_to_camera(opencv_from_opengl(without_scale(self._matrix(frame), self._scale)))
         except ValueError as error:
             raise ValueError(f"{self.path}: transform_matrix of {frame.get('file_path')!r:.60}: {error}") from error
+
+    def _matrix(self, frame: dict[str, Any]) -> Float[np.ndarray, "3 4"]:
+        given = frame.get("transform_matrix")
+        rows = len(given) if isinstance(given, list) else 4
+        matrix = read_numbers(self.path, frame, "transform_matrix", (3 if rows == 3 else 4, 4))
+        if not np.allclose(matrix[3:], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
+            raise ValueError(
+                f"{self.path}: transform_matrix of {self._name(frame)} must end with the row 0 0 0 1, got "
+                f"{matrix[3].tolist()}; positions belong into its last column"
+            )
+        return matrix[:3]
 
     def lens(self, frame: dict[str, Any], image: Path) -> Lens:
         """The lens of a frame's full-size image; its size is that of the image file if it is not given.
@@ -153,7 +171,8 @@ class Transforms:
         else:
             width, height = image_size(image)
         if (focal := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
-            raise ValueError(f"{self.path} has no fl_x or camera_angle_x")
+            found = ", ".join(sorted(map(visible, frame)))
+            raise ValueError(f"{self.path} has no fl_x or camera_angle_x, nor a matrix K; a frame has {found:.200}")
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
         k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -180,7 +199,8 @@ class Transforms:
 
     def _model(self, frame: dict[str, Any]) -> Any:
         given = self._given(frame)
-        return FISHEYE if given.get("is_fisheye") else given.get("camera_model", "OPENCV")  # the former: instant-ngp
+        flags = (model for flag, model in INSTANT_NGP.items() if given.get(flag))
+        return next(flags, given.get("camera_model", "OPENCV"))
 
     def _given(self, frame: dict[str, Any]) -> dict[str, Any]:
         return {**self.fields, **frame}

@@ -25,6 +25,7 @@ from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.video_frames import VideoFrames
 from warpgs.files import read_bounded
 
+from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
 from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
 
@@ -56,7 +57,7 @@ class VipeLoader:
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
         name = _video_name(root)
-        poses = _poses(root / f"pose/{name}.npz")
+        poses, scaled = _poses(root / f"pose/{name}.npz")
         video = VideoFrames(root / f"rgb/{name}.mp4")
         _check_cameras(root / f"intrinsics/{name}_camera.txt")
         lenses = _lenses(root / f"intrinsics/{name}.npz", video.size)
@@ -83,7 +84,7 @@ class VipeLoader:
         val = every_eighth([frame.name for frame in frames])
         text = f"times from the numbers of the frames in rgb/{name}.mp4"
         source = TimeSource(with_steps(text, [frame.time for frame in frames]))
-        notes = []
+        notes = [*scaled]
         if without := max(0, video.count - len(frames)):
             where = f"pose/{name}.npz has no pose for them"
             notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are left out: {where}")
@@ -109,12 +110,15 @@ def _indexed(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return indices, values
 
 
-def _poses(path: Path) -> dict[int, Float[np.ndarray, "3 4"]]:
+def _poses(path: Path) -> tuple[dict[int, Float[np.ndarray, "3 4"]], tuple[str, ...]]:
+    """World-to-camera poses by frame, and notes."""
     indices, matrices = _indexed(path)
     if matrices.shape[1:] != (4, 4):
         raise ValueError(f"{path}: data must have shape [N, 4, 4], got {list(matrices.shape)}")
     try:
-        return {int(k): world_to_camera(matrix[:3]) for k, matrix in zip(indices, matrices, strict=True)}
+        scale = scale_of_rotations(matrices[:, :3])
+        poses = (world_to_camera(without_scale(matrix[:3], scale)) for matrix in matrices)
+        return {int(k): pose for k, pose in zip(indices, poses, strict=True)}, scale_note(path.name, scale)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
