@@ -86,6 +86,21 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class Conventions:
+    """The meaning of a layout's files, for messages.
+
+    Attributes:
+        masks: How they mark what is dynamic.
+        depth: Whether files hold inverse depth, larger is closer, or depth, larger is farther.
+        depth_unit: What says the unit of depth that must be that of the cameras; None if any will do.
+    """
+
+    masks: str = "0 must mean dynamic and 255 static"
+    depth: Literal["inverse depth", "depth"] = "inverse depth"
+    depth_unit: str | None = None
+
+
+@dataclass(frozen=True)
 class TakenFrame:
     """A frame as it was taken, with the distortion of its lens.
 
@@ -119,6 +134,7 @@ class Capture:
         background: Colour behind everything; black is also that of captures whose images show no background.
         time_source: Where the times of the cameras come from.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
+        conventions: What its files mean.
         notes: What the loader says about the files, one sentence each: what it left out or had to interpret.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
@@ -144,6 +160,7 @@ class Capture:
     background: Background = "black"
     notes: Sequence[str] = ()
     time_source: TimeSource = AS_GIVEN
+    conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)
     extent: float = field(init=False)

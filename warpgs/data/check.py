@@ -1,54 +1,89 @@
-"""Checks whether a capture is fit to train on: reads it as training does and measures what makes training fail."""
+"""Checks whether a capture is fit to train on: reads it as training does and measures what makes training fail.
 
+Training runs the cheap part of the same checks before it begins, so that both say the same in the same words.
+"""
+
+import time
 from pathlib import Path
 
 from .builtin import is_builtin
-from .capture import Capture
+from .capture import Assumption, Capture
+from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
 from .findings import Finding, Report
 from .frames_check import check_counts, check_files
 from .loaders import describe_layout, load_capture, missing_capture
+from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
 from .motion_check import check_motion
 from .points_check import check_points
 from .turning_check import check_turning
 
-SAMPLES = 12
-"""Frames whose content is checked, evenly spread over the capture; all frames are read."""
-
-QUICK_SAMPLES = 3
-"""Frames that ``quick_findings`` checks."""
+READ_SECONDS = 15.0
+"""Time after which only frames that are compared are still read [s]: a check takes at most 30 s on two cores."""
 
 
-def check_capture(root: Path, dataset: str | None = None, factor: int | None = None) -> Report:
-    """Reads every frame of a capture and checks it; arguments as for ``load_capture``.
+def check_capture(
+    root: Path, dataset: str | None = None, factor: int | None = None, assume: Assumption = "masks"
+) -> Report:
+    """Checks a capture; reads every frame of it that it has time for.
+
+    Args:
+        root: As for ``load_capture``.
+        dataset: As for ``load_capture``.
+        factor: As for ``load_capture``.
+        assume: What training will take as dynamic, as ``--assume`` says.
 
     Raises:
         ValueError: If there is no such folder.
     """
+    deadline = time.monotonic() + READ_SECONDS
     if not is_builtin(root) and not root.exists():
         raise ValueError(missing_capture(root))
     try:
-        capture = load_capture(root, dataset, factor=factor, cache_frames=2 * SAMPLES)
+        capture = load_capture(root, dataset, factor=factor, cache_frames=1).assuming(assume)
     except ValueError as error:
         return Report(root, [Finding("error", "files", str(error))])
+    sample = Sample(capture)
+    contents = read_contents(capture, sample, deadline)
     findings = [
         Finding("note", "layout", f"read as {describe_layout(root, dataset)}"),
         *check_counts(capture),
-        *check_files(capture),
+        *check_files(capture, contents),
     ]
+    if masks := _masks(capture, contents):
+        findings += [*check_masks(masks, capture), *check_dynamic_depth(masks)]
     if not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings):
-        for check in (check_points, check_turning, check_depth, check_motion):
-            findings += check(capture, SAMPLES)
+        findings += [
+            *check_points(sample.capture, sample.names),
+            *check_turning(sample.capture, sample.names),
+            *check_depth(sample.capture, sample.names),
+            *check_motion(sample.capture, sample.pairs),
+        ]
     return Report(root, findings)
 
 
 def quick_findings(capture: Capture) -> list[Finding]:
-    """Notes of the loader, and errors and warnings from the cameras, the points and three frames of a capture.
+    """Notes of the loader, and the errors and warnings of the checks that are cheap, before training.
 
-    It takes less than a second. A capture that is assumed to be static (``Capture.assuming``) may have a single time.
+    They read a few frames, which training needs anyway. Motion is compared only if the masks give reason to.
+
+    Args:
+        capture: The capture; one that is assumed to be static (``Capture.assuming``) may have a single time.
 
     Raises:
-        ValueError: If one of the three frames cannot be read.
+        ValueError: If a frame cannot be read.
     """
-    findings = [*check_counts(capture), *check_points(capture.assuming("masks"), QUICK_SAMPLES)]
+    sample = Sample(capture)
+    contents = {name: sample.look(name) for name in sample.names}
+    findings = [*check_counts(capture)]
+    if (masks := _masks(capture, contents)) and are_suspect(masks):
+        masks = _masks(capture, {name: sample.look(name) for name in capture.train})
+        findings += [*check_masks(masks, capture), *check_motion(sample.capture, sample.pairs)]
+    findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]
     return [f for f in findings if f.level != "note" or f.topic == "files"]
+
+
+def _masks(capture: Capture, contents: dict[str, Content]) -> list[DynamicCounts]:
+    """What the masks of the training frames that were read mark as dynamic; nothing if they are not used."""
+    dynamic = [contents[name].dynamic for name in capture.train if name in contents]
+    return [counts for counts in dynamic if counts is not None] if capture.assumption == "masks" else []

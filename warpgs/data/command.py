@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -21,6 +21,8 @@ class Check:
     by default."""
     factor: int | None = None
     """Downscaling factor of the images; the dataset's usual one by default."""
+    assume: Literal["masks", "static", "dynamic"] = "masks"
+    """As in training: take what the masks say, or everything, as static or dynamic."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print JSON."""
 
@@ -32,7 +34,7 @@ class Check:
         """
         with ending_at_once():
             from .check import check_capture
-        report = check_capture(self.capture, self.dataset, self.factor)
+        report = check_capture(self.capture, self.dataset, self.factor, self.assume)
         print(json.dumps(report.plain(), indent=2) if self.as_json else report)
         if not report.is_fit:
             raise SystemExit(1)

@@ -1,7 +1,7 @@
 """Compares the depth of a capture with its sparse points."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -17,7 +17,6 @@ from .depth_alignment import (
     sample_points,
 )
 from .findings import Finding
-from .sampling import evenly_spaced
 
 DEPTH_PROBLEMS: dict[DepthProblem, str] = {
     "unknown": "is known nowhere: its files hold no finite positive numbers",
@@ -28,9 +27,9 @@ DEPTH_PROBLEMS: dict[DepthProblem, str] = {
 """What is wrong with depth that cannot be aligned."""
 
 
-def check_depth(capture: Capture, num_frames: int) -> Iterator[Finding]:
+def check_depth(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
     """Aligns the depth of the sampled frames to the points as training does, and measures its error."""
-    samples = list(_depth_at_points(capture, num_frames))
+    samples = list(_depth_at_points(capture, names))
     count = len(samples)
     if count == 0:
         return
@@ -50,9 +49,9 @@ def check_depth(capture: Capture, num_frames: int) -> Iterator[Finding]:
         yield Finding("warning", "depth", f"{which}: presets other than paper do not use it")
 
 
-def _depth_at_points(capture: Capture, num_frames: int) -> Iterator[PointSamples]:
+def _depth_at_points(capture: Capture, names: Sequence[str]) -> Iterator[PointSamples]:
     """The depth of the sampled frames that have any, at the points."""
-    for name in evenly_spaced(capture.train, num_frames):
+    for name in names:
         frame = capture.frame(name)
         if frame.inverse_depth is not None:
             everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool)

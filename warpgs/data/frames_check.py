@@ -1,10 +1,13 @@
 """Checks the numbers, times and files of the frames of a capture."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from .capture import MASKS_REMEDY, Capture
+from .check_sample import Content
 from .findings import Finding
-from .masks_check import check_masks, dynamic_counts
+
+MAX_ERRORS = 20
+"""Maximum number of unreadable frames that are named."""
 
 
 def check_counts(capture: Capture) -> Iterator[Finding]:
@@ -31,33 +34,35 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
         yield Finding("warning", "counts", f"{len(capture.train)} training frames are very few")
 
 
-def check_files(capture: Capture) -> Iterator[Finding]:
-    """Reads every frame; counts masks and depth, and checks the masks of the training frames."""
-    trained, unmasked, num_read, num_masks, num_depths = [], [], 0, 0, 0
-    for name in (*capture.train, *capture.val):
-        is_trained = name in capture.train
-        try:
-            frame = capture.frame(name)
-        except ValueError as error:
-            # The other checks read training frames only.
-            yield Finding("error", "files" if is_trained else "evaluation", str(error))
-            continue
-        num_read += 1
-        num_depths += frame.inverse_depth is not None
-        has_mask = frame.static_mask is not None and capture.assumption == "masks"
-        num_masks += has_mask
-        if is_trained and has_mask:
-            trained.append(dynamic_counts(frame))
-        elif is_trained:
-            unmasked.append(name)
-    frames = "frames" if num_read == len(capture.train) + len(capture.val) else "readable frames"
-    yield Finding("note", "files", f"{num_masks} of {num_read} {frames} have masks, {num_depths} have depth")
-    if capture.assumption == "dynamic":
-        yield Finding("note", "masks", "there are no masks, as this layout has none: everything is taken as dynamic")
+def check_files(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:
+    """What the files of the frames that were read hold, and whether those to train on have the masks they need."""
+    total, num_read = len(capture.train) + len(capture.val), len(contents)
+    if num_read < total:
+        text = f"{num_read} of {total} frames were read, evenly spread: the check has no time for all"
+        yield Finding("note", "files", f"{text}, training reads them all")
+    damaged = {name: content.error for name, content in contents.items() if content.error is not None}
+    for name, error in list(damaged.items())[:MAX_ERRORS]:
+        # The other checks read training frames only.
+        yield Finding("error", "files" if name in capture.train else "evaluation", error)
+    if len(damaged) > MAX_ERRORS:
+        text = f"{len(damaged) - MAX_ERRORS} more frames cannot be read"
+        yield Finding("error", "files" if any(name in capture.train for name in damaged) else "evaluation", text)
+    readable = [content for content in contents.values() if content.error is None]
+    num_masks, num_depths = sum(c.dynamic is not None for c in readable), sum(c.has_depth for c in readable)
+    frames = "frames" if len(readable) == total else "readable frames" if num_read == total else "frames read"
+    yield Finding("note", "files", f"{num_masks} of {len(readable)} {frames} have masks, {num_depths} have depth")
+    yield from _missing_masks(capture, contents)
+
+
+def _missing_masks(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:
+    """Says what is taken as dynamic without masks, or which training frames need one."""
+    if capture.assumption != "masks":
+        lack = ": there are no masks, as this layout has none" if capture.unmasked == "dynamic" else ""
+        yield Finding("note", "masks", f"everything is taken as {capture.assumption}{lack}")
         return
+    trained = [name for name in capture.train if name in contents and contents[name].error is None]
+    unmasked = [name for name in trained if contents[name].dynamic is None]
     if unmasked:
-        some = f"{len(unmasked)} of {len(unmasked) + len(trained)} training frames, such as {unmasked[0]},"
-        which = some if trained else "the training frames"
+        some = f"{len(unmasked)} of {len(trained)} training frames, such as {unmasked[0]},"
+        which = "the training frames" if len(unmasked) == len(trained) else some
         yield Finding("error", "masks", f"{which} have no masks: make them {MASKS_REMEDY}")
-    if trained:
-        yield from check_masks(trained)

@@ -1,16 +1,19 @@
 """Checks the masks of a capture by themselves."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from .capture import Frame
+from .capture import Capture, Frame
 from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
 from .findings import Finding
 
 MAX_DYNAMIC_FRACTION = 0.4
 """Mean fraction of dynamic pixels; masks with more are rarely correct."""
+
+MAX_USABLE_FRACTION = 0.9
+"""The same of masks that are inverted or hold something else: too little is left that is static."""
 
 
 class DynamicCounts(NamedTuple):
@@ -36,21 +39,36 @@ def dynamic_counts(frame: Frame) -> DynamicCounts:
     return DynamicCounts(len(regions), sum(map(is_cut, regions)), pixels, pixels / is_dynamic.numel(), with_depth)
 
 
-def check_masks(frames: list[DynamicCounts]) -> Iterator[Finding]:
-    """Checks the masks of training frames."""
-    dynamic = [frame.fraction for frame in frames]
-    if max(dynamic) == 0.0:
-        yield Finding("warning", "masks", "the masks mark nothing as dynamic")
-    elif min(dynamic) == 1.0:
-        yield Finding("error", "masks", "the masks mark everything as dynamic: 0 must mean dynamic, 255 static")
+def are_suspect(masks: Sequence[DynamicCounts]) -> bool:
+    """Whether masks mark nothing as dynamic, or more than masks that are correct usually do."""
+    fractions = [mask.fraction for mask in masks]
+    return max(fractions) == 0.0 or float(np.mean(fractions)) > MAX_DYNAMIC_FRACTION
+
+
+def check_masks(masks: Sequence[DynamicCounts], capture: Capture) -> Iterator[Finding]:
+    """How much the masks of training frames mark as dynamic.
+
+    Args:
+        masks: Those of at least one frame.
+        capture: Their capture.
+    """
+    meaning, mean = capture.conventions.masks, float(np.mean([mask.fraction for mask in masks]))
+    largest = max(mask.fraction for mask in masks)
+    if largest == 0.0:
+        text = f"the masks mark nothing as dynamic: {meaning}; train a scene without motion with --assume static"
+        yield Finding("warning", "masks", text)
+        return
+    whole = min(mask.fraction for mask in masks) == 1.0
+    marked = "everything" if whole else f"{mean:.1%} of the pixels"
+    text = f"the masks mark {marked} as dynamic" + ("" if whole else f" on average, {largest:.1%} at most")
+    if whole or (mean > MAX_USABLE_FRACTION and not capture.estimated_masks):
+        text += f": {meaning}, and instance ids are not understood; if nearly everything moves, use --assume dynamic"
+        yield Finding("error", "masks", text)
     else:
-        mean = float(np.mean(dynamic))
-        text = f"the masks mark {mean:.1%} of the pixels as dynamic on average, {max(dynamic):.1%} at most"
         yield Finding("warning" if mean > MAX_DYNAMIC_FRACTION else "note", "masks", text)
-        yield from _dynamic_depth(frames)
 
 
-def _dynamic_depth(frames: list[DynamicCounts]) -> Iterator[Finding]:
+def check_dynamic_depth(frames: Sequence[DynamicCounts]) -> Iterator[Finding]:
     """Whether something tells the depth of what moves in the training frames."""
     is_known = sum(f.with_depth for f in frames) >= MIN_KNOWN_FRACTION * sum(f.pixels for f in frames)
     num_whole = sum(f.cut < f.regions for f in frames)

@@ -2,11 +2,12 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
@@ -24,6 +25,9 @@ COMPARED_SIDE = 512
 MIN_PIXELS = 200
 """Minimum number of pixels of a median."""
 
+MIN_PAIRS = 3
+"""Minimum number of pairs of frames that tell whether masked regions move more."""
+
 MIN_AGREEING = 0.4
 """Minimum fraction of the textured pixels whose flow leads back: 0.05 to 0.25 between unrelated images, 0.9 between
 frames of a slow video."""
@@ -37,43 +41,39 @@ MAX_EPIPOLAR_DISTANCE = 3.0
 match."""
 
 
-def check_motion(capture: Capture, num_frames: int) -> Iterator[Finding]:
-    """Compares masks and cameras with the motion in the images."""
-    inside, outside = [], []
-    for first, second in _pairs(capture, num_frames):
-        found = motion_between(capture.frame(first), capture.frame(second))
-        if found is None:
-            continue
-        outside.append(found.static)
-        if found.dynamic is not None:
-            inside.append(found.dynamic - found.static)
-    if not outside:
-        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
-        yield Finding("note", "cameras", f"{text}, to compare their motion")
-        return
-    static = float(np.median(outside))
-    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
-    hint = ": the cameras may not match the images" if level == "warning" else ""
-    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
-    if len(inside) < 3:
-        return
-    more = float(np.mean(np.array(inside) > 0))
-    if more < 0.25 and float(np.median(inside)) < -0.2:
-        text = (
-            "static regions of the masks move more than dynamic ones: the masks may be inverted (0 must mean dynamic)"
-        )
-        yield Finding("error", "masks", text)
-    else:
-        text = f"dynamic pixels are farther off their epipolar lines than static ones in {more:.0%} of the frames"
-        yield Finding("note", "masks", text)
-
-
-def _pairs(capture: Capture, num_frames: int) -> list[tuple[str, str]]:
-    """Frames that follow each other in time, of cameras that are not far apart, evenly spread over the capture."""
+def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
+    """Training frames that follow each other in time and look in similar directions, evenly spread over the capture."""
     cameras = capture.cameras
     names = sorted(capture.train, key=lambda name: cameras[name].time)
     pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
-    return evenly_spaced(pairs, num_frames)
+    return evenly_spaced(pairs, max_count)
+
+
+def check_motion(capture: Capture, pairs: Sequence[tuple[str, str]]) -> Iterator[Finding]:
+    """Compares masks and cameras with the motion in the images of pairs of frames."""
+    motions = [motion_between(capture.frame(first), capture.frame(second)) for first, second in pairs]
+    found = [motion for motion in motions if motion is not None]
+    if not found:
+        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
+        yield Finding("note", "cameras", f"{text}, to compare their motion")
+        return
+    static = float(np.median([motion.static for motion in found]))
+    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
+    hint = ": the cameras may not match the images" if level == "warning" else ""
+    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
+    both = np.array([(motion.static, motion.dynamic) for motion in found if motion.dynamic is not None])
+    if len(both) >= MIN_PAIRS:
+        yield _compare_regions(both[:, 0], both[:, 1], capture.conventions.masks)
+
+
+def _compare_regions(static: Float[np.ndarray, " P"], dynamic: Float[np.ndarray, " P"], meaning: str) -> Finding:
+    """Whether masked regions move more than the others; if cameras fit them better, masks are inverted."""
+    more, difference = float((dynamic > static).mean()), float(np.median(dynamic - static))
+    if more < 0.25 and difference < -0.2 and float(np.median(dynamic)) < MAX_EPIPOLAR_DISTANCE:
+        text = f"static regions of the masks move more than dynamic ones: the masks may be inverted ({meaning})"
+        return Finding("error", "masks", text)
+    text = f"dynamic pixels are farther off their epipolar lines than static ones in {more:.0%} of the frames"
+    return Finding("note", "masks", text)
 
 
 @dataclass(frozen=True)
@@ -92,22 +92,21 @@ class Motion:
 def motion_between(first: Frame, second: Frame) -> Motion | None:
     """Compares the optical flow (DIS) from the first frame to the second with the epipolar lines of their cameras.
 
-    Only pixels count whose flow back leads to where they came from.
+    The second image is first brought to the orientation, focal length and shape of the first, so that frames of any
+    shapes can be compared. Only pixels count whose flow back leads to where they came from.
 
     Returns:
         The motion; None if too few pixels have texture and flow, the cameras are too far apart (``are_comparable``), or
         the images are too small for optical flow.
     """
-    height, width = first.image.shape[:2]
-    factor = min(1.0, COMPARED_SIDE / max(height, width))
-    size = round(width * factor), round(height * factor)
-    if min(size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
+    size = _reduced_size(first.camera)
+    if min(*size, *second.camera.size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
-    a, b = (grey_at(frame, size) for frame in (first, second))
+    a, (b, is_seen) = grey_at(first, size), _seen_from(first.camera, second, size)
     flow, agrees = flow_between(a, b)
-    distance = _epipolar_distance(first, second, flow)
+    distance = _epipolar_distance(first.camera, second.camera, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
-    textured = gradient > max(np.quantile(gradient, 0.6), 8.0)
+    textured = (gradient > max(np.quantile(gradient, 0.6), 8.0)) & is_seen
     if agrees[textured].sum() < MIN_AGREEING * textured.sum():
         return None
     textured &= agrees
@@ -123,9 +122,34 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
 
 
 def are_comparable(first: Camera, second: Camera) -> bool:
-    """Whether the orientations of two cameras are at most ``MAX_ANGLE`` apart."""
-    relative = second.viewmat[:3, :3].double() @ first.viewmat[:3, :3].double().T
-    return float(relative.trace()) >= 1.0 + 2.0 * math.cos(math.radians(MAX_ANGLE))
+    """Whether two cameras look in directions that are at most ``MAX_ANGLE`` apart."""
+    axes = (camera.viewmat[2, :3].double() for camera in (first, second))
+    return float(torch.dot(*axes)) >= math.cos(math.radians(MAX_ANGLE))
+
+
+def _seen_from(
+    camera: Camera, frame: Frame, size: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """A frame in grey as if its camera were turned like another one and had its lens; and where it shows anything."""
+    own, other = (c.viewmat[:3, :3].double().numpy() for c in (frame.camera, camera))
+    reduced = _reduced_size(frame.camera)
+    centers = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV has pixel centres at whole numbers
+    homography = _intrinsics(camera, size) @ other @ own.T @ np.linalg.inv(_intrinsics(frame.camera, reduced))
+    homography = np.linalg.inv(centers) @ homography @ centers
+    plane = _grey(frame, reduced)
+    turned = cv2.warpPerspective(plane, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.warpPerspective(np.full_like(plane, 255), homography, size, flags=cv2.INTER_NEAREST)
+    return _even_contrast(turned), seen > 0
+
+
+def _reduced_size(camera: Camera) -> tuple[int, int]:
+    factor = min(1.0, COMPARED_SIDE / max(camera.size))
+    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+
+
+def _intrinsics(camera: Camera, size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    """K of the camera's image in another size."""
+    return np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K.double().numpy()
 
 
 def flow_between(
@@ -145,29 +169,30 @@ def flow_between(
     return forward, np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
 
 
-def grey_at(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+def grey_at(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
     """A frame in grey levels with even contrast, as optical flow wants it, resized to (width, height)."""
-    plane = cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY)
-    return cv2.createCLAHE(2.0, (8, 8)).apply(cv2.resize(plane, size, interpolation=cv2.INTER_AREA))
+    return _even_contrast(_grey(frame, size))
 
 
-def _epipolar_distance(first: Frame, second: Frame, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:
-    """Distance from x' to the line F x, with F = K'⁻ᵀ [t]× R K⁻¹ (Hartley and Zisserman, 9.2.2)."""
+def _grey(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
+    return cv2.resize(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+
+
+def _even_contrast(plane: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    return cv2.createCLAHE(2.0, (8, 8)).apply(plane)
+
+
+def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:
+    """Distance from x + flow to the epipolar line of x, for a second camera that is turned like the first.
+
+    The line goes through x and the epipole K t, so it is F x with F = [K t]× (Hartley and Zisserman, 9.2.2).
+    """
     height, width = flow.shape[:2]
-    matrices = []
-    for frame in (first, second):
-        scale = np.diag([width / frame.camera.width, height / frame.camera.height, 1.0])
-        matrices.append(scale @ frame.camera.K.double().numpy())
-    relative = second.camera.viewmat.double().numpy() @ np.linalg.inv(first.camera.viewmat.double().numpy())
-    t = relative[:3, 3]
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    pixels = np.stack([x, y, np.ones_like(x)], -1)
-    target = pixels[..., :2] + flow
-    rotated = pixels @ (matrices[1] @ relative[:3, :3] @ np.linalg.inv(matrices[0])).T
-    if np.linalg.norm(t) < 1e-6:  # pure rotation: the position of every pixel is known
-        return np.linalg.norm(target - rotated[..., :2] / rotated[..., 2:], axis=-1)
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    essential = cross @ relative[:3, :3]
-    lines = pixels @ (np.linalg.inv(matrices[1]).T @ essential @ np.linalg.inv(matrices[0])).T
-    norm = np.maximum(np.hypot(lines[..., 0], lines[..., 1]), 1e-12)
-    return np.abs(lines[..., 0] * target[..., 0] + lines[..., 1] * target[..., 1] + lines[..., 2]) / norm
+    shift = first.viewmat[:3, :3].double() @ (first.position - second.position).double()
+    if float(shift.norm()) < 1e-6:  # pure rotation: every pixel stays where it is
+        return np.linalg.norm(flow, axis=-1)
+    e = _intrinsics(first, (width, height)) @ shift.numpy()
+    along = np.stack([e[0] - e[2] * x, e[1] - e[2] * y])
+    along /= np.maximum(np.hypot(*along), 1e-12)
+    return np.abs(along[0] * flow[..., 1] - along[1] * flow[..., 0])

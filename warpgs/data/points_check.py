@@ -1,6 +1,6 @@
 """Compares the cameras, the sparse points and the images of a capture with each other."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from warpgs.cameras import Camera
 
 from .capture import MIN_EXTENT, Capture, Frame
 from .findings import Finding
-from .sampling import evenly_spaced
 
 MIN_VISIBLE_FRACTION = 0.2
 """Median fraction of the points that a training camera should see."""
@@ -24,7 +23,7 @@ MAX_FRACTION_AT_CAMERAS = 0.01
 """Maximum fraction of such points."""
 
 
-def check_points(capture: Capture, num_frames: int) -> Iterator[Finding]:
+def check_points(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
     """Compares cameras, points and images with each other."""
     cameras = [capture.cameras[name] for name in capture.train]
     if capture.extent <= MIN_EXTENT:
@@ -34,7 +33,6 @@ def check_points(capture: Capture, num_frames: int) -> Iterator[Finding]:
         text = f"there are no sparse points: Gaussians are randomly initialized; {remedy}"
         yield Finding("warning", "points", text)
         return
-    names = evenly_spaced(capture.train, num_frames)
     visible = [float(capture.cameras[n].project(capture.points)[3].float().mean()) for n in names]
     median = float(np.median(visible))
     yield Finding("note", "points", f"{len(capture.points)} points, a camera sees {median:.0%} of them (median)")

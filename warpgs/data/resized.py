@@ -117,7 +117,7 @@ def resize_mask(static: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[
 def reduced_capture(capture: Capture, max_side: int) -> Capture:
     """The capture with frames of at most ``max_side`` pixels along the larger side; larger frames are averaged."""
     cameras = {name: _reduced_camera(camera, max_side) for name, camera in capture.cameras.items()}
-    return replace(capture, cameras=cameras, read=lambda name: _reduced_frame(capture.frame(name), cameras[name]))
+    return replace(capture, cameras=cameras, read=lambda name: reduced_frame(capture.frame(name), cameras[name]))
 
 
 def _reduced_camera(camera: Camera, max_side: int) -> Camera:
@@ -125,7 +125,7 @@ def _reduced_camera(camera: Camera, max_side: int) -> Camera:
     return camera.resized(*(max(1, round(side * factor)) for side in camera.size))
 
 
-def _reduced_frame(frame: Frame, camera: Camera) -> Frame:
+def reduced_frame(frame: Frame, camera: Camera) -> Frame:
     """A frame in the size of a camera; pixels are dynamic where any part of them is, and empty where all of it is."""
 
     def whole(mask: Tensor | None) -> Tensor | None:

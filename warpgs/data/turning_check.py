@@ -8,7 +8,6 @@ import numpy as np
 
 from .capture import MIN_EXTENT, Capture, Frame
 from .findings import Finding
-from .sampling import evenly_spaced
 from .turning import MIN_MATCHES, Matches, Turning, find_turning
 
 COMPARED_SIDE = 512
@@ -26,10 +25,9 @@ MAX_EPIPOLAR_ERROR = 2.0
 """Maximum distance of a match from its epipolar line, above which it does not count [px]."""
 
 
-def check_turning(capture: Capture, num_frames: int) -> Iterator[Finding]:
+def check_turning(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
     """Whether the images show parallax at all."""
-    names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
-    found = turning_of([capture.frame(name) for name in evenly_spaced(names, num_frames)])
+    found = turning_of([capture.frame(name) for name in names])
     if found is None or not any(turning.only_turns for turning in found):
         return
     searched, known = (f"{turning.explained:.0%}" for turning in found)

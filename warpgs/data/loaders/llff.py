@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Conventions
 from warpgs.data.colmap import load_model
 from warpgs.data.colmap_folders import ModelFolder, find_models
 from warpgs.data.images import image_size, read_depth
@@ -39,6 +39,9 @@ NUM_CAMERAS = 12
 MASKS, EVALUATION, EVALUATION_MASKS, DEPTHS = "motion_masks", "mv_images", "mv_masks", "disp"
 """Folders of NSFF: dynamic masks (white = dynamic), images of all cameras at each time with their masks, and inverse
 depth up to scale and offset."""
+
+
+WHITE_IS_DYNAMIC = Conventions(masks="white must mean dynamic and black static")
 
 
 class LlffLoader:
@@ -175,10 +178,10 @@ def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarr
         folder = next((model.folder for model in models if model.num_images() == len(poses)), models[0].folder)
         _, points, colors, notes = load_model(folder, undistort=False)
         if len(points):
-            return World(points, colors, notes=notes)
+            return World(points, colors, notes=notes, conventions=WHITE_IS_DYNAMIC)
     centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])
     along = centers[:, None] + bounds[:, :, None] * poses[:, None, 2, :3]
-    return World(np.zeros((0, 3)), units=scene_units(along.reshape(-1, 3), centers))
+    return World(np.zeros((0, 3)), units=scene_units(along.reshape(-1, 3), centers), conventions=WHITE_IS_DYNAMIC)
 
 
 def _models(root: Path) -> list[ModelFolder]:

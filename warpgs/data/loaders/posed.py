@@ -5,7 +5,7 @@ A loader makes a ``PosedFrame`` of every image, with functions that read its par
 """
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data.camera_files import MAX_ROTATION_ERROR, is_rotation
-from warpgs.data.capture import Assumption, Background, Capture, Frame
+from warpgs.data.capture import Assumption, Background, Capture, Conventions, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb
@@ -80,7 +80,7 @@ class World:
         assumption: What is dynamic where the frames have no masks.
         time_source: Where the times come from.
         own_times: Whether times are in [0, 1] already.
-        background, notes: See ``Capture``.
+        background, notes, conventions: See ``Capture``.
     """
 
     points: Float[np.ndarray, "P 3"] | None
@@ -91,6 +91,7 @@ class World:
     own_times: bool = False
     background: Background = "black"
     notes: Sequence[str] = ()
+    conventions: Conventions = field(default_factory=Conventions)
 
 
 def posed_capture(
@@ -111,18 +112,16 @@ def posed_capture(
     _check_names(root, [frame.name for frame in frames])
     frames = frames if options.depth else [replace(frame, inverse_depth=None) for frame in frames]
     by_name = {frame.name: frame for frame in frames}
-    given = None if world.points is None else (world.points, world.colors)
-    points, colors = given or points_of_depth(frames, options.undistort)
-    centers = np.array([frame.center for frame in frames])
-    units = world.units or (scene_units(points, centers) if len(points) else units_around(centers))
+    points, colors = _points(world, frames, options.undistort)
+    units = world.units or _units(frames, points)
     cameras, lenses = _cameras(root, frames, units, world.own_times, options)
-    train = [name for name in by_name if name not in val]
+    train, evaluated = ([name for name in by_name if (name in val) == is_val] for is_val in (False, True))
     reader = _FrameReader(by_name, cameras, lenses, units.scale, frozenset(train), options.perturbation)
     return Capture(
         root.resolve().name,
         cameras,
         train,
-        [name for name in by_name if name in val],
+        evaluated,
         torch.tensor(units.from_world(points), dtype=torch.float32),
         None if colors is None else torch.tensor(colors),
         reader.read,
@@ -132,7 +131,19 @@ def posed_capture(
         background=world.background,
         notes=world.notes,
         time_source=world.time_source,
+        conventions=world.conventions,
     )
+
+
+def _points(
+    world: World, frames: Sequence[PosedFrame], undistorted: bool
+) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+    return points_of_depth(frames, undistorted) if world.points is None else (world.points, world.colors)
+
+
+def _units(frames: Sequence[PosedFrame], points: Float[np.ndarray, "P 3"]) -> SceneUnits:
+    centers = np.array([frame.center for frame in frames])
+    return scene_units(points, centers) if len(points) else units_around(centers)
 
 
 def _check_names(root: Path, names: Sequence[str]) -> None:

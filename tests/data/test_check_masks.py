@@ -1,0 +1,150 @@
+"""What the check and the start of training say of masks, and of captures that are assumed to have none."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.data import layouts
+from tests.data.captures import edit_json, stop_time
+from tests.prepare import boards
+from warpgs.data import check
+from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.loaders import load_capture
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    root = boards.write_capture(tmp_path_factory.mktemp("check") / "capture")
+    shutil.rmtree(root / "frames")
+    return root
+
+
+@pytest.fixture
+def root(original, tmp_path):
+    return shutil.copytree(original, tmp_path / "capture")
+
+
+def convert_masks(root, convert):
+    for k, path in enumerate(sorted((root / "resized_mask/1x").iterdir())):
+        cv2.imwrite(str(path), convert(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), k))
+
+
+def of_masks(findings, level):
+    return [finding.text for finding in findings if (finding.topic, finding.level) == ("masks", level)]
+
+
+def instance_ids(mask, k):
+    return np.where(mask == 0, 1 + k % 3, 0).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("convert", "text"),
+    [
+        (lambda mask, k: np.where(mask == 0, 3, 0).astype(np.uint8), "everything as dynamic: 0 must mean dynamic"),
+        (instance_ids, "% at most: 0 must mean dynamic and 255 static, and instance ids are not understood"),
+        (lambda mask, k: np.invert(mask), "static regions of the masks move more than dynamic ones"),
+    ],
+    ids=["one instance", "instance ids", "inverted"],
+)
+def test_unusable_masks_are_an_error_in_the_same_words_before_training(root, convert, text):
+    convert_masks(root, convert)
+    errors = of_masks(check_capture(root).findings, "error")
+    assert any(text in error for error in errors)
+    assert of_masks(quick_findings(load_capture(root)), "error") == errors
+    assert not of_masks(quick_findings(load_capture(root).assuming("dynamic")), "error")
+
+
+def test_masks_that_mark_nothing_are_a_warning_in_the_same_words_before_training(root):
+    convert_masks(root, lambda mask, k: np.full_like(mask, 255))
+    warnings = of_masks(check_capture(root).findings, "warning")
+    assert [text.split(":")[0] for text in warnings] == ["the masks mark nothing as dynamic"]
+    assert of_masks(quick_findings(load_capture(root)), "warning") == warnings
+
+
+def test_masks_are_judged_by_all_frames_if_those_that_are_compared_are_suspect(root, monkeypatch):
+    """In every frame that training looks at first, everything moves; in the others, masks are right."""
+    monkeypatch.setattr("warpgs.data.check_sample.MAX_SAMPLES", 4)
+    monkeypatch.setattr("warpgs.data.check_sample.MIN_SAMPLES", 4)
+    convert_masks(root, lambda mask, k: np.zeros_like(mask) if k in (0, 5, 10, 15) else mask)
+    assert not of_masks(quick_findings(load_capture(root)), "error")
+
+
+def test_estimated_masks_of_nearly_everything_are_a_warning_only(root):
+    """Training tries them out."""
+    convert_masks(root, lambda mask, k: np.where(np.arange(256) < 10, 255, 0).astype(np.uint8) + 0 * mask)
+    assert any("on average" in text for text in of_masks(check_capture(root).findings, "error"))
+    edit_json(root / "dataset.json", masks="estimated")
+    findings = check_capture(root).findings
+    assert not any("on average" in text for text in of_masks(findings, "error"))
+    assert any("on average" in text for text in of_masks(findings, "warning"))
+
+
+def test_wrong_cameras_do_not_make_masks_inverted(root):
+    """Far from their epipolar lines are all pixels then, and which ones more so is chance."""
+    convert_masks(root, lambda mask, k: np.where(np.arange(256) < 100, 0, 255).astype(np.uint8) + 0 * mask)
+    paths = sorted((root / "camera").iterdir())
+    cameras = np.random.default_rng(0).permutation([path.read_text() for path in paths])
+    for path, text in zip(paths, cameras, strict=True):
+        path.write_text(text)
+    report = check_capture(root)
+    assert "cameras may not match" in str(report)
+    assert "inverted" not in str(report)
+
+
+def test_masks_of_a_layout_in_which_white_is_dynamic_are_told_so(tmp_path):
+    root = layouts.write_llff(tmp_path / "scene")
+    for path in (root / "motion_masks").iterdir():
+        cv2.imwrite(str(path), np.full((24, 40), 255, np.uint8))
+    (error,) = of_masks(check_capture(root).findings, "error")
+    assert "white must mean dynamic and black static" in error
+
+
+def test_a_capture_without_masks_is_fit_under_the_assumption_that_training_is_given(root):
+    shutil.rmtree(root / "resized_mask")
+    assert not check_capture(root).is_fit
+    report = check_capture(root, assume="static")
+    assert report.is_fit
+    assert "note: everything is taken as static" in str(report)
+
+
+def test_a_capture_of_one_time_is_fit_if_everything_is_assumed_to_be_static(root):
+    stop_time(root)
+    assert not check_capture(root).is_fit
+    assert check_capture(root, assume="static").is_fit
+
+
+def test_as_many_frames_are_read_as_there_is_time_for(root, monkeypatch):
+    ids = json.loads((root / "dataset.json").read_text())["train_ids"]
+    edit_json(root / "dataset.json", train_ids=ids[:8], val_ids=ids[8:])
+    monkeypatch.setattr(check, "READ_SECONDS", 0.0)
+    report = check_capture(root)
+    assert report.is_fit
+    assert "8 of 16 frames were read" in str(report)
+    assert "8 of 8 frames read have masks" in str(report)
+
+
+def test_portrait_and_landscape_frames_that_alternate_fit_their_cameras(root):
+    for k, path in enumerate(sorted((root / "camera").iterdir())):
+        fields = json.loads(path.read_text())
+        (x, y), (left, top) = fields["principal_point"], ((56, 0), (0, 24))[k % 2]
+        size = [256 - 2 * left, 192 - 2 * top]
+        edit_json(path, principal_point=[x - left, y - top], image_size=size)
+        for part in (f"rgb/1x/{path.stem}.png", f"resized_mask/1x/{path.stem}.png.png"):
+            pixels = cv2.imread(str(root / part), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(root / part), pixels[top : top + size[1], left : left + size[0]])
+    report = check_capture(root)
+    (text,) = (f.text for f in report.findings if "epipolar lines (median)" in f.text)
+    assert float(text.split()[3]) < 0.5
+    assert "may not match" not in str(report)
+
+
+def test_the_first_unreadable_files_are_named_and_the_others_counted(root, monkeypatch):
+    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 5)
+    for path in (root / "rgb/1x").iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    text = str(check_capture(root))
+    assert text.count("is truncated") == 5
+    assert "error: 11 more frames cannot be read" in text
