@@ -10,10 +10,15 @@ With the camera's rotation W and translation, t = W mean + translation, depth z 
 
 Σ itself is never formed: cov2d = B Bᵀ is positive semidefinite by construction.
 
-Gradient: with the symmetric V of (v_a, v_b / 2, v_c): v_B = 2 V B, v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ, and the conic's
-    v_a = -(A² v_A + A B v_B + B² v_C),  v_c = -(B² v_A + B C v_B + C² v_C),
-    v_b = -(2 A B v_A + (A C + B²) v_B + 2 B C v_C)
-for the conic (A, B, C). Through t, with v_t: v_mean = Wᵀ v_t, and for the camera the sums over all Gaussians of
+Gradient: with the rows B_0, B_1 of B and n = B_0 × B_1, det' = n² and det = det' + LOW_PASS (a' + c' + LOW_PASS). So,
+for gradients v_A, v_B, v_C of the conic's entries
+    v_det = -(v_A c - v_B b + v_C a) / det²,  v_a = v_C / det + LOW_PASS v_det,  v_c = v_A / det + LOW_PASS v_det,
+    v_b = -v_B / det,  v_n = 2 v_det n,
+    v_B0 = 2 v_a B_0 + v_b B_1 + B_1 × v_n,  v_B1 = v_b B_0 + 2 v_c B_1 + v_n × B_0
+and v_M = (J W)ᵀ v_B, v_(JW) = v_B Mᵀ. The usual form, v_cov2d = -conic v_conic conic, cancels with the fourth power of
+a splat's elongation: at 200:1 it leaves nothing of the gradient of the length in single precision. Here n, the cross
+product of scaled axes, cancels little.
+Through t, with v_t: v_mean = Wᵀ v_t, and for the camera the sums over all Gaussians of
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
 and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
 
@@ -255,37 +260,28 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         a_sharp = wp.dot(spread[0], spread[0])
         b = wp.dot(spread[0], spread[1])
         c_sharp = wp.dot(spread[1], spread[1])
-        det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+        normal = wp.cross(spread[0], spread[1])
+        det_sharp = wp.length_sq(normal)
         det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
-        A = (c_sharp + LOW_PASS) / det
-        B = -b / det
-        C = (a_sharp + LOW_PASS) / det
-        v_conic = v_splat.conic
-        v_a = -(A * A * v_conic[0] + A * B * v_conic[1] + B * B * v_conic[2])
-        v_b = -(2.0 * A * B * v_conic[0] + (A * C + B * B) * v_conic[1] + 2.0 * B * C * v_conic[2])
-        v_c = -(B * B * v_conic[0] + B * C * v_conic[1] + C * C * v_conic[2])
-
+        v_conic = v_splat.conic / det
+        v_det = -(v_conic[0] * (c_sharp + LOW_PASS) - v_conic[1] * b + v_conic[2] * (a_sharp + LOW_PASS)) / det
+        v_det_sharp = float(0.0)  # in addition to v_det
         v_opacity = float(v_splat.opacity)
         if compensate != 0:
             compensation = wp.sqrt(det_sharp / det)
             # d compensation = (d det' - compensation² d det) / (2 compensation det); visible splats have at least
             # ALPHA_MIN of it.
-            factor = v_opacity * opacities[i] * 0.5 / (compensation * det)
-            remainder = 1.0 - compensation * compensation
-            v_a += factor * (c_sharp * remainder - LOW_PASS * compensation * compensation)
-            v_c += factor * (a_sharp * remainder - LOW_PASS * compensation * compensation)
-            v_b -= factor * 2.0 * b * remainder
+            v_det_sharp = v_opacity * opacities[i] * 0.5 / (compensation * det)
+            v_det -= v_det_sharp * compensation * compensation
             v_opacity = v_opacity * compensation
         v_opacities[i] = v_opacity
-
-        v_spread = mat23(
-            2.0 * v_a * spread[0, 0] + v_b * spread[1, 0],
-            2.0 * v_a * spread[0, 1] + v_b * spread[1, 1],
-            2.0 * v_a * spread[0, 2] + v_b * spread[1, 2],
-            v_b * spread[0, 0] + 2.0 * v_c * spread[1, 0],
-            v_b * spread[0, 1] + 2.0 * v_c * spread[1, 1],
-            v_b * spread[0, 2] + 2.0 * v_c * spread[1, 2],
-        )
+        v_a = v_conic[2] + LOW_PASS * v_det
+        v_b = -v_conic[1]
+        v_c = v_conic[0] + LOW_PASS * v_det
+        v_normal = 2.0 * (v_det + v_det_sharp) * normal
+        v_row0 = 2.0 * v_a * spread[0] + v_b * spread[1] + wp.cross(spread[1], v_normal)
+        v_row1 = v_b * spread[0] + 2.0 * v_c * spread[1] + wp.cross(v_normal, spread[0])
+        v_spread = mat23(v_row0[0], v_row0[1], v_row0[2], v_row1[0], v_row1[1], v_row1[2])
         v_shape = wp.transpose(to_image) * v_spread
         v_scales[i] = wp.vec3(
             orientation[0, 0] * v_shape[0, 0] + orientation[1, 0] * v_shape[1, 0] + orientation[2, 0] * v_shape[2, 0],
