@@ -112,6 +112,30 @@ def test_a_large_gaussian_with_a_large_gradient_is_split_in_two():
     assert not (after["means"] == before["means"][1]).all(1).any()
 
 
+LIMIT = EXTENT * CONFIG.max_size
+# Factors of the maximum size, and whether a Gaussian of it that does not grow, and the children of one that does, stay.
+NEAR_LIMITS = {0.99: (True, True), 1.01: (False, True), 1.59: (False, True), 1.61: (False, False)}
+
+
+@pytest.mark.parametrize(("factor", "stays"), NEAR_LIMITS.items())
+@pytest.mark.parametrize("grows", [False, True])
+def test_oversized_gaussians_are_split_before_oversized_ones_are_removed(factor, stays, grows):
+    gradient = LARGE_GRADIENT if grows else SMALL_GRADIENT
+    _, after = densified([SMALL, factor * LIMIT], [SMALL_GRADIENT, gradient], remove_large=True)
+    rows_in(after, 1 + stays[grows] * (2 if grows else 1))
+
+
+def test_an_oversized_gaussian_that_may_not_split_is_removed():
+    _, after = densified([SMALL, OVERSIZED], [SMALL_GRADIENT, LARGE_GRADIENT], remove_large=True, capacity=0)
+    rows_in(after, 1)
+
+
+def test_those_that_are_removed_take_no_capacity():
+    sizes, gradients = [2.0 * LIMIT, SMALL, SMALL], [0.9, 0.8, SMALL_GRADIENT]
+    _, after = densified(sizes, gradients, remove_large=True, capacity=1)
+    rows_in(after, 3)
+
+
 def test_children_of_a_split_are_smaller_by_1_6_along_every_axis():
     before, after = densified([LARGE], [LARGE_GRADIENT])
     expected = (before["log_scales"].double().exp() / 1.6).log().repeat(2, 1)

@@ -85,7 +85,7 @@ def densify(
     limits: DensifyLimits,
     generator: torch.Generator,
 ) -> None:
-    """Clones small and splits large Gaussians with large gradients, and removes transparent and oversized ones.
+    """Clones small and splits large Gaussians with large gradients, then removes transparent and oversized ones.
 
     Args:
         gaussians: Changed in place, together with the optimizer's moments.
@@ -97,13 +97,14 @@ def densify(
     """
     sizes = gaussians.scales.max(1).values
     alive = (gaussians.opacities >= config.min_opacity) & sizes.isfinite() & gaussians.means.isfinite().all(1)
-    if limits.remove_large:
-        alive &= sizes <= config.max_size * limits.extent
-    grows = alive & (gradients > config.gradient)
+    max_size = config.max_size * limits.extent if limits.remove_large else math.inf
+    is_large = sizes > config.dense_fraction * limits.extent
+    # As in 3DGS, growth comes first: the children of an oversized Gaussian stay if they are small enough themselves.
+    grows = alive & (gradients > config.gradient) & (torch.where(is_large, sizes / SPLIT_SHRINK, sizes) <= max_size)
     if int(grows.sum()) > limits.capacity:
         order = torch.where(grows, gradients, -1.0).argsort(descending=True)
         grows[order[max(limits.capacity, 0) :]] = False
-    is_large = sizes > config.dense_fraction * limits.extent
+    alive &= sizes <= max_size
     kept = (alive & ~(grows & is_large)).nonzero()[:, 0]
     cloned = (grows & ~is_large).nonzero()[:, 0]
     split = (grows & is_large).nonzero()[:, 0].repeat(2)
