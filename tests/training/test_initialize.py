@@ -14,7 +14,7 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.point_cloud import color_points, gaussians_at, scene_box, subsample, unproject
+from warpgs.training.point_cloud import color_points, distinct, gaussians_at, scene_box, subsample, unproject
 from warpgs.training.schedule import Protocol
 from warpgs.training.views import Views
 
@@ -105,11 +105,43 @@ def test_gaussians_start_at_their_points_with_an_opacity_of_a_tenth():
     assert error(gaussians.opacities, torch.full((20,), 0.1)) < 1e-6
 
 
-@pytest.mark.parametrize("points", [torch.cat([random_points(20), torch.zeros(5, 3)]), torch.ones(9, 3)])
-def test_coincident_points_have_a_positive_size(points):
-    gaussians = gaussians_at(points, torch.rand(len(points), 3), NETWORK)
-    assert gaussians.log_scales.isfinite().all()
-    assert (gaussians.scales > 0).all()
+def merged(points, copies, jitter=0.0):
+    """The points several times, as merged clouds contain them, shuffled, and moved by a fraction of their position."""
+    order = torch.randperm(copies * len(points), generator=generator())
+    repeated = points.repeat(copies, 1)[order]
+    return repeated * (1.0 + jitter * torch.randn(repeated.shape, generator=generator())), order % len(points)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-7])
+@pytest.mark.parametrize("copies", [2, 4, 30])
+@pytest.mark.parametrize("model", [NETWORK, UNBOUNDED.model])
+def test_points_that_occur_several_times_have_the_size_of_single_ones(copies, jitter, model):
+    points = 5.0 + random_points(50)
+    repeated, original = merged(points, copies, jitter)
+    single, several = (gaussians_at(p, torch.rand(len(p), 3), model).scales.detach() for p in (points, repeated))
+    assert error(several / single[original], torch.ones_like(several)) < 1e-4
+
+
+def test_a_place_that_holds_most_points_does_not_change_the_sizes_elsewhere():
+    points = random_points(50)
+    crowded = torch.cat([points, points[:1].expand(5_000, 3)])
+    alone, among = (gaussians_at(p, torch.rand(len(p), 3), NETWORK).scales.detach() for p in (points, crowded))
+    assert error(among[:50], alone) < 1e-6
+    assert error(among[50:], alone[:1].expand(5_000, 3)) < 1e-6
+
+
+@pytest.mark.parametrize("places", [1, 2, 3])
+def test_points_at_few_places_have_the_size_of_few_points(places):
+    points = random_points(places)
+    gaussians = gaussians_at(merged(points, 9)[0], torch.rand(9 * places, 3), NETWORK)
+    assert torch.equal(gaussians.scales[0], gaussians_at(points, torch.rand(places, 3), NETWORK).scales[0])
+
+
+def test_close_points_are_distinct_down_to_rounding():
+    points = torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 1.0 + 4e-6], [1.0, 1.0, 1.0 + 2e-7], [0.0, 0.0, 0.0]])
+    first, place = distinct(points)
+    assert first.tolist() == [0, 1, 3]
+    assert place.tolist() == [0, 1, 0, 2]
 
 
 def test_the_size_of_a_distant_point_is_limited():
@@ -118,8 +150,8 @@ def test_the_size_of_a_distant_point_is_limited():
 
 
 def test_sizes_without_bounds_are_those_of_3dgs():
-    """sqrt(clamp_min(mean squared distance to three neighbours, 1e-7))."""
-    points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]]), torch.zeros(4, 3)])
+    """sqrt(clamp_min(mean squared distance to three neighbours, 1e-7)), of points at different places."""
+    points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]]), 0.05 + 1e-5 * grid(1.0)[:4]])
     squared = (points[:, None].double() - points[None].double()).square().sum(2).sort(1).values[:, 1:4].mean(1)
     expected = squared.clamp_min(1e-7).sqrt()
     assert expected.max() > 999
@@ -218,6 +250,13 @@ def test_a_few_distant_points_do_not_widen_the_box(distance):
     far[:3] = distance
     for plain, widened in zip(scene_box(points), scene_box(far), strict=True):
         assert error(widened, plain) < 0.01
+
+
+def test_points_that_occur_several_times_do_not_narrow_the_box():
+    points = torch.rand(500, 3, generator=generator())
+    crowded = torch.cat([points, torch.zeros(100_000, 3)])
+    for alone, among in zip(scene_box(points), scene_box(crowded), strict=True):
+        assert error(among, alone) < 0.02
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.ones(1, 3), torch.ones(50, 3)])

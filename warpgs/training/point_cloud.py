@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -16,7 +18,20 @@ INITIAL_OPACITY = 0.1
 NUM_NEIGHBOURS = 3
 
 MIN_SCALE = 1e-7**0.5
-"""Standard deviation of Gaussians at coincident points where sizes are not bounded; as in 3DGS [scene units]."""
+"""Minimum standard deviation where sizes are not bounded; as in 3DGS [scene units]."""
+
+FEW_POINTS_SCALE = 0.01
+"""Standard deviation of Gaussians at so few points that their distances say nothing [scene units]."""
+
+COINCIDENT = 1e-6
+"""Distance between points that coincide, relative to the median of their largest coordinates: merged clouds contain
+points several times, up to rounding to single precision."""
+
+MAX_CELL = 2.0**62
+"""Maximum coordinate of a cell, which must fit an int64."""
+
+CELL_HASH = np.array([0x1E3779B97F4A7C15, 0x42B2AE3D27D4EB4F, 0x165667B19E3779F9])
+"""Odd factors, whose products with a cell's coordinates add up to its hash, modulo 2^64."""
 
 BOX_MARGIN = 1.2
 """Size of the scene's box relative to that of its points."""
@@ -30,32 +45,54 @@ def gaussians_at(
 ) -> Gaussians:
     """Isotropic Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
 
+    Points at one place count as one neighbour, and get the same size: 3DGS would give them none.
+
     Args:
         points: [N, 3] positions on the CPU.
         colors: [N, 3] in [0, 1].
         model: Degree of spherical harmonics, and whether sizes are bounded.
         max_scale: Maximum standard deviation, if sizes are bounded [scene units].
     """
-    N = points.shape[0]
-    if N <= NUM_NEIGHBOURS:
-        scales = torch.full((N,), min(0.01, max_scale))
+    first, place = distinct(points)
+    if len(first) <= NUM_NEIGHBOURS:
+        scales = torch.full((points.shape[0],), min(FEW_POINTS_SCALE, max_scale))
         return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
-    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=NUM_NEIGHBOURS + 1, workers=-1)
+    places = points[first].numpy()
+    distances, _ = cKDTree(places).query(places, k=NUM_NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
     if model.bound_sizes:
-        # Coincident points would get scale 0, a few distant ones the size of the scene.
+        # Of points that nearly coincide and of a few distant ones, distances are no sizes.
         typical = scales.median().clamp_min(1e-7)
         scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(max_scale)
     else:
         scales = scales.clamp_min(MIN_SCALE)
-    return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
+    return Gaussians.from_points(points, colors, scales[place], INITIAL_OPACITY, model.sh_degree)
+
+
+def distinct(points: Float[Tensor, "N 3"]) -> tuple[Int64[Tensor, " D"], Int64[Tensor, " N"]]:
+    """Sorted indices of the first point at each place, and the number of each point's place among them."""
+    values = points.detach().cpu().numpy().astype(np.float64)
+    sizes = np.abs(values).max(1, initial=0.0)
+    tolerance = COINCIDENT * float(np.median(sizes[sizes > 0.0])) if sizes.any() else 1.0
+    cells = np.rint(values / tolerance).clip(-MAX_CELL, MAX_CELL).astype(np.int64)
+    # Cells that share a hash would only share a size, and of a million cells two do with a probability of 1e-7.
+    _, first, cell = np.unique((cells * CELL_HASH).sum(1), return_index=True, return_inverse=True)
+    # A place may lie on the border of cells.
+    pairs = cKDTree(values[first]).query_pairs(tolerance, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(first), len(first)))
+    _, place = connected_components(links, directed=False)
+    place = place[cell]
+    _, first, place = np.unique(place, return_index=True, return_inverse=True)
+    order = first.argsort()
+    return torch.from_numpy(first[order]), torch.from_numpy(order.argsort()[place])
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """(center, half size) of the cube that holds the points, except the outermost 1 % along each axis, with a margin.
 
-    Without points, the cube from -1 to 1 that captures are normalized to.
+    Points at one place count once. Without two places, the cube from -1 to 1 that captures are normalized to.
     """
+    points = points[distinct(points)[0]]
     if points.shape[0] < 2:
         return torch.zeros(3), torch.ones(3)
     ordered = points.sort(0).values
