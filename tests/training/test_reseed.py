@@ -1,6 +1,7 @@
 """New dynamic Gaussians where none shows what moves."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -14,7 +15,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training import optimizer as optim
 from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.reseed import gaussians_that_show, lost_fraction, lost_pixels
+from warpgs.training.point_cloud import scene_box
+from warpgs.training.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches
 from warpgs.training.schedule import Phase
 
 PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False)
@@ -137,3 +139,63 @@ def test_an_empty_background_is_not_filled_if_everything_is_assumed_to_be_dynami
     with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
         trainer._reseed(PHASE, logger)
     assert len(trainer.scene.dynamic) == num
+
+
+def make_transparent(gaussians):
+    gaussians.logit_opacities.data[:] = -20.0
+
+
+def test_a_run_ends_when_it_has_lost_the_last_static_gaussian(trainer):
+    make_transparent(trainer.scene.static)
+    message = r"the last static Gaussian was removed.* but 9\d\.\d% of the training pixels are static: warpgs check"
+    with pytest.raises(ValueError, match=message):
+        trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+
+
+def test_dynamic_gaussians_that_are_all_lost_are_added_again_at_once(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path / "run")
+    trainer._add_dynamic_gaussians()
+    make_transparent(trainer.scene.dynamic)
+    logger = Mock(spec=TrainingLogger)
+    assert trainer.config.densify.reseed == 0.0
+    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), logger)
+    assert len(trainer.scene.dynamic) > 10
+    assert "100% of the dynamic pixels show no dynamic Gaussian" in logger.log.call_args.args[0]
+
+
+def test_an_empty_branch_is_filled_at_random_where_the_deformation_has_no_inverse(trainer):
+    make_transparent(trainer.scene.dynamic)
+    deform(trainer.scene, 1e4)
+    logger = Mock(spec=TrainingLogger)
+    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), logger)
+    center, half_size = scene_box(trainer.capture.points)
+    assert len(trainer.scene.dynamic) > 100
+    assert ((trainer.scene.dynamic.means - center).abs() <= half_size).all()
+    assert f"{len(trainer.scene.dynamic)} added there" in logger.log.call_args.args[0]
+
+
+def test_a_run_ends_when_lost_dynamic_gaussians_cannot_be_added_again(trainer):
+    make_transparent(trainer.scene.dynamic)
+    trainer.config = dataclasses.replace(
+        trainer.config, densify=dataclasses.replace(trainer.config.densify, max_gaussians=1)
+    )
+    message = r"the last dynamic Gaussian was removed.* but \d\.\d% of the training pixels are dynamic.*--assume static"
+    with pytest.raises(ValueError, match=message):
+        trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+
+
+def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer):
+    view = trainer.views[0]
+    static_only = view._replace(static_mask=torch.ones_like(view.static_mask))
+    views = Mock(spec=trainer.views, num_pixels=view.static_mask.numel())
+    views.map.side_effect = lambda work: iter([work(static_only)])
+    before, trainer.scene.dynamic = (len(trainer.scene.static), 7), Gaussians.empty(0, 1)
+    assert require_branches(before, trainer.scene, views) == (
+        "the last dynamic Gaussian was removed, as transparent, oversized or rarely seen; 0.00% of the training pixels "
+        "are dynamic"
+    )
+
+
+def test_a_branch_that_never_had_gaussians_has_lost_none(trainer):
+    trainer.scene.dynamic = Gaussians.empty(0, 1)
+    assert require_branches((len(trainer.scene.static), 0), trainer.scene, trainer.views) is None

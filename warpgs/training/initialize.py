@@ -21,6 +21,7 @@ from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .reseed import gaussians_in_box
 from .schedule import Protocol
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
@@ -111,8 +112,7 @@ def dynamic_gaussians(
     found = found.chosen(subsample(found.positions, max_count, generator))
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
-        positions = random_points(capture.points, max_count, generator)
-        return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, max_scale(config, capture.extent))
+        return gaussians_in_box(capture, max_count, config, generator)
     largest = math.inf if found.depth_known else max_scale(config, capture.extent)
     return gaussians_at(found.positions, found.colors, config.model, largest)
 

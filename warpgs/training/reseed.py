@@ -1,4 +1,4 @@
-"""New dynamic Gaussians where none shows what moves.
+"""New dynamic Gaussians where none shows what moves, and an end for runs that have lost a whole branch.
 
 In its first steps the deformation network may carry all dynamic Gaussians of one object to another one. Where they
 were, no Gaussian receives a gradient any more, so the object stays lost.
@@ -12,12 +12,13 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 
 from .dynamic_points import DynamicPoints, max_scale, to_canonical
-from .point_cloud import gaussians_at
+from .point_cloud import gaussians_at, random_points
 from .schedule import Phase
 from .views import View, Views
 
@@ -27,6 +28,38 @@ where Gaussians overlap."""
 
 MAX_INVERSION_ERROR = 0.01
 """Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
+
+
+MIN_REGION = 1e-3
+"""Fraction of the training pixels above which a run does not go on without the Gaussians that show them."""
+
+
+def require_branches(before: tuple[int, int], scene: SplitScene, views: Views) -> str | None:
+    """A warning if a branch has lost its last Gaussian and hardly any pixel needs it; None if no branch has.
+
+    Args:
+        before: Numbers of static and dynamic Gaussians before the scene was changed.
+        scene: The scene after that.
+        views: Its training views.
+
+    Raises:
+        ValueError: If more than ``MIN_REGION`` of the training pixels need it.
+    """
+    after = {"static": len(scene.static), "dynamic": len(scene.dynamic)}
+    lost = [name for name, count in zip(after, before, strict=True) if count and not after[name]]
+    if not lost:
+        return None
+    branch, other = lost[0], "dynamic" if lost[0] == "static" else "static"
+    num_static = sum(int(count) for (count,) in views.map(lambda view: (view.static_mask.sum(),)))
+    share = (num_static if branch == "static" else views.num_pixels - num_static) / views.num_pixels
+    removed = f"the last {branch} Gaussian was removed, as transparent, oversized or rarely seen"
+    if share < MIN_REGION:
+        return f"{removed}; {share:.2%} of the training pixels are {branch}"
+    hint = f"; if everything is {other}, train with --assume {other}" if share < 0.5 else ""
+    raise ValueError(
+        f"{removed}, but {share:.1%} of the training pixels are {branch}: warpgs check may find what is wrong with the "
+        f"capture{hint}"
+    )
 
 
 def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Callable[[View], Bool[Tensor, "H W"]]:
@@ -73,5 +106,10 @@ def gaussians_that_show(
         seen, time = found.positions[chosen].to(views.device), views[index].time
         x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * extent)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
-    largest = max_scale(config, extent)
-    return gaussians_at(canonical[kept], found.colors[kept], config.model, largest)
+    return gaussians_at(canonical[kept], found.colors[kept], config.model, max_scale(config, extent))
+
+
+def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generator: torch.Generator) -> Gaussians:
+    """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
+    positions = random_points(capture.points, count, generator)
+    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, max_scale(config, capture.extent))

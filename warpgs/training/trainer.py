@@ -25,7 +25,7 @@ from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .object_depth import fill_object_depth
 from .prune import blend_weights, prune_invisible, prune_weakest
-from .reseed import gaussians_that_show, lost_fraction, lost_pixels
+from .reseed import gaussians_in_box, gaussians_that_show, lost_fraction, lost_pixels, require_branches
 from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
@@ -124,7 +124,7 @@ class Trainer:
             Whether the end was reached; false after an interrupt, or if a callback returned true.
 
         Raises:
-            ValueError: If the loss is repeatedly not finite.
+            ValueError: If the loss is repeatedly not finite, or a branch that is needed has lost its last Gaussian.
         """
         if self.iteration == 0:
             self.save()
@@ -168,7 +168,12 @@ class Trainer:
         ranks.any_rank(False)  # finds a lost rank
         self.step.statistics.merge()
         if ranks.is_first():
+            before = len(self.scene.static), len(self.scene.dynamic)
             self._adapt(plan, logger)
+            if before[1] > 0 == len(self.scene.dynamic):
+                self._reseed(plan.phase, logger)
+            if lost := require_branches(before, self.scene, self.views):
+                logger.log(f"warning: iteration {self.iteration + 1}: {lost}")
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
         ranks.copy_first_(self.alignments)
         if plan.replaces_gaussians:
@@ -203,8 +208,7 @@ class Trainer:
         """Densifies both branches, which divide the remaining capacity in proportion to how many want to grow."""
         config, branches = self.config.densify, (self.scene.static, self.scene.dynamic)
         means = self.step.statistics.mean().split([len(gaussians) for gaussians in branches])
-        generator = self._generator("densify")
-        capacity = self._capacity()
+        generator, capacity = self._generator("densify"), self._capacity()
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]
         for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
             part = capacity * count // max(1, sum(candidates))
@@ -222,10 +226,9 @@ class Trainer:
         """Adds dynamic Gaussians where none shows what moves."""
         if self.capture.assumption == "dynamic":
             return  # the masks do not say what moves then: they mark all that is seen
-        config, scene, views = self.config, self.scene, self.views
+        config, scene, views, capacity = self.config, self.scene, self.views, self._capacity()
         mask_of = lost_pixels(scene, phase, config.render_settings)
         fraction = lost_fraction(views, mask_of)
-        capacity = self._capacity()
         count = min(capacity, round(fraction * config.model.dynamic_points))
         if fraction < config.densify.reseed or count <= 0:
             return
@@ -233,6 +236,8 @@ class Trainer:
         found = unproject_pixels(self.capture, views, self.alignments, mask_of, count, generator)
         if found is not None:
             added = gaussians_that_show(found, scene, views, config, self.capture.extent)
+            if not len(added) + len(scene.dynamic):
+                added = gaussians_in_box(self.capture, count, config, generator)
             optim.append(self.step.optimizer, scene.dynamic, added)
             lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
             limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
