@@ -8,6 +8,7 @@ seconds and nanoseconds, with zeros before the latter or without (1305031102_400
 import re
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from itertools import pairwise
 from typing import NamedTuple
 
 SECOND = 10**9
@@ -16,8 +17,8 @@ SECOND = 10**9
 EARLIEST = 10**9
 """Seconds of a calendar or since 1970 are more; smaller ones may be any number."""
 
-SHORTEST_COUNTED = SECOND // 10
-"""If the fractions of all seconds are shorter than this [ns], they are numbers of frames in a second, not fractions."""
+SHORTEST_COUNTED, MIN_COUNTED = SECOND // 10, 6
+"""Fractions of seconds count frames if all are shorter than this [ns], or if this many never begin again."""
 
 DATE = re.compile(
     r"(?<![0-9])(?P<date>[12][0-9]{3}[-_.]?[0-9]{2}[-_.]?[0-9]{2})(?:[ _T.-]|[ _]at[ _])?"
@@ -69,7 +70,7 @@ def _stamps(matches: Sequence[re.Match[str]], seconds_of: Callable[[re.Match[str
     marks = {match["mark"] for match in matches if match["part"]}
     fractions = _fractions(parts, marks)
     is_given = min(seconds) >= EARLIEST and marks <= {".", ""}
-    if fractions is not None and not is_given and max(fractions) < SHORTEST_COUNTED:
+    if fractions is not None and not is_given and _are_counted(seconds, fractions):
         fractions = None
     if fractions is None and ("" in marks or min(seconds) < EARLIEST):
         return None  # digits of a longer number, or two numbers
@@ -77,6 +78,13 @@ def _stamps(matches: Sequence[re.Match[str]], seconds_of: Callable[[re.Match[str
     values = [SECOND * whole + part for whole, part in zip(seconds, fractions or [0] * len(parts), strict=True)]
     rests = [(match.string[: match.start()], match.string[end:]) for match, end in zip(matches, ends, strict=True)]
     return Stamps(values, rests)
+
+
+def _are_counted(seconds: Sequence[int], fractions: Sequence[int]) -> bool:
+    """Whether fractions of seconds count frames instead: from 0 on in every second, or on through all seconds."""
+    in_order = [fraction for _, fraction in sorted(zip(seconds, fractions, strict=True))]
+    goes_on = len({*seconds}) > 1 and all(a < b for a, b in pairwise(in_order))
+    return max(fractions) < SHORTEST_COUNTED or (goes_on and len(fractions) >= MIN_COUNTED)
 
 
 def _fractions(parts: Sequence[str], marks: set[str]) -> list[int] | None:

@@ -27,7 +27,8 @@ def share_times(numbers: Sequence[int], rests: Sequence[str]) -> bool:
     """Whether frames with the same number were taken at the same time, by cameras of one rig.
 
     They were if the names differ in words for cameras or numbers after such words; and if they differ in folders or
-    words, none of them a word for clips, and nearly all numbers are the same in all of them.
+    words, none of them a word for clips, and nearly all numbers are the same in all of them, which are not more than
+    the numbers: folders of times hold the images of few cameras.
 
     Args:
         numbers: Of each frame.
@@ -41,8 +42,8 @@ def share_times(numbers: Sequence[int], rests: Sequence[str]) -> bool:
         columns = [k for k, column in enumerate(zip(*tokens, strict=True)) if len({*column}) > 1]
         if all(_is_camera(token, k) for k in columns for token in tokens):
             return True
-        if any(token[k].isdecimal() and "/" not in token[k:] for k in columns for token in tokens):
-            return False
+    if len({tuple(re.findall("[0-9]+", label.rpartition("/")[2])) for label in labels}) > 1:
+        return False
     return not any(CLIP.search(label) for label in labels) and _are_common(numbers, rests)
 
 
@@ -56,5 +57,5 @@ def _are_common(numbers: Sequence[int], rests: Sequence[str]) -> bool:
     found = defaultdict(set)
     for number, rest in zip(numbers, rests, strict=True):
         found[rest].add(number)
-    common = set.intersection(*found.values())
-    return len(common) > 1 and len(common) >= MIN_COMMON * len({*numbers})
+    common, count = set.intersection(*found.values()), len({*numbers})
+    return len(common) > 1 and len(common) >= MIN_COMMON * count and len(found) <= count
