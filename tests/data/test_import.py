@@ -11,8 +11,10 @@ from tests.data import captures, layouts
 from warpgs.cli import main
 from warpgs.data import loaders
 from warpgs.data.capture import Capture
+from warpgs.data.check import check_capture
 from warpgs.data.import_capture import import_capture, time_steps
 from warpgs.data.loaders import describe_layout, load_capture, recognize
+from warpgs.data.writer import plain_ids
 
 DATASETS = {name: lambda root, name=name: captures.write_capture(root, name) for name in captures.FACTORS}
 SOURCES = {**layouts.WRITERS, **DATASETS}
@@ -50,6 +52,60 @@ def test_the_copy_is_the_same_capture(tmp_path, layout):
         assert all(copied.cameras[n].time == pytest.approx(original.cameras[n].time / last, abs=1e-5) for n in names)
     else:
         assert_equal(load_capture(tmp_path / "copy"), original)
+
+
+@pytest.mark.parametrize("size", [(1, 24), (40, 1)])
+def test_images_that_are_a_line_are_refused_by_everything_that_opens_captures(root, tmp_path, size):
+    for path in (root / "camera").iterdir():
+        captures.edit_json(path, image_size=list(size), principal_point=[size[0] / 2, size[1] / 2])
+    text = f"is {size[0]}×{size[1]}, expected at least 2 pixels per side"
+    with pytest.raises(ValueError, match=text):
+        import_capture(root, tmp_path / "copy")
+    with pytest.raises(ValueError, match=text):
+        load_capture(root)
+    assert text in str(check_capture(root))
+    assert not (tmp_path / "copy").exists()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f".hidden_{k:05d}" for k in range(12)],
+        [f"a{k:02d} " for k in range(12)],
+        [f"{'.' * k}x" for k in range(12)],
+        [f"line\n{k}" for k in range(12)],
+        [f"{'ä' * 121}{k:02d}" for k in range(12)],
+    ],
+    ids=["hidden", "trailing space", "all the same without dots", "line break", "long"],
+)
+def test_the_check_accepts_the_names_of_frames_that_are_imported(tmp_path, names):
+    source = tmp_path / "source"
+    transforms = layouts.write_nerfstudio(source) / "transforms.json"
+    fields = json.loads(transforms.read_text())
+    for entry, name in zip(fields["frames"], names, strict=True):
+        path = source / entry["file_path"]
+        entry["file_path"] = f"images/{name}.png"
+        path.rename(source / entry["file_path"])
+    captures.write_json(transforms, fields)
+    lines = []
+    import_capture(source, tmp_path / "copy", log=lines.append)
+    report = check_capture(tmp_path / "copy")
+    assert "not fit" not in str(report)
+    assert "11 frames to train on, 1 to evaluate" in str(report)
+    assert any("ids that files cannot have" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("names", "ids"),
+    [
+        (["a", "b c"], ["a", "b c"]),
+        ([".a", "a"], ["a_2", "a"]),
+        (["..", "."], ["frame", "frame_2"]),
+        (["a/b", "a_b", "a\\b"], ["a_b_2", "a_b", "a_b_3"]),
+    ],
+)
+def test_ids_in_the_copy_are_plain_and_distinct(names, ids):
+    assert [*plain_ids(names).values()] == ids
 
 
 def test_estimated_masks_stay_estimates(root, tmp_path):

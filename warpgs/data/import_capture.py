@@ -1,6 +1,7 @@
 """Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def import_capture(
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
-    capture = load_capture(source, dataset, factor=factor, cache_frames=2)
+    capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
     names = sorted((*capture.train, *capture.val), key=lambda name: (capture.cameras[name].time, name))
     val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
     with complete_or_absent(target) as folder:
@@ -62,7 +63,28 @@ def import_capture(
             f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
         )
         _log_remarks(capture, log)
+        if renamed:
+            old, new = renamed[0]
+            log(
+                f"note: {len(renamed)} frames have ids that files cannot have everywhere: {old!r} is {new!r} in the copy"
+            )
         log(f"{target} is finished: next run {command('check', target)}")
+
+
+def _with_plain_ids(capture: Capture) -> tuple[Capture, list[tuple[str, str]]]:
+    """The capture with ids that the copy can have, and those that differ, before and after."""
+    ids = writer.plain_ids([*capture.train, *capture.val])
+    renamed = [(old, new) for old, new in ids.items() if old != new]
+    if not renamed:
+        return capture, []
+    old_of = {new: old for old, new in ids.items()}
+    return replace(
+        capture,
+        cameras={ids[name]: camera for name, camera in capture.cameras.items()},
+        train=[ids[name] for name in capture.train],
+        val=[ids[name] for name in capture.val],
+        read=lambda name: replace(capture.frame(old_of[name]), name=name),
+    ), renamed
 
 
 def _log_remarks(capture: Capture, log: Callable[[str], None]) -> None:

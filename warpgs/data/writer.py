@@ -30,6 +30,34 @@ GIVEN, ESTIMATED = "given", "estimated"
 """What dataset.json says of the masks, see ``Capture.estimated_masks``."""
 
 
+MAX_ID_BYTES = 200
+"""Maximum length of an id that is written: file systems allow names of 255 bytes, with suffixes and while they are
+written."""
+
+
+def is_plain_id(name: str) -> bool:
+    """Whether a frame can have this id: it is one plain file name, and does not begin with a dot."""
+    return bool(name) and not name.startswith(".") and not any(character in name for character in "/\\\0")
+
+
+def plain_ids(names: Sequence[str]) -> dict[str, str]:
+    """The id under which each of some distinct frames is written: its name, as far as files can have it everywhere."""
+    ids: dict[str, str] = {}
+    taken = {name for name in names if _portable(name) == name}
+    for name in names:
+        stem = _portable(name)
+        copies = (stem, *(f"{stem}_{k}" for k in range(2, len(names) + 2)))
+        ids[name] = name if stem == name else next(found for found in copies if found not in taken)
+        taken.add(ids[name])
+    return ids
+
+
+def _portable(name: str) -> str:
+    """The name without leading dots, trailing spaces and dots, slashes and control characters, and not too long."""
+    kept = "".join(c if c.isprintable() and c not in "/\\" else "_" for c in name).lstrip(". ").rstrip(". ")
+    return kept.encode(errors="replace")[:MAX_ID_BYTES].decode(errors="ignore") or "frame"
+
+
 def write_image(root: Path, name: str, image: UInt8[np.ndarray, "H W 3"], factors: Sequence[int] = (1,)) -> None:
     """Writes rgb/<factor>x/<name>.png for every downscaling factor."""
     for factor in factors:

@@ -67,6 +67,9 @@ LOADERS: dict[str, Loader] = {
 }
 """Loader of each dataset; a folder is read by the first one that recognizes it."""
 
+MIN_SIDE = 2
+"""Minimum side of an image, after it is downscaled [px]."""
+
 FALLBACK = "hypernerf"
 """Dataset of a folder that no loader recognizes; the errors of its loader name what is missing."""
 
@@ -117,7 +120,17 @@ def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_
     loader = LOADERS[dataset or recognize(root)]
     if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
         options = replace(options, factor=vrig_factor)
-    return loader.load(root, options)
+    capture = loader.load(root, options)
+    _require_sides(root, capture)
+    return capture
+
+
+def _require_sides(root: Path, capture: Capture) -> None:
+    """Raises ValueError if an image is a line: it has no gradient across, and no half of its size."""
+    for name, camera in capture.cameras.items():
+        if min(camera.size) < MIN_SIDE:
+            size, expected = f"{camera.width}×{camera.height}", f"at least {MIN_SIDE} pixels per side"
+            raise ValueError(f"{root}: frame {name} is {size}, expected {expected}; --factor divides the size of files")
 
 
 def is_capture(root: Path) -> bool:

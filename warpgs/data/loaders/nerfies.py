@@ -26,7 +26,7 @@ from warpgs.data.points import read_points
 from warpgs.data.taken import taken_reader
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.data.writer import ESTIMATED, GIVEN
+from warpgs.data.writer import ESTIMATED, GIVEN, is_plain_id
 from warpgs.errors import command
 from warpgs.files import read_json
 
@@ -126,7 +126,7 @@ def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
     if not isinstance(ids, list) or not all(isinstance(i, str) for i in ids) or len(set(ids)) < len(ids):
         raise ValueError(f"{path}: {key} must be a list of distinct ids")
     for i in ids:
-        if not i or "/" in i or "\\" in i or "\0" in i or i.startswith("."):
+        if not is_plain_id(i):
             raise ValueError(f"{path}: {key} must hold plain names, got {i!r}")
     return ids
 
