@@ -114,6 +114,8 @@ def test_a_folder_that_another_process_still_writes_is_kept(tmp_path):
             assert first != second
             assert (first / "image.png").is_file()
         (tmp_path / "capture").rmdir()
+        with pytest.raises(ValueError, match="capture is being written by another process: wait until it has ended"):
+            complete_or_absent(tmp_path / "capture").__enter__()
     assert [path.name for path in tmp_path.rglob("*")] == ["capture", "image.png"]
 
 

@@ -112,10 +112,12 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
         keep_existing: Whether another process may make the same folder meanwhile, which is kept then.
 
     Raises:
+        ValueError: If another process is writing it, unless ``keep_existing``.
         OSError: If it cannot be created, or is not empty at the end; the message names the folder or its parent, as do
             those of errors of files in it, instead of the temporary folder. Its class and errno are those of the cause.
     """
-    _remove_abandoned(folder)
+    if _remove_abandoned(folder) and not keep_existing:
+        raise ValueError(f"{folder} is being written by another process: wait until it has ended, or choose another")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}-"))
@@ -171,15 +173,26 @@ def kept_if_used(folder: Path, bookkeeping: Collection[str] = ()) -> Iterator[No
                 path.rmdir()
 
 
-def _remove_abandoned(folder: Path) -> None:
-    """Removes what processes that were killed in ``complete_or_absent`` left of a folder; others hold their locks."""
+def _remove_abandoned(folder: Path) -> bool:
+    """Removes what processes that were killed in ``complete_or_absent`` left of a folder; others hold their locks.
+
+    Returns:
+        Whether another process holds one.
+    """
+    is_written = False
     for partial in folder.parent.glob(f".{glob.escape(folder.name)}-*/{glob.escape(folder.name)}"):
         lock = partial.parent / OWNED
         if lock.is_file() and not lock.is_symlink():  # opening it may empty it
-            with suppress(OSError, Timeout, NotImplementedError), FileLock(lock, timeout=0):
-                shutil.rmtree(partial)
+            try:
+                with FileLock(lock, timeout=0):
+                    shutil.rmtree(partial)
+            except Timeout:  # an OSError, too
+                is_written = True
+            except (OSError, NotImplementedError):
+                pass
             if not partial.exists():
                 shutil.rmtree(partial.parent, ignore_errors=True)
+    return is_written
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.errors import not_one_of
 from warpgs.files import read_json, write_json
+from warpgs.locks import lock_folder
 
 from .cameras import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION
@@ -81,11 +82,12 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     loader = LOADERS[layout]
     if not isinstance(loader, NerfiesLoader):
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
-    capture = loader.load(root, LoadOptions(), incomplete_masks=True)
-    job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
-    for part in PARTS:
-        if part in options.parts:
-            getattr(job, f"add_{part}")()
+    with lock_folder(root, "prepared"):
+        capture = loader.load(root, LoadOptions(), incomplete_masks=True)
+        job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
+        for part in PARTS:
+            if part in options.parts:
+                getattr(job, f"add_{part}")()
 
 
 def _check_options(options: AddOptions) -> None:

@@ -79,13 +79,18 @@ class Cameras:
         )
 
     @staticmethod
+    def files(path: Path) -> list[Path]:
+        """The file that ``save`` wrote."""
+        return [path.with_name(path.name + ".npz")]
+
+    @staticmethod
     def load(path: Path) -> "Cameras":
         """The cameras that ``save`` wrote.
 
         Raises:
             ValueError: If the file is missing or damaged.
         """
-        file = path.with_name(path.name + ".npz")
+        (file,) = Cameras.files(path)
         data = io.BytesIO(read_bounded(file, MAX_BYTES))
         try:
             found = Cameras._parse(data)

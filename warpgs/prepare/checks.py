@@ -54,6 +54,8 @@ def check_options(source: Path, root: Path, options: Options) -> None:
 
 
 def _check_paths(source: Path, root: Path, options: Options) -> None:
+    if root.exists() and not root.is_dir():
+        raise ValueError(f"{root} is a file: choose another folder")
     if source.is_dir() and is_capture(source):
         raise ValueError(
             f"{source} is a capture: {command('train', '--data', source)} trains on it; prepare needs a video or a "

@@ -26,8 +26,8 @@ from warpgs.data.turning import find_turning
 
 from .cameras import MISLED, Cameras, NoCamerasError
 from .focal_guess import calibrated, confirms
-from .matches import all_pairs, keep_static, revisit_pairs, sequence_pairs, verified_matches
-from .model import cameras_of_model
+from .matches import all_pairs, has_features, keep_static, revisit_pairs, sequence_pairs, verified_matches
+from .model import cameras_of_model, read_model
 from .rotations import find_directions
 
 FALLBACK_FRAMES = 250
@@ -133,7 +133,7 @@ def run(job: Job, report: Report) -> Cameras:
         report("directions", 0, 1)
         return _find_directions(job, database)
     model_folder = work / "model"
-    model = pycolmap.Reconstruction(model_folder) if job.refine else None
+    model = read_model(model_folder) if job.refine else None
     if model is not None:
         error = model.compute_mean_reprojection_error()
         model = _refine(job, model, report)
@@ -158,8 +158,9 @@ def run(job: Job, report: Report) -> Cameras:
 def _extract_and_match(job: Job, report: Report) -> None:
     """Features and matches along the sequence, unless they are in the database."""
     finished = job.database.with_suffix(".done")
-    if finished.exists():
+    if finished.exists() and has_features(job.database, job.files):
         return
+    finished.unlink(missing_ok=True)
     job.database.unlink(missing_ok=True)
     reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reading.camera_model = job.lens

@@ -1,7 +1,7 @@
 """Inverse depth of every frame of a capture: the methods that estimate it, and its files."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -76,6 +76,11 @@ def add_depth(
     unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
     notes = [f"depth is unknown everywhere in {', '.join(unknown)}"] if unknown else []
     return f"known on {np.mean(known):.0%} of the pixels", notes
+
+
+def depth_files(root: Path, names: Sequence[str]) -> list[Path]:
+    """The files with the depth of frames that ``add_depth`` writes."""
+    return [root / f"depth/1x/{name}.npy" for name in names]
 
 
 def _place_points(root: Path, cameras: Cameras, planes: Planes) -> None:

@@ -78,6 +78,15 @@ class Frames:
         taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"]), int(f["time"])) for f in index["frames"]]
         return Frames(folder, taken, int(index["width"]), int(index["height"]), float(index["factor"]))
 
+    @staticmethod
+    def files(folder: Path) -> list[Path]:
+        """The files that ``take_frames`` wrote; only their index if that is damaged."""
+        try:
+            names = Frames.load(folder).names
+        except (KeyError, TypeError, ValueError):
+            names = []
+        return [folder / INDEX, *(folder / f"{name}.png" for name in names)]
+
     @property
     def names(self) -> list[str]:
         """Ids of the frames, in order."""

@@ -3,7 +3,7 @@
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from errno import ENOSPC
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from warpgs.data.writer import FINISHED, REPORT, STATE, WORK
 from warpgs.files import read_json, write_json
+from warpgs.locks import LOCK
 
 OUTPUTS = (
     "rgb", "resized_mask", "camera", "depth", "points.npy", "point_colors.npy", "scene.json", "metadata.json",
@@ -58,12 +59,14 @@ class Journal:
         self._options = options
         self._done: dict[str, Any] = {}
         self.notes: list[str] = []
-        if root.exists() and not root.is_dir():
-            raise ValueError(f"{root} is a file: choose another folder")
         if force:
             self._require_own_outputs()
-        elif root.exists() and any(root.iterdir()):
+        elif self._contents():
             self._done, self.notes = self._read_state()
+
+    def _contents(self) -> set[str]:
+        """Names of everything in the folder of the capture but the lock that this process holds."""
+        return {path.name for path in self.root.iterdir()} - {LOCK} if self.root.exists() else set()
 
     def _require_own_outputs(self) -> None:
         if (self.work / STATE).exists() or (self.root / REPORT).exists():
@@ -86,7 +89,7 @@ class Journal:
             begun, done, notes = dict(state["options"]), dict(state["done"]), list(map(str, state["notes"]))
             done = {name: {"result": str(e["result"]), "seconds": float(e["seconds"])} for name, e in done.items()}
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            if list(self.root.iterdir()) == [self.work]:  # interrupted during the first step
+            if self._contents() == {WORK}:  # interrupted during the first step
                 return {}, []
             self._require_own_outputs()
             raise ValueError(
@@ -110,16 +113,24 @@ class Journal:
         """Whether all steps are finished."""
         return FINISHED in self._done
 
-    def step(self, name: str, work: Callable[[], str]) -> None:
+    def step(self, name: str, work: Callable[[], str], files: Callable[[], Iterable[Path]]) -> None:
         """Runs ``work``, which returns a summary of its result, unless the step of this name is finished.
 
-        The summary is logged, and so are the notes that ``work`` appended.
+        A finished step of whose ``files`` one is missing or empty is done again, and so are all that came after it. The
+        summary is logged, and so are the notes that ``work`` appended.
         """
+        if name in self._done and (lost := first_lost(files())) is not None:
+            self.log(f"note: {lost}, which an earlier call wrote, is missing: {name} is done again")
+            finished = [*self._done]
+            for later in finished[finished.index(name) :]:
+                del self._done[later]
+            self._save()
         if name in self._done:
             summary, when, noted = self._done[name]["result"], "finished before", len(self.notes)
         else:
             start, noted = time.perf_counter(), len(self.notes)
             summary = work()
+            self.notes[:] = dict.fromkeys(self.notes)  # a step that is done again notes the same
             seconds = round(time.perf_counter() - start, 1)
             self._done[name] = {"seconds": seconds, "result": summary}
             self._save()
@@ -128,19 +139,26 @@ class Journal:
         for note in self.notes[noted:]:
             self.log(f"note: {note}")
 
-    def result(self, name: str, load: Callable[[Path], Result], make: Callable[[Path], str]) -> Result:
+    def result(
+        self,
+        name: str,
+        load: Callable[[Path], Result],
+        make: Callable[[Path], str],
+        files: Callable[[Path], Iterable[Path]],
+    ) -> Result:
         """The result of a step.
 
         Args:
             name: Name of the step; its path in the work folder follows from it.
             load: Reads the result from this path.
             make: Writes the result to this path and returns a summary; not called if the step is finished.
+            files: The files of the result at this path, which must be there if the step is to count as finished.
 
         Raises:
             ValueError: If the result was damaged since it was written.
         """
         path = self.work / name.replace(", ", "-").replace(" ", "-")
-        self.step(name, lambda: make(path))
+        self.step(name, lambda: make(path), lambda: files(path))
         try:
             return load(path)
         except (KeyError, TypeError, ValueError) as error:
@@ -204,6 +222,11 @@ class Journal:
         write_json(
             self.work / STATE, {"version": VERSION, "options": self._options, "done": self._done, "notes": self.notes}
         )
+
+
+def first_lost(paths: Iterable[Path]) -> Path | None:
+    """The first of some paths at which there is nothing, or an empty file, as after a power failure."""
+    return next((path for path in paths if not path.exists() or (path.is_file() and not path.stat().st_size)), None)
 
 
 def _remove(path: Path) -> None:

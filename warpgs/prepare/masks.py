@@ -77,6 +77,11 @@ class Masks:
         return [mask if self.undistorted else undistort(mask, lens) for mask in masks]
 
 
+def mask_files(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The files that ``write_masks`` writes."""
+    return [folder / INDEX, *(folder / f"{name}.png.png" for name in names)]
+
+
 def write_masks(
     folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]], undistorted: bool = False
 ) -> str:

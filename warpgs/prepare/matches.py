@@ -79,6 +79,29 @@ def _visible(
     return (in_camera[..., 2] > 0) & (np.abs(in_camera[..., :2] / depth[..., None]) < limits[:, None]).all(2)
 
 
+def has_features(database: Path, names: list[str]) -> bool:
+    """Whether a database can be read and has the features of some images, and the pairs along the sequence of all.
+
+    Args:
+        database: COLMAP's database.
+        names: Names of the images.
+    """
+    if not database.is_file():
+        return False
+    try:
+        opened = pycolmap.Database.open(database)
+    except RuntimeError:
+        return False
+    try:
+        images = {image.name: image.image_id for image in opened.read_all_images()}
+        is_matched = opened.num_matched_image_pairs() >= len(sequence_pairs(len(images)))
+        return is_matched and all(name in images and opened.exists_descriptors(images[name]) for name in names)
+    except RuntimeError:  # damaged further inside
+        return False
+    finally:
+        opened.close()
+
+
 def keep_static(database: Path, masks: Path | None, names: list[str]) -> float:
     """Removes matches of other images, and those in dynamic regions; returns the mean number of static features.
 

@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+import cv2  # noqa: F401  before pycolmap, see ``colmap``
 import numpy as np
+import pycolmap
 
 from warpgs.data.colmap import lens_of
 
@@ -20,6 +22,14 @@ MIN_POINTS = 100
 
 MAX_ERROR = 2.0
 """Maximum mean reprojection error of a point [px]; others are omitted."""
+
+
+def read_model(folder: Path) -> Any:
+    """COLMAP's reconstruction in a folder; None if it is missing or damaged."""
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError):
+        return None
 
 
 def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Cameras:

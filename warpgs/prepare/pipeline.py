@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.errors import command
-from warpgs.files import kept_if_used
+from warpgs.files import kept_if_used, read_json
+from warpgs.locks import lock_folder
 
 from .cameras import MISLED, Cameras, NoCamerasError
 from .checks import check_options
-from .journal import Journal
+from .journal import Journal, first_lost
 from .masks import MASKERS, Masks
 from .options import Options
-from .scene import DOUBTFUL_FRACTION
+from .scene import DOUBTFUL_FRACTION, capture_files
 from .steps import Steps, take
 
 MAX_DYNAMIC_FRACTION = 0.6
@@ -43,15 +44,25 @@ def prepare(
 
     Raises:
         ValueError: If an option is invalid, the folder holds something else, or the source is not suitable; the message
-            says why and what to try.
+            says why and what to try. If another process prepares the same folder.
         ImportError: If a network's package is missing.
         OSError: If a file cannot be written, or the disk is full.
     """
     options = options or Options()
     check_options(source, root, options)
+    with lock_folder(root, "prepared"):
+        return _prepare(source, root, options, force, log)
+
+
+def _prepare(
+    source: Path, root: Path, options: Options, force: bool, log: Callable[[str], None] | None
+) -> dict[str, Any]:
+    """``prepare`` in a folder that is locked."""
     chosen = {"source": source, **asdict(options), "depth": options.depth_method}
     journal = Journal(root, json.loads(json.dumps(chosen, default=lambda p: str(p.resolve()))), force, log)
-    if not (was_finished := journal.is_finished):
+    if was_finished := journal.is_finished:
+        _require_whole(root)
+    else:
         with journal.explain_full_disk(), kept_if_used(journal.work):
             _run_steps(source, options, journal)
     report = journal.report()
@@ -61,6 +72,14 @@ def prepare(
     done = f"{root} is finished: look at {sheets} in it, then run {command('check', root)}"
     journal.log(f"{root} was finished before; --force makes it again" if was_finished else done)
     return report
+
+
+def _require_whole(root: Path) -> None:
+    """Raises ValueError if a finished capture lacks a file: what it was made from is removed."""
+    index = root / "dataset.json"
+    lost = first_lost([index]) or first_lost(capture_files(root, list(map(str, read_json(index).get("ids", [])))))
+    if lost is not None:
+        raise ValueError(f"{root} was finished before, but {lost} is missing: make the capture again with --force")
 
 
 def _run_steps(source: Path, options: Options, journal: Journal) -> None:

@@ -22,6 +22,9 @@ from .sphere import points_around
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks; training uses the second with ``--factor 2``."""
 
+FOLDERS = {"rgb": ".png", "resized_mask": ".png.png"}
+"""Folders of the images and masks, and how the files of frames end there."""
+
 MAX_DYNAMIC_VIEWS = 0.5
 """Fraction of a point's views in dynamic regions above which the point is omitted."""
 
@@ -78,6 +81,13 @@ def write_capture(
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
     write_contact_sheet(root / "masks.png", painted, cameras.names)
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
+
+
+def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
+    """The files of a capture with these frames that ``write_capture`` writes, without the contact sheet."""
+    sizes = [f"{folder}/{factor}x/{{}}{end}" for folder, end in FOLDERS.items() for factor in FACTORS]
+    frames = [root / path.format(name) for path in (*sizes, "camera/{}.json") for name in names]
+    return [root / "dataset.json", root / "metadata.json", root / "scene.json", root / "points.npy", *frames]
 
 
 def _doubts(fraction: float, estimated: bool) -> list[str]:

@@ -1,8 +1,9 @@
 """The steps of a preparation: each checks the disk space, calls the function that does the work, and is journaled."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,15 +14,15 @@ from warpgs.data.lens import Lens
 from .background_motion import SIDE, off_background
 from .cameras import Cameras, NoCamerasError
 from .checks import check_count
-from .depth import DEPTHS, add_depth
+from .depth import DEPTHS, add_depth, depth_files
 from .frames import Frames, take_frames
 from .given_masks import find_given_masks, read_dynamic
 from .images import read_images, resize_to_side
 from .intrinsics import read_intrinsics
 from .journal import Journal
-from .masks import MASKERS, Masks, find_masks, write_masks
+from .masks import MASKERS, Masks, find_masks, mask_files, write_masks
 from .options import Options
-from .scene import write_capture
+from .scene import capture_files, write_capture
 from .sfm import Settings, recover_cameras
 
 MIN_SPACE = 100
@@ -54,7 +55,7 @@ def take(source: Path, options: Options, journal: Journal) -> Frames:
             shutil.rmtree(new, ignore_errors=True)
         return f"{len(frames.taken)} of {frames.width}×{frames.height}"
 
-    return journal.result("frames", Frames.load, make)
+    return journal.result("frames", Frames.load, make, Frames.files)
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Steps:
                 return _save(self._still(names), path, names)
             return _save(self._reconstruct(names, settings), path, names)
 
-        return self.journal.result(name, Cameras.load, make)
+        return self.journal.result(name, Cameras.load, make, Cameras.files)
 
     def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
         """The cameras of the first pass, refined with the matches outside of the masks."""
@@ -104,7 +105,7 @@ class Steps:
             self.journal.notes.append(f"the cameras are those of the first pass, without masks: with masks, {reason}")
             return f"{len(first.names)} frames, those of the first pass"
 
-        return self.journal.result(name, Cameras.load, make)
+        return self.journal.result(name, Cameras.load, make, Cameras.files)
 
     def _still(self, names: list[str]) -> Cameras:
         """The cameras of a tripod: all the same."""
@@ -162,7 +163,7 @@ class Steps:
             write_masks(path, names, off)
             return f"{np.mean([mask.mean() for mask in off]):.1%} of the pixels do not move with it"
 
-        return self.journal.result(name, Masks.load, make)
+        return self.journal.result(name, Masks.load, make, self._mask_files(self.frames.names))
 
     def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
         """The masks of the cameras' frames."""
@@ -175,7 +176,8 @@ class Steps:
             self._require_space(MASK_BYTES)
             return write_masks(path, cameras.names, dynamic)
 
-        return replace(self.journal.result(name, Masks.load, make), estimated=True)
+        files = self._mask_files(cameras.names)
+        return replace(self.journal.result(name, Masks.load, make, files), estimated=True)
 
     def copy_masks(self, name: str) -> Masks:
         """The masks given by the user, in the size of the frames."""
@@ -186,7 +188,7 @@ class Steps:
             self._require_space(MASK_BYTES)
             return write_masks(path, self.frames.names, dynamic, undistorted)
 
-        return self.journal.result(name, Masks.load, make)
+        return self.journal.result(name, Masks.load, make, self._mask_files(self.frames.names))
 
     def write_capture(self, name: str, cameras: Cameras, masks: Masks) -> None:
         """Writes the capture without depth."""
@@ -197,7 +199,7 @@ class Steps:
             holdout = self.options.holdout
             return write_capture(root, self.frames, cameras, masks, holdout=holdout, notes=notes, quiet=quiet)
 
-        self.journal.step(name, make)
+        self.journal.step(name, make, lambda: capture_files(self.journal.root, cameras.names))
 
     def add_depth(self, name: str, cameras: Cameras) -> None:
         """Adds depth to the capture."""
@@ -212,7 +214,14 @@ class Steps:
             journal.notes.extend(notes)
             return summary
 
-        self.journal.step(name, make)
+        def files() -> list[Path]:
+            return [] if method is None else depth_files(self.journal.root, cameras.names)
+
+        self.journal.step(name, make, files)
+
+    @staticmethod
+    def _mask_files(names: Sequence[str]) -> Callable[[Path], list[Path]]:
+        return partial(mask_files, names=names)
 
     def _reconstruct(self, names: list[str], settings: Settings) -> Cameras:
         self._require_space(FEATURE_BYTES)
