@@ -58,6 +58,9 @@ DATES = [
     "WIN_20240131_14_{:02d}_{:02d}_Pro.jpg",
     "2024-01-31T14:{:02d}:{:02d}.jpg",
     "DJI_2024013114{:02d}{:02d}_0007_D.JPG",
+    "frame_14{:02d}{:02d}.png",
+    "14-{:02d}-{:02d}.png",
+    "vlcsnap-14h{:02d}m{:02d}s000.png",
 ]
 
 
@@ -71,6 +74,7 @@ NUMBERS = {
     "ns-process-data": ([f"./images/frame_{k:05d}.png" for k in (1, 2, 3)], [0, 1, 2]),
     "dropped frames": (["1", "2", "3", "5", "6"], [0, 1, 2, 4, 5]),
     "sharpest frames": ([f"frame_{k:05d}" for k in (3, 11, 14, 26)], [0, 8, 11, 23]),
+    "numbers like the time of day": ([f"{k:06d}.png" for k in (50, 100, 150, 200, 250)], [0, 50, 100, 150, 200]),
     "no padding": (["f2.png", "f10.png"], [0, 8]),
     "some padding": (["f2.png", "f003.png", "f10.png"], [0, 1, 8]),
     "text after the number": ([f"{k:06d}.rgb.png" for k in (4, 5, 7)], [0, 1, 3]),
@@ -267,3 +271,9 @@ def test_check_and_training_warn_of_times_that_are_guessed(edited):
     assert sum("times from" in line for line in lines) == 1
     assert any(line.startswith(start) for line in lines)
     assert any(line.startswith(start) for line in str(check_capture(root)).splitlines())
+
+
+def test_guessed_times_are_no_warning_for_a_scene_without_motion(edited):
+    root, lines = rename(edited("nerfstudio"), lambda k: "abcdefghijkl"[k]), []
+    check_before_training(load_capture(root), TrainConfig(assume="static"), lines.append)
+    assert not any("times from" in line for line in lines)

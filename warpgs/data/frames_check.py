@@ -18,7 +18,8 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
     yield Finding("note", "counts", f"{len(capture.train)} frames to train on, {len(capture.val)} to evaluate, {shown}")
     times = sorted(capture.cameras[name].time for name in capture.train)
     distinct = len(set(times))
-    yield Finding("warning" if capture.time_source.problem else "note", "time", str(capture.time_source))
+    is_guessed = capture.time_source.problem and capture.assumption != "static"
+    yield Finding("warning" if is_guessed else "note", "time", str(capture.time_source))
     if distinct == 1 and len(times) > 1:
         text = "all training frames have one time: time_id in metadata.json, or what the layout has for it, is wrong"
         if capture.assumption == "static":

@@ -6,6 +6,7 @@ seconds and nanoseconds, with zeros before the latter or without (1305031102_400
 """
 
 import re
+import statistics
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from itertools import pairwise
@@ -20,11 +21,13 @@ EARLIEST = 10**9
 SHORTEST_COUNTED, MIN_COUNTED = SECOND // 10, 6
 """Fractions of seconds count frames if all are shorter than this [ns], or if this many never begin again."""
 
-DATE = re.compile(
-    r"(?<![0-9])(?P<date>[12][0-9]{3}[-_.]?[0-9]{2}[-_.]?[0-9]{2})(?:[ _T.-]|[ _]at[ _])?"
+TIME_OF_DAY = (
     r"(?P<clock>[0-9]{2}[-_.:h]?[0-9]{2}[-_.:m]?[0-9]{2})s?"
     r"(?:(?P<mark>[._,-]?)(?P<part>[0-9]{9}|[0-9]{6}|[0-9]{3}|(?<=\.)[0-9]{1,9}))?(?![0-9])"
 )
+DAY = r"(?P<date>[12][0-9]{3}[-_.]?[0-9]{2}[-_.]?[0-9]{2})(?:[ _T.-]|[ _]at[ _])?"
+DATE, CLOCK = re.compile(rf"(?<![0-9]){DAY}{TIME_OF_DAY}"), re.compile(rf"(?<![0-9]){TIME_OF_DAY}")
+
 EPOCH = re.compile(r"(?<![0-9])(?P<seconds>[1-4][0-9]{9})(?:(?P<mark>[._-]?)(?P<part>[0-9]{1,9}))?(?![0-9])")
 """Seconds since 1970, from 2001 on; what follows may be a fraction of a second or a number."""
 
@@ -50,14 +53,18 @@ def find_stamps(stems: Sequence[str]) -> Iterator[Stamps]:
     Args:
         stems: Names without suffixes.
     """
-    for pattern, seconds_of in ((DATE, _calendar_seconds), (EPOCH, _seconds), (PAIR, _seconds), (DECIMAL, _decimal)):
+    readers = {DATE: _date, EPOCH: _seconds, PAIR: _seconds, DECIMAL: _decimal, CLOCK: _date}
+    for pattern, seconds_of in readers.items():
         matches = [[*pattern.finditer(stem)] for stem in stems]
         counts = {len(found) for found in matches}
         if len(counts) != 1:
             continue
         for k in reversed(range(counts.pop())):  # the last one that differs is that of the frame
-            stamps = _stamps([found[k] for found in matches], seconds_of)
-            if stamps is not None and len(set(stamps.nanoseconds)) > 1:
+            chosen = [found[k] for found in matches]
+            stamps = _stamps(chosen, seconds_of)
+            if stamps is None or len(set(stamps.nanoseconds)) == 1:
+                continue
+            if pattern is not CLOCK or _is_clock([match["clock"] for match in chosen], stamps.nanoseconds):
                 yield stamps
 
 
@@ -70,7 +77,7 @@ def _stamps(matches: Sequence[re.Match[str]], seconds_of: Callable[[re.Match[str
     marks = {match["mark"] for match in matches if match["part"]}
     fractions = _fractions(parts, marks)
     is_given = min(seconds) >= EARLIEST and marks <= {".", ""}
-    if fractions is not None and not is_given and _are_counted(seconds, fractions):
+    if fractions is not None and any(parts) and not is_given and _are_counted(seconds, fractions):
         fractions = None
     if fractions is None and ("" in marks or min(seconds) < EARLIEST):
         return None  # digits of a longer number, or two numbers
@@ -109,8 +116,25 @@ def _fractions(parts: Sequence[str], marks: set[str]) -> list[int] | None:
     return [unit * int(part or 0) for part in parts]
 
 
-def _calendar_seconds(match: re.Match[str]) -> int | None:
-    digits = re.sub(r"[^0-9]", "", match["date"] + match["clock"])
+def _is_clock(texts: Sequence[str], nanoseconds: Sequence[int]) -> bool:
+    """Whether times of day without a date are far more even than the same digits as numbers."""
+    numbers = [SECOND * int(_digits(text)) + time % SECOND for text, time in zip(texts, nanoseconds, strict=True)]
+    return _unevenness(nanoseconds) < 0.5 * _unevenness(numbers)
+
+
+def _unevenness(values: Sequence[int]) -> float:
+    """Standard deviation of the steps between values, over their mean."""
+    steps = [b - a for a, b in pairwise(sorted({*values}))]
+    return statistics.pstdev(steps) / statistics.fmean(steps)
+
+
+def _digits(text: str) -> str:
+    return re.sub(r"[^0-9]", "", text)
+
+
+def _date(match: re.Match[str]) -> int | None:
+    """Seconds to a time of day; of any day if none is given."""
+    digits = _digits(match.groupdict().get("date", "20000101") + match["clock"])
     try:
         moment = datetime.strptime(digits, "%Y%m%d%H%M%S")
     except ValueError:
