@@ -66,6 +66,21 @@ def test_what_the_output_cannot_represent_is_escaped(arguments, shown, monkeypat
     assert shown in written.getvalue()
 
 
+@pytest.mark.parametrize("columns", [60, 80])
+@pytest.mark.parametrize("arguments", [[], ["train"], ["train", "--help-all"], *([name] for name in COMMANDS)])
+def test_help_breaks_between_words_and_fits_the_terminal(arguments, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with contextlib.suppress(SystemExit):
+        main([*arguments, *(["--help"] if len(arguments) == 1 else [])])
+    text = capsys.readouterr().out
+    assert [line for line in text.splitlines() if len(line) > columns] == []
+    monkeypatch.setenv("COLUMNS", "300")
+    with contextlib.suppress(SystemExit):
+        main([*arguments, *(["--help"] if len(arguments) == 1 else [])])
+    words = {word.strip("[]") for word in capsys.readouterr().out.replace("│", " ").split()}
+    assert [word for word in text.replace("│", " ").split() if word.isalpha() and word not in words] == []
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_rewrapped_and_names_what_is_expected(command, capsys):
     text = shown(capsys, command, "--help-all" if command == "train" else "--help")

@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from .command_line.screen import wrapped
 from .command_line.version import version
 from .errors import FAILED, ending_at_once, program, run_command, say, suggestion, visible
 
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     name, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if name in HELP:
-        print(usage())
+        print(wrapped(usage()))
         return 0
     if name == "--version" or rest == ["--version"]:
         print(f"warpgs {version()}")
@@ -108,7 +109,7 @@ def _train(arguments: Sequence[str], prog: str) -> int:
             return training.main(arguments, prog)
     finally:
         if not help_all:
-            print(f"{prog} --help-all shows all options, by group, with the defaults of the preset.")
+            print(wrapped(f"{prog} --help-all shows all options, by group, with the defaults of the preset."))
 
 
 def usage() -> str:
@@ -122,10 +123,11 @@ def usage() -> str:
         commands:
         {commands}
 
-        warpgs COMMAND --help shows the options of a command, warpgs train --help-all
-        all options of train; warpgs --version shows the version.
+        warpgs COMMAND --help shows the options of a command, warpgs train --help-all all of train, warpgs --version
+        the version.
         """
-    return textwrap.dedent(text).format(commands="\n".join(lines)).strip()
+    text = textwrap.dedent(text).replace("--version\n", "--version ")  # the caller wraps it
+    return text.format(commands="\n".join(lines)).strip()
 
 
 def _print_completion(arguments: list[str]) -> int:

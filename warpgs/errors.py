@@ -18,6 +18,7 @@ from types import FrameType
 from typing import ParamSpec
 
 from .command_line import posix
+from .command_line.screen import show_error
 
 P = ParamSpec("P")
 
@@ -49,8 +50,8 @@ _prog: ContextVar[str] = ContextVar("prog", default="warpgs")
 
 
 def say(message: str) -> None:
-    """Writes a line on stderr that begins with the program and its command."""
-    sys.stderr.write(f"{_prog.get()}: {message}\n")
+    """Writes a line on stderr that begins with the program and its command; a terminal may show it as several."""
+    show_error(f"{_prog.get()}: {message}")
 
 
 def run_command(command: Callable[[], object], prog: str = "warpgs", advice: str = ADVICE) -> int:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from warpgs.command_line.screen import show
 from warpgs.errors import ending_at_once
 
 
@@ -47,4 +48,4 @@ class Bench:
         with ending_at_once():
             from .run_bench import run_bench
         for path in run_bench(self):
-            print(f"wrote {path}")
+            show(f"wrote {path}")

@@ -22,6 +22,8 @@ import tyro
 
 from warpgs.errors import not_one_of, suggestion
 
+from .screen import Stream, wrapped
+
 Options = TypeVar("Options")
 
 RunFolder = Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
@@ -85,15 +87,31 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
             # Without the dashes, which would make all short options similar.
             close = suggestion(name[2:], [option[2:] for option in known], "--{}".format)
             raise ValueError(f"there is no option {name}{close or f'; {prog} --help lists all'}")
-    box = io.StringIO()
+    box, text = io.StringIO(), _Like(sys.stdout)
     try:
-        with contextlib.redirect_stderr(box):
+        with contextlib.redirect_stderr(box), contextlib.redirect_stdout(text):
             yield
     except SystemExit as end:
         if end.code:
             raise ValueError(_unboxed(box.getvalue())) from None
+        sys.stdout.write(wrapped(text.getvalue()))  # tyro wraps its boxes, but not what precedes them
         raise
     sys.stderr.write(box.getvalue())
+
+
+class _Like(io.StringIO):
+    """A file in memory that looks like another one to what chooses colours and characters."""
+
+    def __init__(self, other: Stream) -> None:
+        super().__init__()
+        self._other = other
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(self._other, "encoding", None) or "utf-8"
+
+    def isatty(self) -> bool:
+        return self._other.isatty()
 
 
 def _unboxed(text: str) -> str:

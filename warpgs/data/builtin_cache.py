@@ -5,12 +5,12 @@ import hashlib
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from warpgs.command_line.screen import show_error
 from warpgs.files import complete_or_absent
 
 
@@ -22,7 +22,7 @@ def cached(folder: Path, write: Callable[[Path], None], quiet: bool) -> Path:
     """
     if not folder.is_dir():
         if not quiet:
-            sys.stderr.write(f"warpgs: making the built-in capture {folder}, once: this can take a minute\n")
+            show_error(f"warpgs: making the built-in capture {folder}, once: this can take a minute")
         with complete_or_absent(folder, keep_existing=True) as partial:
             write(partial)
     return folder
@@ -56,8 +56,8 @@ def cache_folder(content: str) -> Path:
         return folder
     folder = Path(tempfile.mkdtemp(prefix="warpgs-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    sys.stderr.write(
+    show_error(
         f"warpgs: no cache for {content} ({reason}): they are kept in {folder} until the program ends; "
-        "set XDG_CACHE_HOME to a folder that can be written\n"
+        "set XDG_CACHE_HOME to a folder that can be written"
     )
     return folder

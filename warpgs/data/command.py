@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.command_line.screen import show
 from warpgs.errors import ending_at_once
 
 
@@ -35,7 +36,10 @@ class Check:
         with ending_at_once():
             from .check import check_capture
         report = check_capture(self.capture, self.dataset, self.factor, self.assume)
-        print(json.dumps(report.plain(), indent=2) if self.as_json else report)
+        if self.as_json:
+            print(json.dumps(report.plain(), indent=2))
+        else:
+            show(report)
         if not report.is_fit:
             raise SystemExit(1)
 
@@ -60,5 +64,5 @@ class Import:
     def run(self) -> None:
         with ending_at_once():
             from .import_capture import import_capture
-        log = None if self.quiet else print
+        log = None if self.quiet else show
         import_capture(self.source, self.capture, self.dataset, factor=self.factor, holdout=self.holdout, log=log)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.command_line.screen import show
 from warpgs.config import NetName
 from warpgs.errors import ending_at_once
 
@@ -40,4 +41,4 @@ class Eval:
         weights, capture = (self.lpips, self.lpips_net), None
         if self.data is not None:
             capture = Run.open(self.run_folder, self.device, self.data).open_capture(self.quiet)
-        print(evaluate_run(self.run_folder, capture, weights, self.device, self.quiet, self.as_taken))
+        show(evaluate_run(self.run_folder, capture, weights, self.device, self.quiet, self.as_taken))

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.command_line.screen import show
 from warpgs.errors import ending_at_once
 
 
@@ -52,4 +53,4 @@ class Export:
         """Exports and prints a summary; raises as ``export_run``."""
         with ending_at_once():
             from .export_run import export_run
-        print(export_run(self))
+        show(export_run(self))

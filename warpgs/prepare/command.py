@@ -1,12 +1,12 @@
 """The commands ``warpgs prepare`` and ``warpgs sample``."""
 
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from warpgs.command_line.screen import show
 from warpgs.errors import command, ending_at_once, terminable
 
 from .options import Options
@@ -36,7 +36,7 @@ class Prepare:
     """Print errors only."""
 
     def run(self) -> None:
-        log = None if self.quiet else partial(print, flush=True)
+        log = None if self.quiet else show
         if self.add is not None:
             with ending_at_once():
                 from .add import AddOptions, add_parts
@@ -82,7 +82,7 @@ class Sample:
     def run(self) -> None:
         with ending_at_once():
             from .sample import write_sample  # imports torch and Warp
-        log = None if self.quiet else partial(print, flush=True)
+        log = None if self.quiet else show
         write_sample(self.video, log=log)
         if log is not None:
             log(f"{self.video} is finished: next run {command('prepare', self.video, 'CAPTURE', '--holdout', 8)}")

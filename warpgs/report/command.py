@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.command_line.screen import show
 from warpgs.errors import ending_at_once
 
 
@@ -31,4 +32,4 @@ class Report:
         """Writes the report and prints a summary; raises as ``write_report``."""
         with ending_at_once():
             from .write_report import write_report
-        print(write_report(self))
+        show(write_report(self))

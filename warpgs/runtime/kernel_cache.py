@@ -19,6 +19,7 @@ from typing import IO
 
 import warp as wp
 
+from warpgs.command_line.screen import show_error
 from warpgs.files import read_bounded
 
 SEAL = "warpgs.sha256"
@@ -84,9 +85,9 @@ def _use_temporary_folder(reason: object) -> None:
     folder = tempfile.mkdtemp(prefix="warpgs-kernels-")  # a fixed name might hold kernels of another user
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     wp.config.kernel_cache_dir = folder
-    sys.stderr.write(
+    show_error(
         f"warpgs: no cache for compiled kernels ({reason}): they are compiled at every start; "
-        "set WARP_CACHE_PATH to a folder that can be written\n"
+        "set WARP_CACHE_PATH to a folder that can be written"
     )
 
 
@@ -120,13 +121,11 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
 @functools.cache
 def _announce_compilation() -> None:
     """Says once per process why nothing happens for a while."""
-    sys.stderr.write(
-        f"warpgs: compiling kernels that are not in {wp.config.kernel_cache_dir} yet: this can take a minute\n"
-    )
+    show_error(f"warpgs: compiling kernels that are not in {wp.config.kernel_cache_dir} yet: this can take a minute")
 
 
 def _discard(folder: Path, reason: object) -> None:
-    sys.stderr.write(f"warpgs: warning: the kernel cache is damaged ({reason}): {folder} is compiled again\n")
+    show_error(f"warpgs: warning: the kernel cache is damaged ({reason}): {folder} is compiled again")
     gone = folder.with_name(f"{folder.name}.damaged{os.getpid()}")
     with contextlib.suppress(FileNotFoundError):  # another process was faster
         folder.rename(gone)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.command_line.screen import show
 from warpgs.config import NetName
 from warpgs.errors import ending_at_once, terminable
 
@@ -59,4 +60,4 @@ class Sweep:
         with ending_at_once():
             from .run_sweep import run_sweep
         with terminable():
-            return run_sweep(self, print)
+            return run_sweep(self, print if self.dry_run else show)  # a dry run prints a script

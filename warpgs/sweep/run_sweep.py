@@ -3,13 +3,12 @@
 import dataclasses
 import os
 import shlex
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from warpgs.command_line.screen import show_error
 from warpgs.config.presets import PRESETS
 from warpgs.data.builtin import builtin_folder, is_builtin
 from warpgs.errors import FAILED, not_one_of, one_line
@@ -60,7 +59,7 @@ def run_sweep(options: Sweep, log: Log) -> int:
     spec = _spec(options)
     out = (options.out or Path("runs") / f"sweep-{spec.name}").resolve()
     # The output of a dry run is a script.
-    warn = partial(print, file=sys.stderr) if options.dry_run else log
+    warn = show_error if options.dry_run else log
     overrides, known = _overrides(options), _known_commands(out)
     finished = [command for name, command in known.items() if (out / name / "metrics.json").is_file()]
     scenes = find_scenes(spec.data, warn, trained_captures(finished))

@@ -1,12 +1,12 @@
 """``warpgs train`` and ``python train.py``."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 import tyro
 
 from warpgs.command_line.parsing import ALWAYS, flags, one_line_errors
+from warpgs.command_line.screen import show, show_error
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.errors import ending_at_once, run_command, suggestion
@@ -78,8 +78,8 @@ def run(config: TrainConfig) -> int:
     with ending_at_once():
         from .train import UnfitCaptureError, train  # imports torch, which --help does not need
     try:
-        train(config, log=print)
+        train(config, log=show)
     except UnfitCaptureError as error:
-        print("\n".join(map(str, error.findings)), file=sys.stderr)
+        show_error("\n".join(map(str, error.findings)))
         return UNFIT
     return 0

@@ -16,6 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from torch.utils.tensorboard import summary
 
+from warpgs.command_line.screen import fitted
+
 from .events import Events
 
 NUM_RECENT = 20
@@ -125,7 +127,7 @@ class TrainingLogger:
 
     def log(self, text: str) -> None:
         """Prints a line above the bar."""
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(fitted(text, sys.stdout), highlight=False, markup=False, soft_wrap=True)
 
     def report(self, status: Status) -> None:
         """Shows the status and adds it to the events."""

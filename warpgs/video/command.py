@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.command_line.screen import show
 from warpgs.errors import ending_at_once
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
@@ -64,7 +65,7 @@ class Render:
         """Renders and prints a summary; raises as ``render_run``."""
         with ending_at_once():
             from .render_run import render_run
-        print(render_run(self))
+        show(render_run(self))
 
     @property
     def image_size(self) -> tuple[int, int]:

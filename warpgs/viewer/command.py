@@ -1,14 +1,13 @@
 """``warpgs view``."""
 
-import sys
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, Literal
 
 import tyro
 
 from warpgs.command_line.parsing import RunFolder
 from warpgs.command_line.posix import share_free_memory
+from warpgs.command_line.screen import show, show_error
 from warpgs.errors import ending_at_once
 
 
@@ -35,4 +34,4 @@ class View:
         share_free_memory()  # before there are threads, of which every visit has some of its own
         with ending_at_once():
             from .serve import serve
-        serve(self, report=partial(print, flush=True), warn=partial(print, file=sys.stderr))
+        serve(self, report=show, warn=show_error)
