@@ -62,12 +62,7 @@ def import_capture(
             f"{source} is read as {describe_layout(source, dataset)}: {len(names)} frames, {counts[0]} with masks, "
             f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
         )
-        _log_remarks(capture, log)
-        if renamed:
-            old, new = renamed[0]
-            log(
-                f"note: {len(renamed)} frames have ids that files cannot have everywhere: {old!r} is {new!r} in the copy"
-            )
+        _log_remarks(capture, renamed, log)
         log(f"{target} is finished: next run {command('check', target)}")
 
 
@@ -87,7 +82,10 @@ def _with_plain_ids(capture: Capture) -> tuple[Capture, list[tuple[str, str]]]:
     ), renamed
 
 
-def _log_remarks(capture: Capture, log: Callable[[str], None]) -> None:
+def _log_remarks(capture: Capture, renamed: list[tuple[str, str]], log: Callable[[str], None]) -> None:
+    if renamed:
+        example = "{!r} is {!r} in the copy".format(*renamed[0])
+        log(f"note: {len(renamed)} frames have ids that files cannot have everywhere: {example}")
     for note in (*capture.notes, capture.time_source):
         log(f"note: {note}")
     if capture.assumption == "dynamic":
