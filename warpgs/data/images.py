@@ -1,6 +1,7 @@
 """Reading images, masks and depth; damaged files and files of another size are refused."""
 
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from warpgs.files import read_array, read_bounded
+
+from .exif import EXCHANGES_SIDES, INVERSE, orientation_of, upright
 
 MAX_SIDE = 16_384
 """Maximum side of an image [px]; larger ones are refused before memory is allocated for them."""
@@ -45,6 +48,7 @@ def decode(
     size: tuple[int, int] | None = None,
     what: str = "the image",
     max_pixels: int = MAX_PIXELS,
+    image: Path | None = None,
 ) -> Shaped[np.ndarray, "H W ..."]:
     """The pixels of a PNG or JPEG file in OpenCV's channel order, as stored or converted as OpenCV's ``flags`` request.
 
@@ -57,12 +61,22 @@ def decode(
         size: Expected width and height; another size is refused before memory is allocated for it.
         what: Name of the image in the message about its size.
         max_pixels: Maximum number of pixels if ``size`` is None.
+        image: The image that it belongs to, whose EXIF orientation it may share; see ``turned``.
 
     Raises:
         ValueError: If it is missing, truncated, damaged, too large, of another size, or not a PNG or JPEG image.
     """
-    data, _ = _read_checked(path, size[0] * size[1] if size else max_pixels, size, what)
-    return _decode(path, data, flags)
+    if size is None:
+        return _decode(path, _read_checked(path, max_pixels)[0], flags)
+    data = read_bounded(path, MAX_OVERHEAD + MAX_BYTES_PER_PIXEL * size[0] * size[1])
+    found = _check(path, data, MAX_PIXELS)
+    orientation = orientation_to(path, found, size.__eq__, image)
+    if found != size and orientation == 1:
+        raise ValueError(
+            f"{path}: {what} is {found[0]}×{found[1]}, expected {size[0]}×{size[1]}, the image_size of its camera"
+            f"{exchanged_sides(path, found, size.__eq__)}"
+        )
+    return upright(_decode(path, data, flags), orientation)
 
 
 def decode_bytes(path: Path, data: bytes) -> Shaped[np.ndarray, "H W ..."]:
@@ -102,17 +116,57 @@ def is_transparent(path: Path) -> bool:
     return bool(stored.ndim == 3 and stored.shape[2] == 4 and stored[..., 3].min() < np.iinfo(stored.dtype).max)
 
 
-def _read_checked(
-    path: Path, max_pixels: int, size: tuple[int, int] | None = None, what: str = ""
-) -> tuple[bytes, tuple[int, int]]:
+Fits = Callable[[tuple[int, int]], bool]
+"""Whether a (width, height) fits."""
+
+
+def orientation_to(path: Path, stored: tuple[int, int], fits: Fits, image: Path | None = None) -> int:
+    """The EXIF orientation with which a file fits that does not fit as stored; 1 if there is none.
+
+    Args:
+        path: The file.
+        stored: Its (width, height).
+        fits: Whether a size is that of the camera.
+        image: The image that the file belongs to: a mask without an orientation of its own may have been made of the
+            stored pixels while the camera is that of the upright image, or the reverse.
+    """
+    if fits(stored) or not fits(stored[::-1]):
+        return 1
+    orientation = orientation_of(path)
+    if orientation < EXCHANGES_SIDES and image is not None:
+        orientation = orientation_of(image)
+        if orientation >= EXCHANGES_SIDES and fits(image_size(image)):
+            orientation = INVERSE.get(orientation, orientation)
+    return orientation if orientation >= EXCHANGES_SIDES else 1
+
+
+def turned(
+    path: Path, pixels: Shaped[np.ndarray, "h w ..."], fits: Fits, image: Path | None = None
+) -> Shaped[np.ndarray, "H W ..."]:
+    """The pixels of a file, turned as ``orientation_to`` says if they do not fit as stored."""
+    return upright(pixels, orientation_to(path, (pixels.shape[1], pixels.shape[0]), fits, image))
+
+
+def exchanged_sides(path: Path, stored: tuple[int, int], fits: Fits) -> str:
+    """The end of a message about a size that does not fit: how the file is shown, and whether turning it helps."""
+    orientation = orientation_of(path)
+    shown = f"; its EXIF orientation is {orientation}" if orientation > 1 else ""
+    return f"{shown}; its sides are exchanged: rotate its pixels by 90°" if fits(stored[::-1]) else shown
+
+
+def has_shape(stored: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether a (width, height) is a multiple of ``size``, apart from rounding to whole pixels."""
+    (width, height), total = stored, sum(stored) + sum(size)
+    return min(stored) > 0 and abs(width * size[1] - height * size[0]) <= 0.5 * total
+
+
+def _read_checked(path: Path, max_pixels: int) -> tuple[bytes, tuple[int, int]]:
     """The content of an image file, and its width and height."""
     data = read_bounded(path, MAX_OVERHEAD + MAX_BYTES_PER_PIXEL * max_pixels)
-    return data, _check(path, data, max_pixels, size, what)
+    return data, _check(path, data, max_pixels)
 
 
-def _check(
-    path: Path, data: bytes, max_pixels: int, size: tuple[int, int] | None = None, what: str = ""
-) -> tuple[int, int]:
+def _check(path: Path, data: bytes, max_pixels: int) -> tuple[int, int]:
     """Width and height of the content of an image file."""
     if data.startswith(_PNG):
         width, height = _check_png(path, data)
@@ -122,10 +176,6 @@ def _check(
         raise ValueError(f"{path} is not a PNG or JPEG image")
     if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
         raise ValueError(f"{path} claims {width}×{height} pixels, expected 1 to {MAX_SIDE} per side")
-    if size is not None and (width, height) != size:
-        raise ValueError(
-            f"{path}: {what} is {width}×{height}, expected {size[0]}×{size[1]}, the image_size of its camera"
-        )
     if width * height > max_pixels:
         raise ValueError(f"{path} claims {width}×{height} pixels, expected at most {max_pixels:,} together")
     return width, height
@@ -209,15 +259,16 @@ def fill_transparent(stored: UInt8[np.ndarray, "H W ..."]) -> UInt8[np.ndarray, 
     return image
 
 
-def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def read_mask(path: Path, size: tuple[int, int], image: Path | None = None) -> Bool[np.ndarray, "H W"]:
     """True where a mask file is brighter than half of its type's range, of ``size`` (width, height).
 
-    Masks of 0 and 1 instead of 0 and 255, and 16-bit masks of 0 and 255, are read correctly too.
+    Masks of 0 and 1 instead of 0 and 255, and 16-bit masks of 0 and 255, are read correctly too. ``image`` is the image
+    that it belongs to; see ``turned``.
 
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    return is_bright(decode(path, size=size, what="the mask"))
+    return is_bright(decode(path, size=size, what="the mask", image=image))
 
 
 def is_bright(stored: Shaped[np.ndarray, "H W ..."]) -> Bool[np.ndarray, "H W"]:
@@ -233,19 +284,20 @@ def max_depth_pixels(size: tuple[int, int]) -> int:
     return max(MIN_MAX_DEPTH_PIXELS, min(MAX_PIXELS, MAX_DEPTH_FACTOR**2 * size[0] * size[1]))
 
 
-def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
+def read_depth(path: Path, size: tuple[int, int], image: Path | None = None) -> Float[np.ndarray, "H W"]:
     """An 8- or 16-bit image, scaled to [0, 1], or a .npy file, resized to ``size`` (width, height).
 
     Networks often predict depth at a lower resolution than the image. Values that are not finite become NaN. In .npy
     files NaN and 0 mark unknown pixels; arrays that have any are resized without interpolation. Depth may have 8 times
-    the sides of the image, or 16 million pixels if that is more.
+    the sides of the image, or 16 million pixels if that is more. ``image`` is the image that it belongs to; see
+    ``turned``.
 
     Raises:
         ValueError: If the file is missing or damaged, or does not hold an [H, W] array.
     """
     values: np.ndarray
     max_pixels = max_depth_pixels(size)
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         values = read_array(path, max_pixels).astype(np.float32)
         values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
         has_unknown = bool((~np.isfinite(values) | (values == 0)).any())
@@ -255,6 +307,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
         has_unknown = False
     if values.ndim != 2 or not 0 < min(values.shape) <= max(values.shape) <= MAX_SIDE:
         raise ValueError(f"{path}: depth must be one channel, [H, W], got shape {list(values.shape)}")
+    values = turned(path, values, lambda stored: has_shape(stored, size), image)
     values[~np.isfinite(values)] = np.nan
     if values.shape[1::-1] == size:
         return values

@@ -6,14 +6,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.files import read_array
 
 from .capture import Capture, Frame
-from .images import MAX_PIXELS, decode, fill_transparent, is_bright, to_8_bits
+from .images import (
+    MAX_PIXELS,
+    decode,
+    exchanged_sides,
+    fill_transparent,
+    has_shape,
+    is_bright,
+    to_8_bits,
+    turned,
+)
 
 WHITE = 255
 
@@ -49,40 +58,40 @@ def read_resized_over_white(
 
 def _read(path: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "h w ..."]:
     """The stored image with 8 bits per channel, in OpenCV's order, if it has the shape of ``size``."""
-    stored = to_8_bits(decode(path))
-    check_shape(path, "the image", (stored.shape[1], stored.shape[0]), size)
-    return stored
+    return _fitting(path, "the image", to_8_bits(decode(path)), size)
 
 
-def read_resized_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def read_resized_mask(path: Path, size: tuple[int, int], image: Path | None = None) -> Bool[np.ndarray, "H W"]:
     """True where a mask file is bright, resized to ``size`` (width, height).
 
-    Masks of 0 and 1, 0 and 255, or 0 and 65535. A pixel of a reduced mask is dark if any part of it is.
+    Masks of 0 and 1, 0 and 255, or 0 and 65535. A pixel of a reduced mask is dark if any part of it is. ``image`` is
+    the image that it belongs to, whose EXIF orientation it may share.
 
     Raises:
         ValueError: If the file is missing, damaged or of another shape.
     """
-    stored = decode(path)
-    check_shape(path, "the mask", (stored.shape[1], stored.shape[0]), size)
-    return resize_mask(is_bright(stored), size)
+    return resize_mask(is_bright(_fitting(path, "the mask", decode(path), size, image)), size)
 
 
-def read_metric_depth(path: Path, size: tuple[int, int], unit: float) -> Float[np.ndarray, "H W"]:
+def read_metric_depth(
+    path: Path, size: tuple[int, int], unit: float, image: Path | None = None
+) -> Float[np.ndarray, "H W"]:
     """Inverse depth of a file of depth along the camera's z axis, resized to ``size``; NaN where unknown.
 
     Args:
         path: A PNG file of 8 or 16 bits, or a .npy file.
         size: Width and height of the result.
         unit: World units per unit of the file.
+        image: The image that it belongs to, whose EXIF orientation it may share.
 
     Raises:
         ValueError: If the file is missing, damaged or of another shape.
     """
-    stored = read_array(path, MAX_PIXELS) if path.suffix == ".npy" else decode(path)
+    stored = read_array(path, MAX_PIXELS) if path.suffix.lower() == ".npy" else decode(path)
     stored = stored[..., 0] if stored.ndim == 3 and stored.shape[2] == 1 else stored
     if stored.ndim != 2:
         raise ValueError(f"{path}: depth must be one channel, [H, W], got shape {list(stored.shape)}")
-    check_shape(path, "the depth", (stored.shape[1], stored.shape[0]), size)
+    stored = _fitting(path, "the depth", stored, size, image)
     return inverse_of(stored.astype(np.float32) * np.float32(unit), size)
 
 
@@ -144,6 +153,17 @@ def check_shape(path: Path, what: str, stored: tuple[int, int], size: tuple[int,
     Raises:
         ValueError: If it is not; the message names the file.
     """
-    width, height = stored
-    if min(stored) == 0 or abs(width * size[1] - height * size[0]) > 0.5 * (width + height + sum(size)):
-        raise ValueError(f"{path}: {what} is {width}×{height}, which has not the shape of {size[0]}×{size[1]}")
+    if not has_shape(stored, size):
+        raise ValueError(
+            f"{path}: {what} is {stored[0]}×{stored[1]}, which has not the shape of {size[0]}×{size[1]}"
+            f"{exchanged_sides(path, stored, lambda other: has_shape(other, size))}"
+        )
+
+
+def _fitting(
+    path: Path, what: str, stored: np.ndarray, size: tuple[int, int], image: Path | None = None
+) -> Shaped[np.ndarray, "h w ..."]:
+    """Stored pixels with the shape of ``size``, turned if their EXIF orientation, or that of their image, says so."""
+    pixels = turned(path, stored, lambda other: has_shape(other, size), image)
+    check_shape(path, what, (pixels.shape[1], pixels.shape[0]), size)
+    return pixels

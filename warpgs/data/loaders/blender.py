@@ -17,6 +17,7 @@ from .left_out import images_left_out
 from .options import LoadOptions
 from .posed import PosedFrame, World, plain_names, posed_capture
 from .transforms import Transforms
+from .turned import turning_notes
 
 TRAIN, TEST, VAL = "transforms_train.json", "transforms_test.json", "transforms_val.json"
 
@@ -48,6 +49,7 @@ class BlenderLoader:
         masked = any(frame.static_mask is not None for frame in train)
         images = [[index.image(entry) for entry in index.frames] for index in indices]
         is_white = any(map(_is_transparent, images[0]))
+        sizes = [(frame.lens.width, frame.lens.height) for frame in frames]
         listed = f"not listed in {' or '.join(index.path.name for index in indices)}"
         world = World(
             np.zeros((0, 3)),
@@ -56,7 +58,11 @@ class BlenderLoader:
             time_source=_time_source(indices, frames),
             own_times=True,
             background="white" if is_white else "black",
-            notes=(*chain(*(index.notes for index in indices)), *images_left_out(root, chain(*images), listed)),
+            notes=[
+                *chain(*(index.notes for index in indices)),
+                *turning_notes([*chain(*images)], sizes),
+                *images_left_out(root, chain(*images), listed),
+            ],
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)
 
@@ -110,8 +116,8 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
                 transforms.pose(entry),
                 float(time),
                 partial(read_resized_over_white, image),
-                None if mask is None else partial(read_resized_mask, mask),
-                None if depth is None else partial(read_metric_depth, depth, unit=1.0),
+                None if mask is None else partial(read_resized_mask, mask, image=image),
+                None if depth is None else partial(read_metric_depth, depth, unit=1.0, image=image),
             )
         )
     return frames

@@ -21,6 +21,7 @@ from .posed import (
     plain_names,
     posed_capture,
 )
+from .turned import turning_notes
 
 MASKS, DEPTHS = "masks", "depths"
 """Folders of the static masks (white = static) and of inverse depth up to scale and offset."""
@@ -50,6 +51,7 @@ class ColmapLoader:
             notes += _unused(root, found.part)
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
         reason = f"the model in {found.shown(root)} has no pose for them"
+        notes += turning_notes(files.used, [(image.lens.width, image.lens.height) for image in images])
         notes += [*files.images.notes, *images_left_out(root, files.used, reason, files.folder)]
         world = World(model.points, model.colors, time_source=source, notes=notes)
         return posed_capture(root, frames, every_eighth(names), world, options)
@@ -84,8 +86,8 @@ class _Files:
             image.pose,
             time,
             partial(read_resized_image, path),
-            None if mask is None else partial(read_resized_mask, mask),
-            None if depth is None else partial(read_depth, depth),
+            None if mask is None else partial(read_resized_mask, mask, image=path),
+            None if depth is None else partial(read_depth, depth, image=path),
         )
 
 

@@ -47,12 +47,14 @@ class IPhoneLoader(NerfiesLoader):
 
     def has_metric_depth(self, paths: Iterable[Path]) -> bool:
         """Whether all depth is that of the sensor (.npy), which has the units of the cameras."""
-        return all(path.suffix == ".npy" for path in paths)
+        return all(path.suffix.lower() == ".npy" for path in paths)
 
-    def inverse_depth(self, path: Path, size: tuple[int, int], units: SceneUnits) -> Float[np.ndarray, "H W"]:
+    def inverse_depth(
+        self, path: Path, size: tuple[int, int], units: SceneUnits, image: Path
+    ) -> Float[np.ndarray, "H W"]:
         """Inverse of the sensor's z-depth (.npy), 0 = unknown [1 / scene units]; images hold inverse depth already."""
-        values = images.read_depth(path, size)
-        if path.suffix != ".npy":
+        values = images.read_depth(path, size, image)
+        if path.suffix.lower() != ".npy":
             return values
         known = (values > 0) & (values != CLAMPED_DEPTH)
         metres = np.where(known, values, np.float32(np.nan))

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from warpgs.data.capture import Capture, Conventions
 from warpgs.data.colmap import load_model
 from warpgs.data.colmap_folders import ModelFolder, find_models
-from warpgs.data.images import image_size, read_depth
+from warpgs.data.images import exchanged_sides, image_size, orientation_to, read_depth
 from warpgs.data.lens import Lens
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.data.time_source import TimeSource
@@ -28,6 +28,7 @@ from .listed import find_file
 from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
 from .posed import PosedFrame, World, every_eighth, plain_names, posed_capture, world_to_camera
+from .turned import turning_notes
 
 INDEX = "poses_bounds.npy"
 
@@ -61,7 +62,7 @@ class LlffLoader:
         lenses = [_lens(root, path, size) for path, size in zip(paths, sizes, strict=True)]
         names = plain_names([path.name for path in paths])
         frames = [
-            PosedFrame(name, lens, pose, float(k), partial(read_resized_image, path), *_mask_and_depth(root, path.stem))
+            PosedFrame(name, lens, pose, float(k), partial(read_resized_image, path), *_mask_and_depth(root, path))
             for k, (name, path, lens, pose) in enumerate(zip(names, paths, lenses, poses, strict=True))
         ]
         others = list(_other_cameras(root, frames))
@@ -69,7 +70,8 @@ class LlffLoader:
         options = replace(options, factor=1)  # that of the folder
         source = TimeSource(f"times from the order of the images, one for each pose of {INDEX}")
         world = _world(root, poses, bounds)
-        world = replace(world, time_source=source, notes=(*world.notes, *notes))
+        turned = turning_notes(paths, [(lens.width, lens.height) for lens in lenses])
+        world = replace(world, time_source=source, notes=(*world.notes, *notes, *turned))
         return posed_capture(root, [*frames, *others], frozenset(val), world, options)
 
 
@@ -125,10 +127,16 @@ def _images(folder: Path) -> list[Path]:
 
 def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
     """The lens of an image that may have been reduced since its pose was written."""
-    width, height = image_size(path)
+    stored = image_size(path)
     full_height, full_width, focal = size.tolist()
-    if abs(width * full_height - height * full_width) > 0.01 * width * full_height:
-        raise ValueError(f"{path} is {width}×{height}, which has not the shape of {full_width:g}×{full_height:g}")
+
+    def fits(size: tuple[int, int]) -> bool:
+        return bool(abs(size[0] * full_height - size[1] * full_width) <= 0.01 * size[0] * full_height)
+
+    width, height = stored if orientation_to(path, stored, fits) == 1 else stored[::-1]
+    if not fits((width, height)):
+        shape = f"which has not the shape of {full_width:g}×{full_height:g}{exchanged_sides(path, stored, fits)}"
+        raise ValueError(f"{path} is {width}×{height}, {shape}")
     scale = focal / full_width * width
     try:
         return Lens(width, height, (scale, scale), (width / 2, height / 2)).checked()
@@ -136,18 +144,18 @@ def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
         raise ValueError(f"{root / INDEX}: {error}") from error
 
 
-def _mask_and_depth(root: Path, name: str) -> tuple[partial | None, partial | None]:
-    mask = find_file(root / MASKS, f"{name}.png")
-    depth = find_file(root / DEPTHS, f"{name}.npy")
+def _mask_and_depth(root: Path, image: Path) -> tuple[partial | None, partial | None]:
+    mask = find_file(root / MASKS, f"{image.stem}.png")
+    depth = find_file(root / DEPTHS, f"{image.stem}.npy")
     return (
-        None if mask is None else partial(_read_static, mask),
-        None if depth is None else partial(read_depth, depth),
+        None if mask is None else partial(_read_static, mask, image=image),
+        None if depth is None else partial(read_depth, depth, image=image),
     )
 
 
-def _read_static(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def _read_static(path: Path, size: tuple[int, int], image: Path) -> Bool[np.ndarray, "H W"]:
     """The static mask of a file of NSFF, in which dynamic pixels are white."""
-    return ~read_resized_mask(path, size)
+    return ~read_resized_mask(path, size, image)
 
 
 def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
@@ -164,7 +172,7 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
         mask = find_file(root / EVALUATION_MASKS / path.parent.name, f"{path.stem}.png")
         source = frames[camera]
         name = f"{path.parent.name}_{path.stem}"
-        read_mask = None if mask is None else partial(_read_static, mask)
+        read_mask = None if mask is None else partial(_read_static, mask, image=path)
         found.append(
             PosedFrame(name, source.lens, source.pose, float(time), partial(read_resized_image, path), read_mask)
         )

@@ -33,6 +33,7 @@ from warpgs.files import read_json
 from .left_out import images_left_out
 from .listed import ListedFiles, find_file
 from .options import LoadOptions
+from .turned import turning_notes
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
 
@@ -63,9 +64,14 @@ class NerfiesLoader(ABC):
         path = root / "dataset.json"
         return Split(path, read_ids(path, dataset, "train_ids"), read_ids(path, dataset, "val_ids"))
 
-    def inverse_depth(self, path: Path, size: tuple[int, int], units: SceneUnits) -> Float[np.ndarray, "H W"]:
-        """Inverse depth of a file, resized to ``size`` (width, height); here the files hold inverse depth already."""
-        return images.read_depth(path, size)
+    def inverse_depth(
+        self, path: Path, size: tuple[int, int], units: SceneUnits, image: Path
+    ) -> Float[np.ndarray, "H W"]:
+        """Inverse depth of a file that belongs to an image, resized to ``size`` (width, height).
+
+        Here the files hold inverse depth already.
+        """
+        return images.read_depth(path, size, image)
 
     def has_metric_depth(self, paths: Iterable[Path]) -> bool:
         """Whether the inverse depth of files has scene units and no offset."""
@@ -86,8 +92,8 @@ class NerfiesLoader(ABC):
             cameras[name], lenses[name] = read_camera(path, units, factor, time, options.lens)
         points, colors = read_points(root, units)
 
-        def read_depth(path: Path, size: tuple[int, int]) -> np.ndarray:
-            return self.inverse_depth(path, size, units)
+        def read_depth(path: Path, size: tuple[int, int], image: Path) -> np.ndarray:
+            return self.inverse_depth(path, size, units, image)
 
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
         depths = [files[name].depth for name in split.train]
@@ -105,7 +111,10 @@ class NerfiesLoader(ABC):
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             read_taken=taken_reader(reader.read_with, lenses),
             time_source=time_source,
-            notes=images_left_out(root, (file.image for file in files.values()), listed),
+            notes=[
+                *turning_notes([files[name].image for name in cameras], [camera.size for camera in cameras.values()]),
+                *images_left_out(root, (file.image for file in files.values()), listed),
+            ],
         )
 
 
@@ -226,7 +235,7 @@ class _FrameReader:
         cameras, lenses, files: Of each frame.
         train: Frames whose masks are perturbed.
         perturbation: Perturbation of their masks.
-        read_depth: Reads inverse depth of a size (width, height).
+        read_depth: Reads the inverse depth of an image in a size (width, height).
     """
 
     cameras: dict[str, Camera]
@@ -234,7 +243,7 @@ class _FrameReader:
     files: dict[str, _FrameFiles]
     train: frozenset[str]
     perturbation: MaskPerturbation
-    read_depth: Callable[[Path, tuple[int, int]], np.ndarray]
+    read_depth: Callable[[Path, tuple[int, int], Path], np.ndarray]
 
     def read(self, name: str) -> Frame:
         return self.read_with(name, self.lenses[name])
@@ -243,8 +252,8 @@ class _FrameReader:
         """The frame, undistorted as for a lens."""
         files, size = self.files[name], self.cameras[name].size
 
-        def optional(read: Callable[[Path, tuple[int, int]], np.ndarray], path: Path | None) -> np.ndarray | None:
-            return None if path is None else undistort(read(path, size), lens)
+        def optional(read: Callable[[Path, tuple[int, int], Path], np.ndarray], path: Path | None) -> np.ndarray | None:
+            return None if path is None else undistort(read(path, size, files.image), lens)
 
         mask = optional(images.read_mask, files.mask)
         if mask is not None and name in self.train:

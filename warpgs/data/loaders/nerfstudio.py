@@ -25,6 +25,7 @@ from .posed import (
     posed_capture,
 )
 from .transforms import Transforms
+from .turned import turning_notes
 
 INDEX = "transforms.json"
 
@@ -57,17 +58,18 @@ class NerfstudioLoader:
                     transforms.pose(entry),
                     time,
                     partial(read_resized_image, image),
-                    None if mask is None else partial(read_resized_mask, mask),
-                    None if depth is None else partial(read_metric_depth, depth, unit=unit),
+                    None if mask is None else partial(read_resized_mask, mask, image=image),
+                    None if depth is None else partial(read_metric_depth, depth, unit=unit, image=image),
                 )
             )
         by_image = {image.resolve(): name for image, name in zip(images, names, strict=True)}
         val, ignored = _evaluated(transforms, by_image)
         kept = [frame for frame in frames if frame.name not in ignored]
-        notes = images_left_out(root, images, f"not listed in {INDEX}")
+        notes = turning_notes(images, [(frame.lens.width, frame.lens.height) for frame in frames])
+        notes += images_left_out(root, images, f"not listed in {INDEX}")
         if ignored:
             lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
-            notes += (f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}",)
+            notes.append(f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}")
         world = replace(_world(transforms), time_source=source, notes=(*transforms.notes, *notes))
         return posed_capture(root, kept, val, world, options)
 

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from warpgs.data.images import image_size
+from warpgs.data.exif import EXCHANGES_SIDES, orientation_of
+from warpgs.data.images import image_size, orientation_to
 from warpgs.data.lens import Lens, unsupported_model
 from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
@@ -24,6 +25,7 @@ from warpgs.files import read_json, read_numbers
 from .listed import ListedFiles
 from .matrices import scale_note, scale_of_rotations, with_intrinsics, without_scale
 from .posed import opencv_from_opengl, world_to_camera
+from .turned import unclear_note
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 """Values of ``camera_model`` of a perspective lens; the other one that is read is ``FISHEYE``."""
@@ -44,6 +46,9 @@ MAX_TIME = 1e19
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """Suffixes that ``file_path`` may lack."""
+
+MAX_OFF_CENTER = 0.1
+"""Maximum distance of a principal point from the middle, over the side of the image, to tell how that is turned."""
 
 IMAGES = ("file_path", "mask_path")
 """Fields whose files may have been converted to another image format."""
@@ -69,6 +74,7 @@ class Transforms:
         self.path, self._undistort = path, undistort
         self.fields = with_intrinsics(path, read_json(path))
         self._files = ListedFiles(path.parent, path.name)
+        self._unclear: list[Path] = []
         frames = self.fields.get("frames")
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
@@ -99,7 +105,8 @@ class Transforms:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was interpreted in the file so far."""
-        return (*self._files.notes, *scale_note(self.path.name, self._scale))
+        unclear = (unclear_note(image) for image in self._unclear[:1])
+        return (*self._files.notes, *scale_note(self.path.name, self._scale), *unclear)
 
     def image(self, frame: dict[str, Any]) -> Path:
         """The image of a frame; raises as ``file``."""
@@ -169,7 +176,7 @@ class Transforms:
         if "w" in self._given(frame) and "h" in self._given(frame):
             width, height = (round(self._number(frame, key)) for key in ("w", "h"))
         else:
-            width, height = image_size(image)
+            width, height = self._size(frame, image)
         if (focal := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
             found = ", ".join(sorted(map(visible, frame)))
             raise ValueError(f"{self.path} has no fl_x or camera_angle_x, nor a matrix K; a frame has {found:.200}")
@@ -185,6 +192,20 @@ class Transforms:
             return lens.checked(self._undistort)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
+
+    def _size(self, frame: dict[str, Any], image: Path) -> tuple[int, int]:
+        """The size of an image where a frame does not give it: upright if only then the principal point is central."""
+        stored = image_size(image)
+        if not {"cx", "cy"} <= self._given(frame).keys() and orientation_of(image) >= EXCHANGES_SIDES:
+            self._unclear.append(image)
+        center = np.array(
+            [self._number(frame, key, 0.5 * side) for key, side in zip(("cx", "cy"), stored, strict=True)]
+        )
+
+        def fits(size: tuple[int, int]) -> bool:
+            return bool((np.abs(center / size - 0.5) < MAX_OFF_CENTER).all())
+
+        return stored if orientation_to(image, stored, fits) == 1 else stored[::-1]
 
     def _focal(self, frame: dict[str, Any], key: str, angle_key: str, side: int) -> float | None:
         given = self._given(frame)
