@@ -75,7 +75,7 @@ def allowed_origins(texts: Iterable[str]) -> set[Origin]:
     Raises:
         ValueError: If a text is neither.
     """
-    allowed = set()
+    allowed: set[Origin] = set()
     for text in texts:
         try:
             addresses = [text] if "://" in text else [f"{scheme}://{text}" for scheme in PORTS]
