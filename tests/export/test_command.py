@@ -28,6 +28,7 @@ from warpgs.runs import run as runs
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.video import camera_paths
+from warpgs.video.filmed import position_and_axis
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -150,12 +151,23 @@ def test_max_gaussians_limits_the_number_of_gaussians(run, tmp_path):
     assert len(read_standard(tmp_path / "out" / "scene.ply")) == 12
 
 
-def test_a_page_starts_at_the_middle_view_and_follows_the_training_cameras(run, data):
+def test_a_page_follows_the_training_cameras(run, data):
     capture = Run.open(run, "cpu").open_capture(quiet=True)
     start = start_view(clouds_of(run), capture, keys=4, seconds=2.0)
-    assert start.viewmat == capture.cameras[capture.val[len(capture.val) // 2]].viewmat.tolist()
-    assert len(start.track) == 4
+    path = camera_paths.training_path(capture, 4)
+    assert start.track == [camera.viewmat.tolist() for camera in path]
+    assert start.viewmat == path[2].viewmat.tolist()
+    assert start.intrinsics[0] == float(path[2].K[0, 0])
     assert start.title == "the run"
+    assert all(start.filmed.outside(*position_and_axis(camera)) < 1 for camera in path)
+
+
+def test_a_page_of_training_cameras_that_jump_starts_at_the_middle_view(run, data, monkeypatch):
+    capture = Run.open(run, "cpu").open_capture(quiet=True)
+    monkeypatch.setattr(camera_paths, "jumps", lambda _: True)
+    start = start_view(clouds_of(run), capture, keys=4, seconds=2.0)
+    assert start.viewmat == capture.cameras[capture.val[len(capture.val) // 2]].viewmat.tolist()
+    assert start.track == []
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -18,17 +19,23 @@ from warpgs.export.page import write_page
 from warpgs.export.start_camera import StartView
 from warpgs.model.gaussians import SH_C0
 from warpgs.video.camera_paths import evenly_spaced
+from warpgs.video.filmed import DRAG_LIMIT, Filmed
 
 KEYS = 9
 BRANCHES = (slice(0, 40), slice(40, 60))
 """Rows of static and dynamic Gaussians."""
 
 
-def start(title="scene", track=False):
+FILMED = Filmed(np.array([[0.0, 0.0, -3.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([3.0]), np.array([0.4]))
+"""By one camera that looks at the origin."""
+
+
+def start(title="scene", track=False, filmed=None):
     camera = scenes.camera()
     K, view = camera.K, camera.viewmat.tolist()
     intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    return StartView(title, camera.size, intrinsics, view, 3.0, [view, view] if track else [], 4.0, False, 0.999)
+    tracks = [view, view] if track else []
+    return StartView(title, camera.size, intrinsics, view, 3.0, tracks, 4.0, False, 0.999, filmed=filmed)
 
 
 @pytest.fixture(scope="module")
@@ -217,6 +224,47 @@ def test_the_player_restores_the_same_values(tmp_path, static, dynamic, keys):
         for part in PARTS:
             values = getattr(getattr(baked, name), part).values.transpose(0, 2, 1).reshape(-1)
             assert np.allclose(printed[f"{name}-{part}"], values, rtol=1e-6, atol=1e-6 * np.abs(values).max(initial=0))
+
+
+DRAGS = """
+import {readFileSync} from 'fs';
+const {filmed} = JSON.parse(readFileSync(process.argv[2], 'utf8').match(/id="scene">([^<]*)</)[1]);
+const views = JSON.parse(process.argv[3]), result = {outside: [], dragged: {}};
+for (const [position, forward] of views) result.outside.push(outsideOf(filmed, {rotation: [0, 0, forward], position}));
+const moves = {rotate: [0.05, 0.01], pan: [0.05, 0.02], zoom: [0.1], nearer: [-0.1]};
+for (const [name, step] of Object.entries(moves)) {
+  const orbit = new Orbit({rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], position: [0, 0, -3]}, 3);
+  const move = (x, y) => step.length === 1 ? orbit.zoom(Math.exp(x)) : orbit[name](x, y);
+  for (let k = 0; k < 200; k++) orbit.within(filmed, move, ...step);
+  result.dragged[name] = outsideOf(filmed, orbit.camera);
+}
+console.log(JSON.stringify(result));
+"""
+
+
+@pytest.fixture(scope="module")
+def dragged(tmp_path_factory, baked):
+    """How far views are outside for the player, and how far the mouse can move a view."""
+    folder = tmp_path_factory.mktemp("drags")
+    write_page(folder / "scene.html", baked, start(filmed=FILMED))
+    camera = (resources.files("warpgs.export") / "player" / "camera.js").read_text()
+    return json.loads(node.run(folder, camera + DRAGS, folder / "scene.html", json.dumps(VIEWS)))
+
+
+VIEWS = [[[0, 0, -3], [0, 0, 1]], [[0.5, 0.2, -2], [0, 0, 1]], [[0, 0, -3], [0.6, 0, 0.8]], [[1, 1, 1], [0, -1, 0]]]
+"""Positions and forward axes."""
+
+
+@pytest.mark.skipif(node.NODE is None, reason="the test needs node")
+def test_the_player_decides_what_was_filmed_as_python_does(dragged):
+    expected = [FILMED.outside(np.array(position, float), np.array(forward, float)) for position, forward in VIEWS]
+    assert dragged["outside"] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.skipif(node.NODE is None, reason="the test needs node")
+@pytest.mark.parametrize("move", ["rotate", "pan", "zoom", "nearer"])
+def test_the_mouse_cannot_leave_the_region_around_what_was_filmed(dragged, move):
+    assert 0.8 * DRAG_LIMIT < dragged["dragged"][move] <= DRAG_LIMIT
 
 
 @pytest.fixture(scope="module")

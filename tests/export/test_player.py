@@ -9,19 +9,22 @@ import torch
 
 from tests.export import scenes
 from tests.export.browser import Browser, executable
-from tests.export.test_page import start
+from tests.export.test_page import FILMED, start
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.export.baking import bake
 from warpgs.export.page import write_page
 from warpgs.rendering import render
 from warpgs.video.camera_paths import evenly_spaced
+from warpgs.video.filmed import DRAG_LIMIT
 from warpgs.visualize.images import to_bytes
 
 pytestmark = pytest.mark.skipif(executable() is None, reason="the test needs Chromium")
 
 SIZE = (320, 240)  # five times the image size of the page's intrinsics
 SETTLED = "document.body?.dataset.state === 'settled'"
+FOLLOWS = "document.getElementById('follow').checked"
+NOTED = "!document.getElementById('outside').hidden"
 ENDED = "['settled', 'failed'].includes(document.body?.dataset.state)"
 
 
@@ -91,18 +94,46 @@ def test_the_page_requests_nothing_and_reports_no_errors(browser, page):
 
 def test_moving_the_camera_changes_the_image_and_reset_restores_it(browser, page):
     first = shown(browser, page, "time=0.5")
-    for move in ("orbit.rotate(0.4, 0.2)", "orbit.pan(0.1, 0)", "orbit.zoom(0.7)"):
-        browser.value(f"delete document.body.dataset.state, {move}, update()")
+    for move in ("rotate(0.4, 0.2)", "pan(0.1, 0)", "zoom(0.7)"):
+        browser.value(f"delete document.body.dataset.state, {move}")
         browser.until(SETTLED)
         assert psnr(browser.screenshot(), first) < 35
+        assert not browser.value(FOLLOWS)
         browser.value("delete document.body.dataset.state, home()")
         browser.until(SETTLED)
         assert (browser.screenshot() == first).all()
+        assert browser.value(FOLLOWS)
+
+
+def test_the_page_plays_along_the_training_cameras(browser, baked, tmp_path):
+    first = start().viewmat
+    last = [[*row[:3], row[3] - 1.0] if k == 0 else row for k, row in enumerate(first)]  # one unit to the right
+    write_page(tmp_path / "moving.html", baked, dataclasses.replace(start(), track=[first, last]))
+    shown(browser, tmp_path / "moving.html", "time=0")
+    before = np.array(browser.value("orbit.camera.position"))
+    browser.value("toggle()")
+    browser.until("state.time > 0.2")
+    browser.value("toggle()")
+    time, position = browser.value("[state.time, currentCamera().position]")
+    assert position - before == pytest.approx([time, 0.0, 0.0], abs=1e-4)
+    shown(browser, tmp_path / "moving.html", "time=1&follow=0")
+    assert browser.value("orbit.camera.position") == pytest.approx(before)
+
+
+def test_a_view_that_leaves_what_was_filmed_says_so_and_stays_near(browser, baked, tmp_path):
+    write_page(tmp_path / "filmed.html", baked, start(track=True, filmed=FILMED))
+    shown(browser, tmp_path / "filmed.html", "time=0.5")
+    assert not browser.value(NOTED)
+    browser.value("for (let k = 0; k < 100; k++) rotate(0.05, 0)")
+    browser.until(NOTED)
+    assert 1 < browser.value("outsideOf(FILMED, orbit.camera)") <= DRAG_LIMIT
+    browser.value("home()")
+    browser.until(f"!({NOTED})")
 
 
 def test_an_orbited_view_matches_the_renderer(browser, page, baked):
     shown(browser, page, "time=0.5")
-    browser.value("delete document.body.dataset.state, orbit.rotate(0.7, -0.4), update()")
+    browser.value("delete document.body.dataset.state, rotate(0.7, -0.4)")
     browser.until(SETTLED)
     seen = browser.value("orbit.camera")
     rotation, position = torch.tensor(seen["rotation"]), torch.tensor(seen["position"])

@@ -22,6 +22,7 @@ from jaxtyping import Int32
 from warpgs.command_line.progress import progress
 from warpgs.files import write_bytes
 from warpgs.video.camera_paths import evenly_spaced
+from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
 
 from .baking import PARTS, Baked, Branch, bake, texture_bytes
 from .job import Job, Writer
@@ -61,7 +62,8 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -
         "format": "warpgs page",
         "version": VERSION,
         "keys": baked.keys,
-        "start": {field.name: getattr(start, field.name) for field in fields(start)},
+        "start": {field.name: getattr(start, field.name) for field in fields(start) if field.name != "filmed"},
+        "filmed": _filmed(start.filmed),
         "branches": {name: _metadata(branch) for name, branch in branches.items()},
     }
     blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
@@ -105,6 +107,14 @@ def _player(title: str, blocks: str) -> str:
 
 def _block(mime_type: str, name: str, content: str) -> str:
     return f'<script type="{mime_type}" id="{name}">{content}</script>'
+
+
+def _filmed(filmed: Filmed | None) -> dict[str, Any] | None:
+    """What was filmed, in numbers of five digits."""
+    if filmed is None:
+        return None
+    numbers = {field.name: np.round(getattr(filmed, field.name), 5).tolist() for field in fields(filmed)}
+    return {**numbers, "reach": REACH, "limit": DRAG_LIMIT}
 
 
 def _metadata(branch: Branch) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import COLORS, Capture, Color, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
+from warpgs.video.filmed import Filmed
 
 from .cloud import Cloud
 from .clouds import Clouds
@@ -29,13 +30,14 @@ class StartView:
         title: Title of the page.
         size: (width, height) of the image that ``intrinsics`` refer to [px].
         intrinsics: fx, fy, cx, cy [px].
-        viewmat: [4, 4] world to camera, of the first view.
+        viewmat: [4, 4] world to camera, of the first view without a track, and of the upward direction.
         pivot: Distance from the camera to the point that it orbits: median depth of the dynamic Gaussians in its image,
             or of all in it if there are none [scene units].
-        track: One [4, 4] world to camera per key time, along the training cameras; may be empty.
+        track: One [4, 4] world to camera per key time, along the training cameras; empty without a path.
         seconds: Duration of the scene [s].
         antialias, max_alpha: As in ``RenderSettings``.
         background: Colour behind everything, in [0, 1].
+        filmed: What the training cameras have filmed; None if they are not known.
     """
 
     title: str
@@ -48,6 +50,7 @@ class StartView:
     antialias: bool
     max_alpha: float
     background: Color = COLORS["black"]
+    filmed: Filmed | None = None
 
 
 def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
@@ -62,7 +65,7 @@ def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
 
 
 def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: float) -> StartView:
-    """The start view of a page: the middle evaluation view, else the middle training view, else a default camera.
+    """How a page starts: along the training cameras, unless they jump; then the middle view, else a default camera.
 
     Args:
         clouds: The scene.
@@ -74,9 +77,11 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
     cloud = cloud.select(cloud.finite)
     track: list[Camera] = []
     camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
+    filmed = None
     if capture is not None:
-        camera = capture.cameras[camera_paths.middle_view(capture)]
-        track = camera_paths.training_path(capture, keys)
+        track = [] if camera_paths.jumps(capture) else camera_paths.training_path(capture, keys)
+        camera = track[len(track) // 2] if track else capture.cameras[camera_paths.middle_view(capture)]
+        filmed = Filmed.by(capture, _means(cloud))
     K = camera.K.tolist()
     dynamic = cloud.select(cloud.is_dynamic)
     config = clouds.scene.config
@@ -91,6 +96,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         antialias=config.antialias,
         max_alpha=config.max_alpha,
         background=background_color(config.background),
+        filmed=filmed,
     )
 
 

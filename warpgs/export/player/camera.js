@@ -24,6 +24,19 @@ function rotated(vector, axis, angle) {
   return addScaled(addScaled(vector.map((v) => v * c), cross(axis, vector), s), axis, along);
 }
 
+function outsideOf(filmed, {rotation, position}) {
+  // How far a view is outside of what was filmed, with the formulas of warpgs/video/filmed.py; 1 at the border.
+  let least = Infinity;
+  filmed.positions.forEach((center, k) => {
+    const forward = filmed.forwards[k], depth = filmed.depths[k], offset = addScaled(position, center, -1);
+    const distance = Math.hypot(...addScaled(offset, forward, -0.5 * dot(offset, forward)));
+    const cosine = dot(normalized(addScaled(offset, rotation[2], depth)), forward);
+    const turn = Math.acos(Math.max(-1, Math.min(1, cosine)));
+    least = Math.min(least, Math.max(distance / (filmed.reach * depth), turn / filmed.angles[k]));
+  });
+  return least;
+}
+
 class Orbit {
   // A camera that orbits a pivot in front of it, about the upward direction of the first view.
   constructor(first, distance) {
@@ -34,13 +47,13 @@ class Orbit {
   }
 
   reset() {
-    this.set(this.first, this.firstDistance);
+    this.set(this.first);
   }
 
-  set(camera, distance = this.distance) {
+  set(camera) {
     this.rotation = camera.rotation;
-    this.distance = distance;
-    this.pivot = addScaled(camera.position, camera.rotation[2], distance);
+    this.distance = this.firstDistance;
+    this.pivot = addScaled(camera.position, camera.rotation[2], this.distance);
   }
 
   get camera() {
@@ -60,5 +73,16 @@ class Orbit {
 
   zoom(factor) {
     this.distance = Math.max(1e-3, this.distance * factor);
+  }
+
+  within(filmed, move, right, down = 0) {
+    // Moves as far as the view stays near what was filmed: by the whole step, a part of it, or along one axis alone.
+    const {rotation, distance, pivot} = this, before = outsideOf(filmed, this.camera);
+    for (const [x, y] of [[1, 1], [0.5, 0.5], [1, 0], [0, 1], [0.25, 0.25]]) {
+      move(x * right, y * down);
+      const after = outsideOf(filmed, this.camera);
+      if (after <= Math.max(filmed.limit, before)) return;
+      Object.assign(this, {rotation, distance, pivot});
+    }
   }
 }

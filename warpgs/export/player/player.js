@@ -1,6 +1,6 @@
 const element = (id) => document.getElementById(id);
 const SCENE = JSON.parse(element('scene').textContent);
-const START = SCENE.start, NAMES = ['static', 'dynamic'], BRANCHES = NAMES.map((name) => SCENE.branches[name]);
+const START = SCENE.start, FILMED = SCENE.filmed, NAMES = ['static', 'dynamic'], BRANCHES = NAMES.map((name) => SCENE.branches[name]);
 const WIDTH = 2048; // texels per row
 const lastKey = SCENE.keys - 1;
 
@@ -214,7 +214,7 @@ function applyAddress() { // e.g. #time=0.5&play=0&layers=dynamic
   state.playing = options.get('play') !== '0';
   state.changed = true;
   element('controls').hidden = options.get('controls') === '0';
-  element('follow').checked = options.get('follow') === '1' && track.length > 0;
+  element('follow').checked = options.get('follow') !== '0' && track.length > 0;
 }
 applyAddress();
 addEventListener('hashchange', applyAddress);
@@ -288,6 +288,7 @@ function frame(now) {
     element('time').value = state.time;
     element('clock').textContent = `${(state.time * START.seconds).toFixed(2)} / ${START.seconds.toFixed(1)} s`;
     element('play').textContent = state.playing ? 'pause' : 'play';
+    element('outside').hidden = !FILMED || outsideOf(FILMED, camera) <= 1;
   }
   requestAnimationFrame(frame);
 }
@@ -296,7 +297,15 @@ function frame(now) {
 
 const update = () => { state.changed = true; };
 const toggle = () => { state.playing = !state.playing; update(); };
-const home = () => { element('follow').checked = false; orbit.reset(); update(); };
+const home = () => { element('follow').checked = track.length > 0; orbit.reset(); update(); };
+const moving = (move) => (right, down) => { // ends following the training camera
+  element('follow').checked = false;
+  if (FILMED) orbit.within(FILMED, move, right, down);
+  else move(right, down);
+  update();
+};
+const rotate = moving((right, down) => orbit.rotate(right, down)), pan = moving((right, down) => orbit.pan(right, down));
+const zoomed = moving((steps) => orbit.zoom(Math.exp(steps))), zoom = (factor) => zoomed(Math.log(factor));
 const pointers = new Map();
 element('play').onclick = toggle;
 element('home').onclick = home;
@@ -313,24 +322,20 @@ canvas.onpointermove = (event) => {
   if (!last) return;
   const right = (event.clientX - last[0]) / canvas.clientHeight, down = (event.clientY - last[1]) / canvas.clientHeight;
   const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
-  element('follow').checked = false;
   if (other) {
     const distance = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
-    orbit.zoom(distance(last) / Math.max(1, distance([event.clientX, event.clientY])));
-    orbit.pan(right / 2, down / 2);
+    zoom(distance(last) / Math.max(1, distance([event.clientX, event.clientY])));
+    pan(right / 2, down / 2);
   } else if (event.buttons & 2 || event.shiftKey) {
-    orbit.pan(right, down);
+    pan(right, down);
   } else {
-    orbit.rotate(3 * right, -3 * down);
+    rotate(3 * right, -3 * down);
   }
   pointers.set(event.pointerId, [event.clientX, event.clientY]);
-  update();
 };
 canvas.addEventListener('wheel', (event) => {
   event.preventDefault();
-  element('follow').checked = false;
-  orbit.zoom(Math.exp(event.deltaY / 800));
-  update();
+  zoom(Math.exp(event.deltaY / 800));
 }, {passive: false});
 // A control that was clicked does not keep the keys of the page. Those who move between controls by Tab keep the focus.
 addEventListener('click', (event) => {
