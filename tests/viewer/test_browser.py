@@ -19,6 +19,7 @@ from tests.viewer import watched  # noqa: E402
 from tests.viewer.watched import until  # noqa: E402
 from warpgs.runs.trained import TrainedScene  # noqa: E402
 from warpgs.runtime import graphs  # noqa: E402
+from warpgs.video.filmed import DRAG_LIMIT  # noqa: E402
 from warpgs.viewer import source as source_module  # noqa: E402
 from warpgs.viewer.layers import render_layer  # noqa: E402
 from warpgs.viewer.pose import camera_of, pose_of  # noqa: E402
@@ -33,8 +34,11 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run"]
 ARGUMENTS += [f"--disable-{part}" for part in ("background-networking", "component-update", "sync", "quic")]
 SIZE = {"width": 900, "height": 700}
-LEFT = 480
-"""Columns of the image that are compared; the panel lies beside the image [px]."""
+LEFT, ABOVE = 480, 560
+"""Columns and rows of the image that are compared; the panel lies beside it, the timeline over its lower end [px]."""
+
+
+CANVAS_WIDTH = "document.querySelector('canvas').getBoundingClientRect().width"
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +111,7 @@ def seen(page, session, seconds=60.0):
     handled(page, session)
     before, end = None, time.monotonic() + seconds
     while time.monotonic() < end:
-        now = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:, :LEFT]
+        now = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[:ABOVE, :LEFT]
         if before is not None and np.array_equal(now, before):
             return now.astype(float)
         before = now
@@ -126,7 +130,7 @@ def test_the_image_shows_the_scene_through_the_camera(page, session):
     request = session._shown.request
     camera = camera_of(request.pose, request.size, request.time)
     expected = render_layer(request.layer, request.scene.splats(request.time), camera)
-    expected = cv2.resize(expected, session._canvas())[:, :LEFT, ::-1]
+    expected = cv2.resize(expected, session._canvas())[:ABOVE, :LEFT, ::-1]
     assert expected.std() > 10
     assert np.abs(image - expected).mean() < 4.0
 
@@ -155,8 +159,71 @@ def test_the_panel_has_the_name_of_the_run(page, run):
 
 
 def test_the_panel_lies_beside_the_image(page, session):
-    box = page.get_by_role("button", name="Play", exact=True).bounding_box()
+    box = page.get_by_role("button", name="Screenshot", exact=True).bounding_box()
     assert session._canvas()[0] < box["x"]
+
+
+def test_the_timeline_is_as_wide_as_the_image_also_in_another_window(page, session):
+    def is_wide():
+        box, width = page.get_by_role("button", name="Play", exact=True).bounding_box(), page.evaluate(CANVAS_WIDTH)
+        return box["x"] > 0 and 0.9 * width < box["width"] <= width
+
+    until(is_wide)
+    page.set_viewport_size({"width": 800, "height": 700})
+    until(lambda: session._canvas()[0] < 600)
+    until(is_wide)
+    page.set_viewport_size(SIZE)
+    until(is_wide)
+    settle(session)
+
+
+def test_the_tab_has_the_name_of_the_run(page, run):
+    until(lambda: page.title() == run.name)
+
+
+def test_space_plays_and_pauses_also_after_a_click_on_a_button(page, session):
+    page.mouse.click(200, 100)
+    for playing in (True, False):
+        page.keyboard.press("Space")
+        until(lambda playing=playing: session._clock.playing is playing)
+    page.get_by_role("button", name="Play", exact=True).click()
+    until(lambda: session._clock.playing)
+    page.keyboard.press("Space")
+    until(lambda: not session._clock.playing)
+    settle(session)
+
+
+def test_the_view_follows_the_training_camera_until_the_mouse_moves_it(page, session, viewer):
+    session.panel.follow.value = True
+    session.panel.time.value = 0.1
+    settle(session)
+    aspect = session._canvas()[0] / session._canvas()[1]
+    assert session._pose().position == pytest.approx(viewer._training.path.pose(0.1, aspect).position)
+    until(lambda: np.allclose(session._client.camera.position, session._pose().position, atol=1e-5))
+    page.get_by_role("button", name="Play", exact=True).click()
+    until(lambda: not 0.08 < session.panel.time.value < 0.2)
+    assert session.panel.follow.value
+    page.mouse.move(200, 300)
+    page.mouse.down()
+    page.mouse.move(230, 300, steps=5)
+    page.mouse.up()
+    until(lambda: not session.panel.follow.value)
+    page.get_by_role("button", name="Pause", exact=True).click()
+    settle(session)
+
+
+def test_the_mouse_stays_near_what_was_filmed_and_the_status_says_where_it_leaves_it(page, session, viewer):
+    for _ in range(4):
+        page.mouse.move(50, 300)
+        page.mouse.down()
+        page.mouse.move(450, 300, steps=20)
+        page.mouse.up()
+    page.get_by_text("outside of what was filmed").wait_for()
+    settle(session)
+    assert 1 < session._steering.outside() <= DRAG_LIMIT
+    until(lambda: np.allclose(session._client.camera.position, session._pose().position, atol=1e-3))
+    session.panel.snap._impl.update_cb[0](None)
+    page.get_by_text("outside of what was filmed").wait_for(state="detached")
 
 
 def test_truth_is_shown_left_of_the_border_until_the_camera_moves(page, session, viewer):
@@ -206,7 +273,7 @@ def test_a_screenshot_is_written(page, session, tmp_path_factory):
 
 def test_the_time_slider_changes_the_image(page, session):
     before = seen(page, session)
-    box = page.locator("input[type=text]:visible:not([readonly])").first
+    box = page.locator("input[type=text]:visible:not([readonly])").last
     box.fill("0.95")
     box.press("Enter")
     until(lambda: session.panel.time.value == pytest.approx(0.95))
@@ -214,7 +281,7 @@ def test_the_time_slider_changes_the_image(page, session):
 
 
 def test_keys_move_the_time_slider(page, session):
-    thumb = page.get_by_role("slider").first
+    thumb = page.get_by_role("slider").last
     thumb.focus()
     before = session.panel.time.value
     for _ in range(5):
@@ -233,7 +300,7 @@ def test_the_menu_changes_the_layer(page, session, layer):
 
 def test_the_appearance_network_can_be_switched_off(page, session):
     before = seen(page, session)
-    page.get_by_role("checkbox").first.click()
+    page.get_by_role("checkbox").nth(1).click()
     until(lambda: session.panel.residual.value is False)
     assert np.abs(seen(page, session) - before).max() > 0
 
@@ -245,6 +312,7 @@ def test_time_plays_and_pauses(page, session):
     page.get_by_role("button", name="Pause", exact=True).click()
     until(lambda: not session._clock.playing)
     settle(session)
+    handled(page, session)
     assert page.get_by_role("button", name="Play", exact=True).is_visible()
 
 
@@ -363,13 +431,18 @@ def test_the_status_shows_counts_and_fps(page, session):
 def test_the_time_of_a_slow_image_moves_no_control(page, session, monkeypatch):
     """Otherwise a click may hit the button beside the one that was aimed at."""
     seen(page, session)
-    play = page.get_by_role("button", name="Play", exact=True)
-    before = play.bounding_box()
+    boxes = [page.get_by_role("button", name=name, exact=True) for name in ("Play", "Screenshot", "Look through it")]
+    before = [box.bounding_box() for box in boxes]
     monkeypatch.setattr(session, "_cost", ("1920 × 1306 in 12345 ms", 0.1))
     session._status_at = 0.0
     session._update_status()
     page.get_by_text("12345 ms").wait_for()
-    assert play.bounding_box() == before
+    monkeypatch.setattr(session, "_note", "a long note " * 20)
+    session._status_at = 0.0
+    session._update_status()
+    page.get_by_text("a long note").wait_for()
+    assert [box.bounding_box() for box in boxes] == before
+    monkeypatch.setattr(session, "_note", "")
 
 
 def test_newer_checkpoints_are_shown(page, session, run):

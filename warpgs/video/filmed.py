@@ -84,6 +84,10 @@ class Filmed:
         turns = np.arccos(np.clip(cosines, -1.0, 1.0))
         return float(np.maximum(distances / (REACH * self.depths), turns / self.angles).min(initial=math.inf))
 
+    def depth(self, position: Float[np.ndarray, "3"]) -> float:
+        """Depth of what the camera sees that is nearest to a position [scene units]."""
+        return float(self.depths[np.linalg.norm(self.positions - position, axis=1).argmin()])
+
     def _with(self, camera: Camera, depth: float) -> "Filmed":
         position, forward = position_and_axis(camera)
         half = 0.5 * min(camera.width / float(camera.K[0, 0]), camera.height / float(camera.K[1, 1]))

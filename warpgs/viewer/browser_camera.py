@@ -12,6 +12,7 @@ from warpgs.video.camera_paths import UP, BoundingSphere, default_camera
 from .pose import pose_of
 from .source import Source
 from .training_cameras import TrainingCameras
+from .training_path import fitted
 
 
 class BrowserCamera(NamedTuple):
@@ -36,9 +37,8 @@ def through_training_camera(training: TrainingCameras, index: int, aspect: float
     In a canvas that is narrower than its image, the field of view is wide enough to show the whole image.
     """
     view = training.views[index]
-    half_height = max(1.0, view.aspect / aspect) * math.tan(0.5 * view.pose.fov)
     position, target = np.array(view.pose.position), training.target(index)
-    return BrowserCamera(position, target, training.up, 2.0 * math.atan(half_height))
+    return BrowserCamera(position, target, training.up, fitted(view.pose.fov, view.aspect, aspect))
 
 
 def start_camera(source: Source, training: TrainingCameras | None) -> BrowserCamera:

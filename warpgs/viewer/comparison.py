@@ -7,6 +7,11 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 
+from .layers import Image
+from .pose import camera_of
+from .renderer import RenderRequest
+from .training_cameras import TrainingCameras
+
 MAX_DISTANCE = 1e-3
 """Distance from a training camera, relative to the extent of the capture, up to which its image can be shown."""
 
@@ -67,3 +72,15 @@ def wiped(
 
 def _matrix(tensor: Float[Tensor, "n n"]) -> Float[np.ndarray, "n n"]:
     return tensor.cpu().double().numpy()
+
+
+def with_truth(image: Image, request: RenderRequest, training: TrainingCameras | None) -> Image:
+    """An image with the part of the training image that its request asks for."""
+    if request.truth is None or training is None:
+        return image
+    index, fraction = request.truth
+    truth = training.image(index)
+    if truth is None:
+        return image
+    camera = camera_of(request.pose, (image.shape[1], image.shape[0]), request.time)
+    return wiped(image, turned(truth, training.camera(index), camera), fraction)

@@ -3,13 +3,14 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-import viser
 
 from .browser_camera import BrowserCamera
 from .panel import Panel
 from .path_editor import PathEditor, PathState
+from .pose import Pose
+from .steering import Steering
 
-KEPT = ("time", "speed", "layer", "residual", "width")
+KEPT = ("time", "speed", "follow", "layer", "residual", "width")
 """Controls whose values survive a reload."""
 
 
@@ -30,10 +31,14 @@ class PageState(NamedTuple):
     training_view: int | None
     path: PathState
 
+    @property
+    def pose(self) -> Pose:
+        """The pose of the camera."""
+        return Pose(tuple(self.orientation.tolist()), tuple(self.camera.position.tolist()), self.camera.fov)
+
     @staticmethod
-    def of(camera: viser.CameraHandle, panel: Panel, has_training_cameras: bool, path: PathEditor) -> "PageState":
+    def of(steering: Steering, panel: Panel, has_training_cameras: bool, path: PathEditor) -> "PageState":
         """The current state of a page."""
-        seen = BrowserCamera(camera.position, camera.look_at, camera.up_direction, float(camera.fov))
         controls = {name: getattr(panel, name).value for name in KEPT}
         training_view = panel.view.value if has_training_cameras else None
-        return PageState(seen, camera.wxyz, controls, training_view, path.state())
+        return PageState(steering.seen(), steering.orientation, controls, training_view, path.state())

@@ -7,13 +7,18 @@ import viser
 
 from .layers import LAYERS
 from .path_controls import PathControls
+from .status import status_html
 from .training_cameras import TrainingCameras
 
 PLAY, PAUSE = "Play", "Pause"
 BACK, FORWARD = "◀", "▶"
-HELP = "Drag: orbit · right drag: pan · wheel: zoom · W A S D Q E: fly"
+HELP = "Space: play · drag: orbit · right drag: pan · wheel: zoom · W A S D Q E: fly"
 TIMES, SPEEDS, WIDTHS = (0.0, 1.0), (0.1, 4.0), (160, 1920)
 """Ranges of the sliders of time, speed and image width [px]."""
+
+GAP = 8
+"""Gap between the timeline and the borders of the image [px]."""
+
 
 SPECIAL = "\\`*_{}[]()#+!|<>&~"
 """Characters with a meaning in Markdown or HTML."""
@@ -26,21 +31,29 @@ class Panel:
         gui: Where to add them.
         training: The training cameras, if there are any.
         width: Initial width of the image at rest [px].
-        is_narrow: Whether the panel would cover the image: then all folders but that of the time are closed.
+        is_narrow: Whether the panel would cover the image: then all folders but the time's are closed, and the
+            timeline is one of them instead of lying below the image.
 
     Attributes:
         path: The controls of camera paths.
+        timeline: The timeline below the image; None in the panel.
     """
 
     def __init__(
         self, gui: viser.GuiApi, training: TrainingCameras | None, width: int, is_narrow: bool = False
     ) -> None:
-        self.status = gui.add_markdown("starting")
-        with gui.add_folder("Time"):
+        self.status = gui.add_html(status_html(["starting"], []))
+        self._filled = 0  # width of the canvas that the timeline has
+        self.timeline = None if is_narrow else gui.add_panel()
+        with gui.add_folder("Time") if self.timeline is None else self.timeline.add_tab("Time"):
             self.time = gui.add_slider("time", *TIMES, 0.001, 0.0)
-            self.play = gui.add_button(PLAY)
+            self.play = gui.add_button(PLAY, hint="Space")
+        with gui.add_folder("Playback"):
             self.step = gui.add_button_group("frame", (BACK, FORWARD), hint="To the time of the next training frame")
             self.speed = gui.add_slider("speed", *SPEEDS, 0.1, 1.0, hint="1: the whole scene in 5 seconds")
+            path = None if training is None else training.path
+            hint = "Along the training cameras while time runs, until you move the camera"
+            self.follow = gui.add_checkbox("follow camera", path is not None, disabled=path is None, hint=hint)
         with gui.add_folder("Image", expand_by_default=not is_narrow):
             self.layer = gui.add_dropdown("layer", tuple(LAYERS), initial_value=next(iter(LAYERS)))
             hint = "Off: static Gaussians have their own colours, without the appearance network"
@@ -53,6 +66,12 @@ class Panel:
         self.path = PathControls(gui)
         with gui.add_folder("Help", expand_by_default=False):
             gui.add_markdown(HELP)
+
+    def fill(self, width: int) -> None:
+        """Makes the timeline as wide as the canvas [px]."""
+        if self.timeline is not None and width != self._filled:
+            self._filled = width
+            self.timeline.float(x=GAP, y=-GAP, width=max(1, width - 2 * GAP))
 
     # A browser may send any value, so each is checked again here.
 

@@ -59,7 +59,9 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
 def training_cameras(source: Source, warn: Callable[[str], None]) -> TrainingCameras | None:
     """The training cameras of a run; None, with a warning, if its capture cannot be read."""
     try:
-        return TrainingCameras(source.run.open_corrected_capture())
+        trained = None if source.follow else source.current()
+        clouds = [] if trained is None else [trained.scene.static.means.detach().cpu()]
+        return TrainingCameras(source.run.open_corrected_capture(), *clouds)
     except (ValueError, OSError) as error:
         warn(f"without training cameras: {one_line(error)}")
         return None

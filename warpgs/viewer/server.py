@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import socket
 import threading
@@ -10,6 +11,7 @@ import warnings
 from collections.abc import Callable, Collection
 
 import viser
+from viser._messages import RunJavascriptMessage
 
 from .browser_camera import set_camera, start_camera
 from .origin import Origin, refuse_foreign_pages
@@ -101,6 +103,7 @@ class Viewer:
             control_width="small", show_logo=False, show_share_button=False, dark_mode=True
         )
         self._server.gui.main_panel.dock_right()  # beside the image, not over it
+        self._name_tab()
         refuse_foreign_pages(self._server, host, allowed, warn)
         self._start = start_camera(source, training)
         self._set_initial_camera()
@@ -154,6 +157,11 @@ class Viewer:
                 self._left = (time.monotonic(), session.view())
         if session is not None:
             session.stop()
+
+    def _name_tab(self) -> None:
+        """Names the browser's tab after the run; viser has no other way than the one that it loads its plots by."""
+        title = json.dumps(self._source.run.folder.resolve().name)
+        self._server._websock_server.queue_message(RunJavascriptMessage(f"document.title = {title};"))
 
     def _set_initial_camera(self) -> None:
         """Sets the camera of the browser's button "reset view"."""

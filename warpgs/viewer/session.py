@@ -20,13 +20,16 @@ from .adaptive_resolution import AdaptiveResolution
 from .browser_camera import set_camera, through_training_camera
 from .canvas import NARROW, canvas_of, size_at
 from .clock import Clock
-from .frustums import BLUE, add_frustum
+from .comparison import with_truth
+from .frustums import FRUSTUMS, show_training
 from .page_state import PageState
-from .panel import FORWARD, PAUSE, PLAY, Panel, escape, set_value
+from .panel import FORWARD, PAUSE, PLAY, Panel, set_value
 from .path_editor import PathEditor
 from .pose import Pose, camera_of, pose_of
-from .renderer import Image, Renderer, RenderRequest
+from .renderer import Renderer, RenderRequest
 from .source import Source
+from .status import HIDDEN, LEAVES, about, status_html
+from .steering import Steering
 from .training_cameras import TrainingCameras
 
 REST_SECONDS = 0.2
@@ -46,11 +49,6 @@ RATE_SECONDS = 2.0
 
 KEYFRAME_SCALE = 0.1
 """Size of keyframes in a scene without training cameras [scene units]."""
-
-FRUSTUMS = "/training"
-"""Path of the training cameras in the scene."""
-
-HIDDEN = "training cameras are hidden while you look through one"
 
 ROUNDED = 0.51e-3
 """Maximum error of a time from its slider, which has three digits."""
@@ -99,6 +97,8 @@ class Session:
         self._note = self._problem = ""
         self._fitted = (0, 0)  # the canvas that the view of a training camera was fitted to
         self._status_at = 0.0
+        path, filmed = (None, None) if training is None else (training.path, training.filmed)
+        self._steering = Steering(client.camera, path, filmed)
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale = KEYFRAME_SCALE if training is None else training.frustum_scale
         capture = None if training is None else training.capture
@@ -126,7 +126,7 @@ class Session:
 
     def view(self) -> PageState:
         """What the browser shows."""
-        return PageState.of(self._client.camera, self.panel, self._training is not None, self.path)
+        return PageState.of(self._steering, self.panel, self._training is not None, self.path)
 
     def _restore(self, view: PageState) -> None:
         self.path.restore(view.path)
@@ -138,12 +138,15 @@ class Session:
         with self._client.atomic():
             set_camera(self._client.camera, view.camera)
             self._client.camera.wxyz = view.orientation
+        self._steering.placed(view.pose, self.panel.current_time)
 
     # Handlers of the controls -----------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
         panel, training = self.panel, self._training
-        self._client.camera.on_update(lambda _: self._wake.set())
+        self._client.camera.on_update(lambda _: self._look())
+        panel.follow.on_update(lambda _: self._follow())
+        self._client.gui.add_command("Play or pause", hotkey="space").on_trigger(lambda _: self._toggle())
         for control in (panel.time, panel.layer, panel.residual, panel.width):
             control.on_update(lambda _: self._wake.set())
         panel.play.on_click(lambda _: self._toggle())
@@ -155,6 +158,21 @@ class Session:
             panel.view.on_update(lambda _: self._select(training))
             panel.snap.on_click(lambda _: self._snap(training))
             panel.show_cameras.on_update(lambda _: self._show_cameras(training))
+
+    def _look(self) -> None:
+        """The browser's camera or canvas has changed: by the mouse, which ends following, or by the session."""
+        if self.panel.follow.value and self._steering.is_moved_by_hand():
+            set_value(self.panel.follow, False)  # its handler lets the browser's camera catch up
+        self.panel.fill(self._client.camera.image_width)
+        self._wake.set()
+
+    def _follow(self) -> None:
+        """Goes to the training camera, or lets the browser's camera go on from there."""
+        if self.panel.follow.value:
+            self._steering.follow()
+        else:
+            self._steering.catch_up()
+        self._wake.set()
 
     def _toggle(self) -> None:
         with self._lock:
@@ -188,12 +206,12 @@ class Session:
             return
         request = request._replace(canvas=size_at(request.canvas, request.max_width))
         try:
-            image = self._with_truth(request, self._renderer.render(request, 1.0).image)
+            image = with_truth(self._renderer.render(request, 1.0).image, request, self._training)
         except (ValueError, RuntimeError) as error:
             self._problem = str(error)
             return
         name = f"{self._source.run.folder.resolve().name}-{request.layer.replace(' ', '-')}-{request.time:.3f}.png"
-        self._client.send_file_download(name, encode_png(image), save_immediately=True)
+        self.download(name, encode_png(image))
 
     def _select(self, training: TrainingCameras) -> None:
         """Looks through the selected training camera, and shows its number if there is none of the number typed in."""
@@ -209,10 +227,12 @@ class Session:
             index = self._selected(training)
             view, camera = training.views[index], self._client.camera
             self._fitted = canvas = self._canvas()
+            seen = through_training_camera(training, index, canvas[0] / canvas[1])
             with self._client.atomic():
-                set_camera(camera, through_training_camera(training, index, canvas[0] / canvas[1]))
+                set_camera(camera, seen)
                 camera.wxyz = np.array(view.pose.wxyz)
             set_value(self.panel.time, view.time)
+            self._steering.placed(view.pose._replace(fov=seen.fov), self.panel.current_time)
             is_shown = self._show_thumbnail(training)
             self._note = "" if is_shown else f"the image of {view.name} cannot be read"
         self._wake.set()
@@ -241,16 +261,7 @@ class Session:
     def _show_cameras(self, training: TrainingCameras) -> None:
         """Adds the training cameras to the scene or removes them, as the checkbox is set by now."""
         with self._lock:
-            for index in training.frustums():
-                if not self.panel.show_cameras.value:
-                    break
-                view, image = training.views[index], training.thumbnail(index)
-                name, scale = f"{FRUSTUMS}/{index}", training.frustum_scale
-                frustum = add_frustum(self._client.scene, name, view.pose, view.aspect, scale, BLUE, image)
-                frustum.on_click(partial(self._look_through, training, index))
-            if not self.panel.show_cameras.value:
-                for index in training.frustums():
-                    self._client.scene.remove_by_name(f"{FRUSTUMS}/{index}")
+            show_training(self._client.scene, training, partial(self._look_through, training), self.panel)
 
     def _look_through(self, training: TrainingCameras, index: int, _: object) -> None:
         if self.panel.view.value == index + 1:
@@ -284,11 +295,14 @@ class Session:
         request = self._request()
         if request is None:
             return IDLE_SECONDS
-        self._frustums.visible = self._at(request) is None  # from one of them, they would cover the image
+        follows = self._clock.playing and bool(panel.follow.value)  # then the browser's camera is elsewhere
+        self._frustums.visible = self._at(request) is None and not follows  # from one, they would cover the image
         if request != self._requested:
             self._requested, self._changed_at = request, now
         shown = self._shown.scale if self._shown is not None and self._shown.request == request else 0.0
         until_rest = self._changed_at + REST_SECONDS - now
+        if until_rest <= 0:
+            self._steering.catch_up()
         if until_rest > 0 or not shown:
             scale = self._resolution.interactive_scale(request.size[0] * request.size[1])
         else:
@@ -324,23 +338,12 @@ class Session:
         camera = camera_of(request.pose, request.size, request.time)
         return index if comparison.is_beside(camera, training.camera(index), training.capture.extent) else None
 
-    def _with_truth(self, request: RenderRequest, image: Image) -> Image:
-        """An image with the part of the training image that its request asks for."""
-        if request.truth is None or self._training is None:
-            return image
-        index, fraction = request.truth
-        truth = self._training.image(index)
-        if truth is None:
-            return image
-        camera = camera_of(request.pose, (image.shape[1], image.shape[0]), request.time)
-        return comparison.wiped(image, comparison.turned(truth, self._training.camera(index), camera), fraction)
-
     def _render(self, request: RenderRequest, scale: float) -> None:
         """Renders an image and sends it to the browser."""
         rendered = self._renderer.render(request, scale)
         start = time.perf_counter() - rendered.seconds  # without waiting for the images of other browsers
         quality = QUALITY_AT_REST if scale == 1 else QUALITY
-        image = self._with_truth(request, rendered.image)
+        image = with_truth(rendered.image, request, self._training)
         self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
         now = time.perf_counter()
         width, height = request.size_at(scale)
@@ -353,21 +356,26 @@ class Session:
         self._cost = (f"{width} × {height} in {milliseconds:.{digits}f} ms", 1.0 / (now - start))
 
     def _pose(self) -> Pose:
-        camera = self._client.camera
-        return Pose(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), float(camera.fov))
+        return self._steering.pose(self.panel.current_time, bool(self.panel.follow.value))
 
     def _canvas(self) -> tuple[int, int]:
         """(width, height) of the canvas."""
         return canvas_of(self._client.camera)
 
     def go_to(self, camera: Camera) -> None:
-        """Moves the camera of the browser, and its time."""
+        """Moves the camera of the browser, and its time; it no longer follows the training camera."""
         pose, handle = pose_of(camera), self._client.camera
+        set_value(self.panel.follow, False)
         with self._client.atomic():
             handle.wxyz, handle.position = np.array(pose.wxyz), np.array(pose.position)
             handle.fov = pose.fov
         set_value(self.panel.time, camera.time)
+        self._steering.placed(pose, self.panel.current_time)
         self._wake.set()
+
+    def download(self, name: str, content: bytes) -> None:
+        """Lets the browser download a file."""
+        self._client.send_file_download(name, content, save_immediately=True)
 
     def current_camera(self) -> Camera:
         """The current camera for a keyframe, with the width of the slider: the size of the canvas may change."""
@@ -380,14 +388,13 @@ class Session:
             return
         self._status_at = now
         hidden = HIDDEN if self.panel.shows_cameras and not self._frustums.visible else ""
-        notes = (self._problem, self._note, hidden, self._source.note, self._source.progress)
-        lines = [escape(note) for note in notes if note]
+        leaves = LEAVES if self._steering.outside() > 1 else ""
+        notes = [n for n in (self._problem, leaves, self._note, hidden, self._source.note, self._source.progress) if n]
+        lines = []
         if self._shown is not None:
-            trained = self._shown.request.scene
-            static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
             recent = sum(now - sent < RATE_SECONDS for sent in self._sent)
             cost, rate = self._cost
-            rate = recent / RATE_SECONDS if recent > 2 else rate
-            counts = f"{static:,} static, {dynamic:,} dynamic Gaussians"
-            lines += [counts, f"iteration {trained.metadata.iteration:,}", f"{cost}, {rate:.1f} FPS"]
-        self.panel.status.content = "  \n".join(lines)
+            lines = about(self._shown.request.scene, cost, recent / RATE_SECONDS if recent > 2 else rate)
+        text = status_html(lines, notes)
+        if text != self.panel.status.content:
+            self.panel.status.content = text

@@ -4,15 +4,18 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video.camera_paths import focus, upward
+from warpgs.video.filmed import Filmed
 from warpgs.visualize.images import reduced
 
 from .pose import Pose, pose_of
+from .training_path import TrainingPath
 
 THUMBNAIL_WIDTH = 320
 MAX_FRUSTUMS = 48
@@ -39,15 +42,27 @@ class TrainingCamera(NamedTuple):
 
 
 class TrainingCameras:
-    """The training views of a capture, in the order of their times; images are read on first use."""
+    """The training views of a capture, in the order of their times; images are read on first use.
 
-    def __init__(self, capture: Capture) -> None:
+    Args:
+        capture: The capture.
+        clouds: Points of the scene, for ``Filmed.by``.
+
+    Attributes:
+        capture: The capture.
+        views: The views.
+        path: The path of the training camera; None if it jumps from frame to frame.
+        filmed: What they have filmed.
+    """
+
+    def __init__(self, capture: Capture, *clouds: Float[Tensor, "_ 3"]) -> None:
         names = sorted(capture.train, key=lambda name: (capture.cameras[name].time, name))
         self.capture = capture
         self.views = []
         for name in names:
             camera = capture.cameras[name]
             self.views.append(TrainingCamera(name, pose_of(camera), camera.time, camera.width / camera.height))
+        self.path, self.filmed = TrainingPath.of(capture), Filmed.by(capture, *clouds)
         self.thumbnail = lru_cache(maxsize=256)(self._thumbnail)
 
     @property
