@@ -7,7 +7,7 @@ import pytest
 import rich
 
 from warpgs.command_line import progress as module
-from warpgs.command_line.progress import progress, progress_of_steps
+from warpgs.command_line.progress import AS_LINES, progress, progress_of_steps
 
 
 def everything_on(screen) -> str:
@@ -57,3 +57,11 @@ def test_quiet_shows_nothing_on_a_terminal(monkeypatch, run):
 def test_items_keep_their_order_and_nothing_is_written_if_stdout_is_not_a_terminal(capsys):
     assert two_items() == [3, 1]
     assert capsys.readouterr().out == ""
+
+
+def test_progress_is_written_as_lines_where_the_environment_asks_for_it(capsys, monkeypatch):
+    monkeypatch.setenv(AS_LINES, "1")
+    assert list(progress(["a", "b"], "rendering")) == ["a", "b"]
+    assert capsys.readouterr().err.splitlines() == ["rendering 0/2", "rendering 1/2", "rendering 2/2"]
+    assert list(progress(["a"], "rendering", quiet=True)) == ["a"]
+    assert capsys.readouterr().err == ""

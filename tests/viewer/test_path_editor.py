@@ -1,7 +1,11 @@
 """The editor of camera paths."""
 
+import html
+import io
 import json
+import re
 import signal
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -11,10 +15,11 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[v
 
 from tests.video.test_camera_paths import capture
 from tests.viewer.watched import Scene
-from warpgs.viewer import path_editor
+from warpgs.viewer import path_editor, path_video
 from warpgs.viewer.path_editor import PathEditor
 from warpgs.viewer.pose import Pose, camera_of
 from warpgs.viewer.training_cameras import TrainingCameras
+from warpgs.viewer.video_options import VideoOptions
 
 pytestmark = pytest.mark.usefixtures("contracts_off")
 TRAINING = TrainingCameras(capture([0.0, 0.1, 0.2, 0.3, 0.4], [0.0, 0.25, 0.5, 0.75, 1.0]))
@@ -55,6 +60,9 @@ class Browser:
     def go_to(self, camera):
         self.at = camera
 
+    def download(self, name, content):
+        self.downloaded = name, content
+
 
 def camera_at(x):
     return camera_of(Pose((1.0, 0.0, 0.0, 0.0), (x, 0.0, 0.0), 1.0), (64, 48), 0.5)
@@ -65,11 +73,14 @@ def positions(cameras):
 
 
 CONTROLS = ("saved", "name", "selected", "add", "replace", "remove", "preview", "save", "render", "note")
+CONTROLS += ("duration", "rate", "size", "progress", "download")
 
 
 def opened(folder, browser):
     """An editor of a run folder."""
     controls = SimpleNamespace(**{name: Control("path") for name in CONTROLS})
+    controls.duration.value, controls.rate.value, controls.size.value = 5.0, 24.0, (64.0, 48.0)
+    controls.download.disabled = True
     run = SimpleNamespace(folder=folder, device=torch.device("cpu"))
     made = PathEditor(Scene(), controls, run, browser, 0.1, TRAINING.capture)
     made.click = lambda name: getattr(controls, name).click()
@@ -82,6 +93,11 @@ def editor(tmp_path):
     return opened(tmp_path, Browser())
 
 
+def note(editor):
+    """The text of the note, without its HTML."""
+    return html.unescape(re.sub("<[^>]*>", "", editor.controls.note.content))
+
+
 def add(editor, *positions):
     for x in positions:
         editor.browser.at = camera_at(x)
@@ -92,7 +108,7 @@ def test_the_number_of_keyframes_is_limited(editor, monkeypatch):
     monkeypatch.setattr(path_editor, "MAX_KEYFRAMES", 2)
     add(editor, 0.0, 1.0, 2.0)
     assert len(editor.cameras) == 2
-    assert editor.controls.note.content == "a path has at most 2 keyframes"
+    assert note(editor) == "a path has at most 2 keyframes"
 
 
 def test_keyframes_are_inserted_behind_the_selected_one_replaced_and_removed(editor):
@@ -171,7 +187,7 @@ def test_a_new_path_gets_a_free_name_which_is_shown(editor):
     other.click("save")
     assert files(editor) == {"path": 1, "path-2": 2}
     assert (other.controls.name.value, other.controls.saved.value) == ("path-2", "path-2")
-    assert "path-2.json" in other.controls.note.content.replace("\\", "")
+    assert "path-2.json" in note(other)
 
 
 def test_a_new_path_is_empty(editor):
@@ -181,7 +197,7 @@ def test_a_new_path_is_empty(editor):
     assert editor.cameras == []
     assert editor._scene.names == []
     assert editor.controls.name.value == "path-2"
-    assert editor.controls.note.content == "no keyframes"
+    assert note(editor) == "no keyframes"
 
 
 @pytest.mark.parametrize("choice", ["(new path)", "other"])
@@ -196,7 +212,7 @@ def test_keyframes_that_are_not_saved_are_only_dropped_on_the_second_choice(edit
     editor.controls.saved.value = choice
     assert positions(editor.cameras) == [0.0, 1.0]
     assert editor.controls.saved.value == "path"
-    assert "2 keyframes not saved" in editor.controls.note.content
+    assert "2 keyframes not saved" in note(editor)
     editor.controls.saved.value = choice
     assert positions(editor.cameras) == ([] if choice == "(new path)" else [5.0])
 
@@ -226,12 +242,12 @@ def test_a_damaged_path_is_reported(editor):
     file.parent.mkdir()
     file.write_text("{}")
     editor.controls.saved.value = "bad"
-    assert "has no list of keyframes" in editor.controls.note.content.replace("\\", "")
+    assert "has no list of keyframes" in note(editor)
 
 
 def test_a_preview_moves_along_the_path(editor, monkeypatch):
     seen = []
-    monkeypatch.setattr(path_editor, "PREVIEW_SECONDS", 0.5)
+    editor.controls.duration.value = 0.5
     monkeypatch.setattr(editor.browser, "go_to", lambda camera: seen.append(camera))
     add(editor, 0.0, 2.0)
     seen.clear()
@@ -254,7 +270,7 @@ def test_a_second_click_ends_the_preview(editor, monkeypatch):
     editor.click("preview")
     assert len(seen) == 3
     assert editor.controls.preview.label == "Preview"
-    monkeypatch.setattr(path_editor, "PREVIEW_SECONDS", 0.2)
+    editor.controls.duration.value = 0.2
     editor.click("preview")
     assert len(seen) == 3 + 5
 
@@ -269,26 +285,45 @@ def test_a_preview_ends_with_the_browser(editor, monkeypatch):
 
 @pytest.fixture
 def started(monkeypatch):
-    """Commands that were started, which render nothing, and signals that were sent to them."""
+    """Commands that were started, which write a video of a few bytes, and signals that were sent to them."""
     commands, signals = [], []
 
     class Child:
         returncode = 0
+        stdout_text = "wrote video.mp4\n"
 
-        def __init__(self, command, **_):
+        def __init__(self, command, **options):
             commands.append(command)
+            assert options["env"]["WARPGS_PROGRESS_LINES"]
+            self.stdout, self._ended = io.StringIO(self.stdout_text), False
 
-        def communicate(self):
-            return "wrote video.mp4\n", ""
+        @property
+        def stderr(self):
+            for k in (0, 1, 2):
+                yield f"rendering {k}/2\n"
+                if during:
+                    during.pop()()
+                if self.returncode:
+                    yield "warpgs render: stopped\n"
+                    return
+            folder = Path(commands[-1][4]) / "render" / Path(commands[-1][6]).stem
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "video.mp4").write_bytes(b"film")
 
         def send_signal(self, number):
             signals.append(number)
+            self.returncode = 130
 
         def poll(self):
-            return 0
+            return self.returncode if self._ended else None
 
-    monkeypatch.setattr(path_editor.subprocess, "Popen", Child)
-    return commands, signals
+        def wait(self):
+            self._ended = True
+            return self.returncode
+
+    during = []
+    monkeypatch.setattr(path_video.subprocess, "Popen", Child)
+    return SimpleNamespace(commands=commands, signals=signals, during=during)
 
 
 def test_a_path_that_is_saved_is_rendered_as_it_is(editor, started):
@@ -303,18 +338,69 @@ def test_a_path_that_is_saved_is_rendered_as_it_is(editor, started):
     editor.click("render")
     assert files(editor) == {"path": 1}
     assert path.read_text() == text
-    assert [command[command.index("--keyframes") + 1] for command in started[0]] == [str(path)] * 2
+    assert [command[command.index("--keyframes") + 1] for command in started.commands] == [str(path)] * 2
 
 
-def test_a_video_is_rendered_by_the_command(editor, started):
+def test_a_video_has_the_duration_rate_and_size_of_the_controls(editor, started):
     """The command runs in a process of its own, and what it prints is shown."""
-    commands, signals = started
+    add(editor, 0.0, 2.0)
+    editor.controls.duration.value, editor.controls.rate.value, editor.controls.size.value = 2.5, 30.0, (640.0, 361.0)
+    editor.click("render")
+    (command,) = started.commands
+    assert command[1:5] == ["-m", "warpgs", "render", str(editor._run.folder)]
+    options = dict(zip(command[5::2], command[6::2], strict=True))
+    assert options["--device"] == "cpu"
+    assert (options["--frames"], options["--rate"], options["--size"]) == ("75", "30", "640x360")
+    assert (editor._run.folder / "paths" / "path.json").is_file()
+    assert note(editor) == "wrote video.mp4"
+    editor.stop()
+    assert started.signals == []  # it has ended
+
+
+def test_the_progress_of_a_video_is_shown_and_the_video_can_be_downloaded(editor, started):
+    shown = []
+    editor.controls.progress.on_update(lambda _: shown.append(editor.controls.progress.value))
+    editor.click("download")
+    assert not hasattr(editor.browser, "downloaded")
     add(editor, 0.0, 2.0)
     editor.click("render")
-    (command,) = commands
-    assert command[1:5] == ["-m", "warpgs", "render", str(editor._run.folder)]
-    assert command[command.index("--device") + 1] == "cpu"
-    assert (editor._run.folder / "paths" / "path.json").is_file()
-    assert editor.controls.note.content == "wrote video.mp4"
-    editor.stop()
-    assert signals == [signal.SIGINT]
+    assert shown == [0.0, 0.0, 50.0, 100.0]
+    assert not editor.controls.download.disabled
+    editor.click("download")
+    assert editor.browser.downloaded == ("path.mp4", b"film")
+
+
+def test_a_second_click_cancels_the_video(editor, started):
+    add(editor, 0.0, 2.0)
+    started.during.append(lambda: (labels.append(editor.controls.render.label), editor.click("render")))
+    labels = []
+    editor.click("render")
+    assert labels == ["Cancel video"]
+    assert started.signals == [signal.SIGINT]
+    assert len(started.commands) == 1
+    assert editor.controls.render.label == "Render video"
+    assert note(editor) == "the video was cancelled"
+    assert editor.controls.progress.value == 0.0
+    assert editor.controls.download.disabled
+
+
+def test_a_video_ends_with_the_browser(editor, started):
+    add(editor, 0.0, 2.0)
+    started.during.append(editor.stop)
+    editor.click("render")
+    assert started.signals == [signal.SIGINT]
+
+
+@pytest.mark.parametrize(
+    ("duration", "rate", "size", "expected"),
+    [
+        (2.0, 30.0, (640, 480), (60, 30.0, (640, 480))),
+        (0.0, 1e9, (-5, 10**9), (12, 120.0, (16, 4096))),
+        (float("nan"), None, "x", (120, 24.0, (1280, 720))),
+        ("1", [], (641.0, float("nan")), (120, 24.0, (640, 32))),
+        (float("inf"), 1, (16,), (600, 1.0, (1280, 720))),
+    ],
+)
+def test_options_of_a_video_are_within_their_ranges_whatever_a_browser_sends(duration, rate, size, expected):
+    options = VideoOptions.of(duration, rate, size)
+    assert (options.frames, options.rate, options.size) == expected

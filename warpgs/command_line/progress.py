@@ -1,5 +1,6 @@
 """Progress bars."""
 
+import os
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -10,9 +11,27 @@ from rich.progress import Progress, TaskID, track
 Item = TypeVar("Item")
 
 
+AS_LINES = "WARPGS_PROGRESS_LINES"
+"""Variable of the environment by which a process asks another one to write its progress to stderr, as lines."""
+
+
 def progress(items: Collection[Item], label: str, quiet: bool = False) -> Iterator[Item]:
-    """Yields the items; shows a progress bar while it does, if stdout is a terminal and ``quiet`` is false."""
+    """Yields the items; shows a progress bar while it does, if stdout is a terminal and ``quiet`` is false.
+
+    With ``AS_LINES`` in the environment it writes a line "label done/total" for each item instead.
+    """
+    if os.environ.get(AS_LINES) and not quiet:
+        for done, item in enumerate(items):
+            _write_line(label, done, len(items))
+            yield item
+        _write_line(label, len(items), len(items))
+        return
     yield from track(items, label, total=len(items), disable=quiet or not sys.stdout.isatty(), transient=True)
+
+
+def _write_line(label: str, done: int, total: int) -> None:
+    sys.stderr.write(f"{label} {done}/{total}\n")
+    sys.stderr.flush()
 
 
 @contextmanager

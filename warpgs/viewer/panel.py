@@ -20,10 +20,6 @@ GAP = 8
 """Gap between the timeline and the borders of the image [px]."""
 
 
-SPECIAL = "\\`*_{}[]()#+!|<>&~"
-"""Characters with a meaning in Markdown or HTML."""
-
-
 class Panel:
     """The controls of one browser; ``session`` and ``path_editor`` implement what they do.
 
@@ -128,8 +124,3 @@ def _clamped(value: int | float, bounds: tuple[int | float, int | float]) -> flo
 def set_value(control: Any, value: Any) -> None:
     """Sets the value of a control; viser declares it in a way that mypy takes for read-only."""
     control.value = value
-
-
-def escape(text: str) -> str:
-    """A text on one line, with all characters escaped that mean something in Markdown or HTML."""
-    return "".join(f"\\{c}" if c in SPECIAL else c for c in " ".join(text.split()))

@@ -1,8 +1,6 @@
 """The keyframes that one browser collects: added, edited, previewed, saved, loaded and rendered."""
 
 import operator
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,20 +11,20 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import viser
 
 from warpgs.cameras import Camera
-from warpgs.command_line.posix import interrupt
 from warpgs.data.capture import Capture
-from warpgs.errors import one_line
 from warpgs.runs.run import Run
 from warpgs.video import keyframes
 
 from .frustums import ORANGE, add_frustum
-from .panel import escape, set_value
-from .path_controls import DEFAULT_NAME, END_PREVIEW, NEW, PREVIEW, PathControls
+from .panel import set_value
+from .path_controls import DEFAULT_NAME, END_PREVIEW, NEW, PREVIEW, PathControls, note_html
+from .path_video import PathVideo
 from .pose import camera_of, pose_of
+from .video_options import VideoOptions
 
 MAX_KEYFRAMES = 1000
-PREVIEW_SECONDS, PREVIEW_RATE = 5.0, 24.0
-"""Duration of a preview [s], and its frames per second."""
+PREVIEW_RATE = 24.0
+"""Frames per second of a preview."""
 
 NONE = "none"
 """Entry of the menu of keyframes without any."""
@@ -41,6 +39,9 @@ class BrowserView(Protocol):
 
     def go_to(self, camera: Camera) -> None:
         """Moves the camera of the browser, and its time."""
+
+    def download(self, name: str, content: bytes) -> None:
+        """Lets the browser download a file."""
 
 
 class PathState(NamedTuple):
@@ -89,7 +90,7 @@ class PathEditor:
         # Each click is handled on its own thread; a control that is set calls its handlers on this one.
         self._lock = threading.RLock()
         self._stopped = threading.Event()
-        self._child: subprocess.Popen[str] | None = None
+        self._video = PathVideo(controls, run, self._note, browser.download)
         self._preview_ended: threading.Event | None = None  # set to end the preview that runs
         self.cameras: list[Camera] = []
         self._opened = NEW
@@ -116,8 +117,7 @@ class PathEditor:
         with self._lock:
             if self._preview_ended is not None:
                 self._preview_ended.set()
-        if self._child is not None:
-            interrupt(self._child)  # as Ctrl-C: it removes what it has written of the video
+        self._video.stop()
 
     # A page that is reloaded ------------------------------------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class PathEditor:
         return f"{count or 'no'} keyframe{'' if count == 1 else 's'}"
 
     def _note(self, text: str) -> None:
-        self._controls.note.content = escape(text)
+        self._controls.note.content = note_html(text)
 
     # Files ------------------------------------------------------------------------------------------------------------
 
@@ -277,28 +277,17 @@ class PathEditor:
         self._keep(name)
         self._browser.go_to(cameras[0])
 
+    def _options(self) -> VideoOptions:
+        """Duration, frames per second and size of the video, as the controls say."""
+        controls = self._controls
+        return VideoOptions.of(controls.duration.value, controls.rate.value, controls.size.value)
+
     def _render(self) -> None:
-        """Renders the path in a process of its own; two threads must not render at the same time."""
-        path = self._save()
-        if path is None:
-            return
-        with self._lock:
-            if self._child is not None and self._child.poll() is None:
-                self._note("another video is being rendered")
-                return
-            command = [sys.executable, "-m", "warpgs", "render", str(self._run.folder), "--keyframes", str(path)]
-            self._child = child = subprocess.Popen(
-                [*command, "--device", self._run.device.type, "--write", "mp4", "--quiet"],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            self._note(f"rendering {path.stem} …")
-        output, errors = child.communicate()
-        lines = (errors if child.returncode else output).strip().splitlines()
-        if not self._stopped.is_set():
-            self._note(one_line(ValueError(lines[-1])) if lines else f"the video ended with {child.returncode}")
+        """Saves and renders the path; a second click cancels that."""
+        if not self._video.cancel():
+            path = self._save()
+            if path is not None:
+                self._video.render(path, self._options())
 
     def _preview(self) -> None:
         """Moves the browser's camera along the path; a second click ends that."""
@@ -314,7 +303,7 @@ class PathEditor:
         self._controls.preview.label = END_PREVIEW
         try:
             times = [float(k) for k in range(len(cameras))]
-            for camera in keyframes.along(cameras, times, round(PREVIEW_SECONDS * PREVIEW_RATE)):
+            for camera in keyframes.along(cameras, times, max(1, round(self._options().duration * PREVIEW_RATE))):
                 self._browser.go_to(camera)
                 if ended.wait(1.0 / PREVIEW_RATE) or self._stopped.is_set():
                     return
