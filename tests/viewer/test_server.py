@@ -2,6 +2,7 @@
 
 import gc
 import importlib.util
+import json
 import random
 import shutil
 import socket
@@ -15,7 +16,6 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'warpgs[viewer]'")
 
 from tests.campaign.browser import Browser
-from tests.data.captures import edit_json
 from tests.errors import error_line
 from tests.viewer.watched import until
 from warpgs.cli import main
@@ -181,7 +181,8 @@ def test_a_missing_package_is_reported_in_one_line_with_the_remedy(run, capsys, 
 
 def test_a_run_without_its_capture_is_shown_without_training_cameras(run, tmp_path):
     copy, warnings = shutil.copytree(run, tmp_path / "run"), []
-    edit_json(copy / "config.json", data=str(tmp_path / "gone"))
+    config = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**config, "data": str(tmp_path / "gone")}))
     source = open_source(copy, "cpu", False)
     assert training_cameras(source, warnings.append) is None
     assert warnings[0].startswith("without training cameras: ")
