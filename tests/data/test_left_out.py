@@ -55,6 +55,17 @@ def test_depth_beside_images_of_blender_is_not_counted_as_images(edited):
     assert "1 of 13 images in the capture are left out, such as train/r_777.png: not listed in" in note
 
 
+def test_masks_beside_the_images_are_not_counted_as_images(edited):
+    root = edited("nerfstudio")
+    values = json.loads((root / "transforms.json").read_text())
+    for entry in values["frames"]:
+        name = entry["mask_path"].replace("masks/", "images/mask_of_")
+        (root / entry["mask_path"]).rename(root / name)
+        entry["mask_path"] = name
+    write_json(root / "transforms.json", values)
+    assert load_capture(root).notes == ()
+
+
 def test_frames_of_a_video_without_a_pose_are_counted(edited):
     root = edited("vipe")
     kept = np.array([0, 3, 7])

@@ -65,10 +65,29 @@ def test_another_matrix_is_refused(edited, given, message):
     refused(root, message)
 
 
-def test_a_matrix_that_contradicts_a_field_of_its_frame_is_refused(edited):
+def test_a_focal_length_of_the_frame_itself_is_preferred_to_its_matrix(edited):
     root = edited("nerfstudio")
-    layouts.edit_transforms(root / "transforms.json", K=K)
-    refused(root, r"fl_x is 45\.0, but 44\.0 in K of the same frame")
+    every_frame(root, lambda entry, k: entry.update(K=K, intrinsics=[1.0, 2.0]))
+    capture = load_capture(root)
+    assert capture.cameras["frame_00003"].K[0, 0] == layouts.FOCAL
+    assert capture.notes == ()
+
+
+def test_matrices_of_frames_are_preferred_to_a_focal_length_of_the_file_and_that_is_said(edited):
+    root = edited("nerfstudio")
+    every_frame(root, lambda entry, k: (without_fields(entry), entry.update(K=K)))
+    edit_json(root / "transforms.json", fl_x=60.0)
+    capture = load_capture(root)
+    assert capture.cameras["frame_00003"].K[0, 0] == FX
+    assert capture.notes == ("transforms.json has fl_x 60.0, but a frame 44 in its matrix: the matrices are used",)
+
+
+def test_matrices_in_fractions_are_not_needed_beside_a_focal_length(edited):
+    root = edited("nerfstudio")
+    fractions = [[1.1, 0, 0.5], [0, 1.8, 0.5], [0, 0, 1]]
+    every_frame(root, lambda entry, k: (without_fields(entry), entry.update(K=fractions)))
+    edit_json(root / "transforms.json", fl_x=60.0)
+    assert load_capture(root).cameras["frame_00003"].K[0, 0] == 60.0
 
 
 def test_without_a_focal_length_the_message_lists_what_there_is(edited):

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from warpgs.data.loaders.listed import find_file
 from warpgs.data.resized import read_resized_mask
-from warpgs.files import first_file
 
 from .frames import SourceFrame
 
@@ -27,7 +27,7 @@ def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[
     """
 
     def find(*stems: str) -> Path | None:
-        return first_file(folder / (stem + suffix) for stem in stems for suffix in SUFFIXES)
+        return next((path for stem in stems if (path := find_file(folder, stem, SUFFIXES))), None)
 
     as_source = [find(Path(frame.source).stem, frame.source) for frame in frames]
     as_frames = [find(frame.name) for frame in frames]

@@ -61,7 +61,7 @@ class BlenderLoader:
             notes=[
                 *chain(*(index.notes for index in indices)),
                 *turning_notes([*chain(*images)], sizes),
-                *images_left_out(root, chain(*images), listed),
+                *images_left_out(root, chain(*images), listed, others=[*chain(*(index.found for index in indices))]),
             ],
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)

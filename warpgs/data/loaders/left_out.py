@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -12,7 +12,9 @@ MAX_LISTED = 1_000_000
 """Maximum number of files that are looked at; a folder with more is not counted."""
 
 
-def images_left_out(root: Path, used: Iterable[Path], reason: str, folder: Path | None = None) -> tuple[str, ...]:
+def images_left_out(
+    root: Path, used: Iterable[Path], reason: str, folder: Path | None = None, others: Collection[Path] = ()
+) -> tuple[str, ...]:
     """A note on the images that are left out, if there are any.
 
     Files whose names extend that of a used image, such as r_000_depth.png that of r_000.png, are not images of their
@@ -23,6 +25,7 @@ def images_left_out(root: Path, used: Iterable[Path], reason: str, folder: Path 
         used: The images of the frames.
         reason: Why the others are left out, for the end of the note.
         folder: Folder that is searched with the folders in it; those that the used images are in if None.
+        others: Files that are used as something else, such as masks.
     """
     used = {Path(os.path.abspath(path)) for path in used}
     stems = {path.parent / path.stem for path in used}
@@ -30,11 +33,12 @@ def images_left_out(root: Path, used: Iterable[Path], reason: str, folder: Path 
     if not folders:
         return ()
     common = Path(os.path.commonpath(folders))
+    known = used | {Path(os.path.abspath(path)) for path in others}
     unused, count = [], 0
     for count, path in enumerate(_images(folders, within=folder is not None), 1):
         if count > MAX_LISTED:
             return ()
-        if path not in used and not _extends(path, stems):
+        if path not in known and not _extends(path, stems):
             unused.append(path)
     if not unused:
         return ()

@@ -9,7 +9,7 @@ import difflib
 import itertools
 import os
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from urllib.parse import unquote
@@ -80,6 +80,11 @@ class ListedFiles:
         if not is_exact:
             self._respelled.setdefault(name, found)
         return found
+
+    @property
+    def found(self) -> Collection[Path]:
+        """The files that were found so far."""
+        return self._names.keys()
 
     def missing(self, name: str, reason: str) -> str:
         """Message that a file is missing, why it is needed, and what is near."""

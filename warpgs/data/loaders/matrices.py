@@ -1,6 +1,6 @@
 """Matrices of cameras as files give them: intrinsics K, and poses whose rotations have one scale."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ from warpgs.files import read_numbers
 NAMES = ("K", "intrinsic_matrix", "intrinsics", "intrinsic")
 """Fields that hold a matrix K."""
 
-FIELDS = ("fl_x", "fl_y", "cx", "cy")
-"""Fields that say the same."""
+FOCAL = ("fl_x", "camera_angle_x")
+"""Fields that are preferred to such a matrix."""
 
 MAX_DIFFERENCE = 1e-3
 """Maximum relative difference between numbers that should be the same."""
@@ -23,22 +23,53 @@ MAX_FRACTION = 4.0
 """Numbers of a K in pixels are larger; in fractions of the image they are not."""
 
 
-def with_intrinsics(path: Path, fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields of an object with ``fl_x``, ``fl_y``, ``cx`` and ``cy`` of its matrix K, if it has one.
+def with_intrinsics(path: Path, fields: dict[str, Any], has_others: bool) -> dict[str, Any]:
+    """Fields of an object with ``fl_x``, ``fl_y``, ``cx`` and ``cy`` of its matrix K, if it has no focal length.
 
     K is [[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], also as nine numbers, or in a 3×4 or 4×4 matrix.
 
     Args:
         path: The file, for messages.
         fields: The object.
+        has_others: Whether the file has a focal length for all frames, so that another kind of K is ignored.
 
     Raises:
-        ValueError: If K is something else, or contradicts another field.
+        ValueError: If K is something else.
     """
     name = next((name for name in NAMES if isinstance(fields.get(name), list)), None)
-    if name is None:
+    if name is None or any(key in fields for key in FOCAL):
         return fields
-    K = _square(path, fields, name)
+    try:
+        K = _checked(path, name, _square(path, fields, name))
+    except ValueError:
+        if has_others:
+            return fields
+        raise
+    return {**fields, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+
+
+def contradictions(
+    name: str, fields: dict[str, Any], given: Sequence[dict[str, Any]], read: Sequence[dict[str, Any]]
+) -> tuple[str, ...]:
+    """A note on matrices of frames that are preferred to another focal length of the whole file, if there are any.
+
+    Args:
+        name: Name of the file.
+        fields: Its content.
+        given: Its frames.
+        read: The same ``with_intrinsics``.
+    """
+    focal = fields.get("fl_x")
+    if isinstance(focal, int | float):
+        for before, after in zip(given, read, strict=True):
+            if before is not after and abs(after["fl_x"] - focal) > 0.01 * focal:
+                return (
+                    f"{name} has fl_x {focal}, but a frame {after['fl_x']:.6g} in its matrix: the matrices are used",
+                )
+    return ()
+
+
+def _checked(path: Path, name: str, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     expected = f"{path}: {name} must be [[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]] in pixels, got {K.tolist()}"
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1]) and abs(K[1, 0]) <= MAX_DIFFERENCE):
         raise ValueError(expected)
@@ -46,12 +77,7 @@ def with_intrinsics(path: Path, fields: dict[str, Any]) -> dict[str, Any]:
         raise ValueError(f"{path}: cameras must have no skew, got {K[0, 1]} in {name}; undistort the images first")
     if np.abs(K).max() <= MAX_FRACTION:
         raise ValueError(f"{expected}: multiply its first row by the width of the image, its second by the height")
-    given = dict(zip(FIELDS, (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])), strict=True))
-    for key in FIELDS:
-        other = fields.get(key, given[key])
-        if isinstance(other, int | float) and abs(other - given[key]) > MAX_DIFFERENCE * K[0, 0]:
-            raise ValueError(f"{path}: {key} is {other}, but {given[key]} in {name} of the same frame")
-    return {**given, **fields}
+    return K
 
 
 def _square(path: Path, fields: dict[str, Any], name: str) -> Float[np.ndarray, "3 3"]:

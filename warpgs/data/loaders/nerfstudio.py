@@ -66,7 +66,7 @@ class NerfstudioLoader:
         val, ignored = _evaluated(transforms, by_image)
         kept = [frame for frame in frames if frame.name not in ignored]
         notes = turning_notes(images, [(frame.lens.width, frame.lens.height) for frame in frames])
-        notes += images_left_out(root, images, f"not listed in {INDEX}")
+        notes += images_left_out(root, images, f"not listed in {INDEX}", others=transforms.found)
         if ignored:
             lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
             notes.append(f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}")

@@ -8,7 +8,7 @@ horizontal field of view) with the principal point in the middle. Distortion is 
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
 
 from .listed import ListedFiles
-from .matrices import scale_note, scale_of_rotations, with_intrinsics, without_scale
+from .matrices import FOCAL, contradictions, scale_note, scale_of_rotations, with_intrinsics, without_scale
 from .posed import opencv_from_opengl, world_to_camera
 from .turned import unclear_note
 
@@ -72,13 +72,16 @@ class Transforms:
 
     def __init__(self, path: Path, undistort: bool) -> None:
         self.path, self._undistort = path, undistort
-        self.fields = with_intrinsics(path, read_json(path))
+        fields = read_json(path)
+        has_focal = any(key in fields for key in FOCAL)
+        self.fields = with_intrinsics(path, fields, has_focal)
         self._files = ListedFiles(path.parent, path.name)
         self._unclear: list[Path] = []
         frames = self.fields.get("frames")
         if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError(f"{path}: frames must be a list of at least one object")
-        self.frames: list[dict[str, Any]] = [with_intrinsics(path, frame) for frame in frames]
+        self.frames: list[dict[str, Any]] = [with_intrinsics(path, frame, has_focal) for frame in frames]
+        self._matrix_notes = contradictions(path.name, self.fields, frames, self.frames)
         self._scale = scale_of_rotations(self._matrix(frame) for frame in frames)
         for frame in frames:
             model = self._model(frame)
@@ -106,7 +109,12 @@ class Transforms:
     def notes(self) -> tuple[str, ...]:
         """What was interpreted in the file so far."""
         unclear = (unclear_note(image) for image in self._unclear[:1])
-        return (*self._files.notes, *scale_note(self.path.name, self._scale), *unclear)
+        return (*self._files.notes, *self._matrix_notes, *scale_note(self.path.name, self._scale), *unclear)
+
+    @property
+    def found(self) -> Collection[Path]:
+        """The files that were found so far."""
+        return self._files.found
 
     def image(self, frame: dict[str, Any]) -> Path:
         """The image of a frame; raises as ``file``."""
@@ -160,7 +168,7 @@ class Transforms:
         given = frame.get("transform_matrix")
         rows = len(given) if isinstance(given, list) else 4
         matrix = read_numbers(self.path, frame, "transform_matrix", (3 if rows == 3 else 4, 4))
-        if not np.allclose(matrix[3:], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
+        if np.abs(matrix[3:, :3]).any():
             raise ValueError(
                 f"{self.path}: transform_matrix of {self._name(frame)} must end with the row 0 0 0 1, got "
                 f"{matrix[3].tolist()}; positions belong into its last column"
