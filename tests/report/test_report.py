@@ -23,8 +23,9 @@ from warpgs.evaluation import evaluate_run
 from warpgs.report.charts import HEIGHT, MAX_POINTS, MAX_VALUES, WIDTH, Series, chart
 from warpgs.report.command import Report
 from warpgs.report.evaluated_run import read_runs
-from warpgs.report.image_strips import MAX_WIDTH, data_uri, saved_views
+from warpgs.report.image_strips import MAX_WIDTH, data_uri, saved_strips, saved_views
 from warpgs.report.metrics_table import config_rows, formatted
+from warpgs.report.page import Gallery, page
 from warpgs.report.write_report import extremes
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -471,3 +472,31 @@ def test_the_report_of_one_run_is_written_into_its_folder(run, capsys):
     assert main(["report", str(run), "--views", "0"]) == 0
     assert f"{run / 'report.html'}: " in capsys.readouterr().out
     assert (run / "report.html").is_file()
+
+
+def test_a_report_of_several_runs_shows_the_mean_that_it_orders_by_and_says_a_note_once(tmp_path, run):
+    def shift(rows):
+        for row in rows:
+            row["psnr"] = float(row["psnr"]) + 2.0
+
+    folders = [run, *(shutil.copytree(run, tmp_path / name) for name in ("second", "third"))]
+    edit_views(folders[1], shift)
+    runs = read_runs(folders)
+    worst, _ = extremes(runs, 1, saved_views(runs[0]))
+    strips = [saved_strips(own, worst, "nothing is rendered") for own in runs]
+    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)], "written today"))
+    known = [view.metrics["psnr"] for own in runs for view in own.views if view.name == worst[0]]
+    assert f"mean {sum(known) / 3:.2f} dB" in shown.text
+    assert "Ordered by the mean PSNR of the runs." in shown.text
+    assert shown.text.count("only views whose images the evaluation saved: nothing is rendered") == 1
+    strips[2] = saved_strips(runs[2], worst, "it is lost")
+    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)], "written today"))
+    assert "run, second: only views whose images the evaluation saved: nothing is rendered" in shown.text
+    assert "third: only views whose images the evaluation saved: it is lost" in shown.text
+
+
+def test_every_table_of_a_report_scrolls_inside_of_the_page(tmp_path, run):
+    page = report(tmp_path, run)
+    containers = [attrs.get("class") for tag, attrs in page.elements if tag == "div"]
+    tables = [tag for tag, _ in page.elements if tag == "table"]
+    assert sum(name in ("wide", "strips") for name in containers) == len(tables) > 2

@@ -2,6 +2,7 @@
 
 import html
 import math
+import statistics
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -27,9 +28,13 @@ svg text { fill: currentColor; font-size: 11px; } svg .title { font-size: 13px; 
 svg .tick { fill: var(--soft); } svg line { stroke: var(--line); }
 svg polyline { fill: none; stroke-width: 1.6; }
 svg .value { fill: transparent; } svg .value:hover { fill: currentColor; }
-.wide { overflow-x: auto; }
+.wide, .strips { overflow-x: auto; scrollbar-width: thin;
+  background: linear-gradient(90deg, Canvas 30%, transparent) left,
+  linear-gradient(-90deg, Canvas 30%, transparent) right, linear-gradient(90deg, #8888, transparent) left,
+  linear-gradient(-90deg, #8888, transparent) right; background-repeat: no-repeat;
+  background-size: 3rem 100%, 3rem 100%, 1rem 100%, 1rem 100%; background-attachment: local, local, scroll, scroll; }
 .dot { display: inline-block; width: .75em; height: .75em; border-radius: 50%; margin-right: .4em; }
-.strips { overflow-x: auto; } .strips td { border: 0; padding: .15rem; vertical-align: top; text-align: left; }
+.strips td { border: 0; padding: .15rem; vertical-align: top; text-align: left; }
 .strips th { border: 0; padding: .15rem .3rem; }
 .strips img { display: block; width: clamp(140px, (min(100vw, 1500px) - 5rem) / var(--columns) - .3rem, 300px); }
 .zoom { position: relative; display: block; cursor: zoom-in; }
@@ -114,7 +119,7 @@ def _summary(runs: Sequence[EvaluatedRun]) -> str:
         )
         rows.append(f"<tr><th>{text(TITLES.get(name, name))}</th>{cells}</tr>")
     note = "" if are_comparable else "<p class=note>The runs were evaluated on different captures or views.</p>"
-    return f"<h2>Metrics and timing</h2>{note}{_wide(_header(runs) + ''.join(rows))}"
+    return f"<h2>Metrics and timing</h2>{note}{wide(_header(runs) + ''.join(rows))}"
 
 
 def _best(name: str, values: Iterable[Any]) -> float | None:
@@ -148,10 +153,13 @@ def _over_time(index: int, run: EvaluatedRun, name: str) -> Series:
 
 def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
     names = "".join(f"<th colspan={len(PER_RUN)}>{_named(runs, k)}: {' | '.join(PER_RUN)}</th>" for k in gallery.runs)
+    named: dict[str, list[str]] = {}  # labels by note: a sentence once, not for each run
+    for k, strips in zip(gallery.runs, gallery.strips, strict=True):
+        named.setdefault(strips.note, []).append(runs[k].label)
     notes = "".join(
-        f"<p class=note>{text(runs[k].label)}: {text(strips.note)}</p>"
-        for k, strips in zip(gallery.runs, gallery.strips, strict=True)
-        if strips.note
+        f"<p class=note>{'' if len(named) == 1 else text(', '.join(found)) + ': '}{text(note)}</p>"
+        for note, found in named.items()
+        if note
     )
     rows = []
     for title, views in (("Worst views", gallery.worst), ("Best views", gallery.best)):
@@ -160,17 +168,20 @@ def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
         rows += [_gallery_row(runs, gallery, view) for view in views]
     columns = 1 + len(PER_RUN) * len(gallery.runs)
     error = f"mean absolute error over the channels, black at 0, brightest from {ERROR_RANGE} on"
-    scale = f"<p class=note>Ordered by PSNR. Error: {error}.</p>"
-    table = f'<div class="strips" style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
+    order = "PSNR" if len(gallery.runs) == 1 else "the mean PSNR of the runs"
+    scale = f"<p class=note>Ordered by {order}. Error: {error}.</p>"
+    table = f'<div class="strips" tabindex=0 style="--columns: {columns}"><table>{"".join(rows)}</table></div>'
     labels = "" if len(gallery.runs) == len(runs) else f" of {', '.join(_named(runs, k) for k in gallery.runs)}"
     return f"<h2>Worst and best views{labels}</h2>{scale}{notes}{table}"
 
 
 def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> str:
     truths = [strips.by_view[name].truth for strips in gallery.strips if name in strips.by_view]
-    cells = [
-        f"<td>{_image(truths[0], f'ground truth of {name}')}{text(name)}</td>" if truths else f"<td>{text(name)}</td>"
-    ]
+    scores = [view.metrics.get("psnr") for k in gallery.runs for view in runs[k].views if view.name == name]
+    known = [score for score in scores if score is not None]
+    mean = f"<br>mean {statistics.fmean(known):.2f} dB" if len(scores) > 1 and known else ""
+    image = _image(truths[0], f"ground truth of {name}") if truths else ""
+    cells = [f"<td>{image}{text(name)}{mean}</td>"]
     for index, strips in zip(gallery.runs, gallery.strips, strict=True):
         view = next(view for view in runs[index].views if view.name == name)
         psnr = view.metrics.get("psnr")
@@ -199,7 +210,7 @@ def _views(runs: Sequence[EvaluatedRun]) -> str:
         opened = " open" if len(runs) == 1 else ""
         parts.append(
             f"<details{opened}><summary>{_named(runs, index)}: {len(run.views)} views</summary>"
-            f"{_wide(f'<tr>{head}</tr>{rows}')}</details>"
+            f"{wide(f'<tr>{head}</tr>{rows}')}</details>"
         )
     return "".join(parts)
 
@@ -219,12 +230,12 @@ def _config(runs: Sequence[EvaluatedRun]) -> str:
         f"<tr><th>{text(name)}</th>{''.join(f'<td class=text>{text(value)}</td>' for value in values)}</tr>"
         for name, values in rows
     )
-    return f"<h2>{title}</h2>{_wide(_header(runs) + body)}"
+    return f"<h2>{title}</h2>{wide(_header(runs) + body)}"
 
 
-def _wide(rows: str) -> str:
-    """A table that scrolls sideways where the screen is narrower."""
-    return f'<div class="wide"><table>{rows}</table></div>'
+def wide(rows: str) -> str:
+    """A table that scrolls sideways where the screen is narrower, with shadows at the ends where it goes on."""
+    return f'<div class="wide" tabindex=0><table>{rows}</table></div>'
 
 
 def _image(address: str, description: str) -> str:

@@ -8,7 +8,7 @@ from warpgs.command_line.version import version
 from warpgs.files import write_text
 from warpgs.report.evaluated_run import groups, read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
-from warpgs.report.page import Gallery, page, text
+from warpgs.report.page import Gallery, page, text, wide
 from warpgs.report.write_report import extremes
 
 from .cells import Cell
@@ -53,4 +53,4 @@ def _table(table: Table) -> str:
     for row, cells in zip(table.rows, texts(table), strict=True):
         values = "".join(f"<td{' class=best' if is_best else ''}>{text(value)}</td>" for value, is_best in cells)
         rows.append(f"<tr><th>{text(row.label)}</th>{values}</tr>")
-    return f"<h2>{text(table.title)}</h2><table><tr>{head}</tr>{''.join(rows)}</table>"
+    return f"<h2>{text(table.title)}</h2>{wide(f'<tr>{head}</tr>' + ''.join(rows))}"
