@@ -110,6 +110,18 @@ def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
     assert "20.50 ± 0.71" in (tmp_path / "out/report.html").read_text()
 
 
+def test_a_terminal_gets_tables_and_the_file_markdown(sweep, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("TERM", "dumb")
+    assert sweep()[0] == 0
+    printed = capsys.readouterr().out
+    assert "20.50 ± 0.71" in printed
+    assert "4 of 4 trainings finished" in printed
+    assert "| full |" not in printed
+    assert "# Mine" not in printed
+    assert "| full | 20.50 ± 0.71 |" in (tmp_path / "out/table.md").read_text()
+
+
 def test_a_sweep_that_stops_writes_its_tables_before_ray_ends_which_takes_seconds(sweep):
     def stop(job):
         raise KeyboardInterrupt

@@ -3,10 +3,12 @@
 import csv
 import io
 import json
+import re
 
 import pytest
+from rich.console import Console
 
-from warpgs.sweep.formats import latex, markdown, means_csv
+from warpgs.sweep.formats import latex, markdown, means_csv, terminal
 from warpgs.sweep.peers import read_peers
 from warpgs.sweep.table import Statistic, best_means, make_tables
 
@@ -145,3 +147,30 @@ def test_peers_stand_below_with_their_numbers_and_the_mean_of_captures_they_all_
 def test_wrong_numbers_of_peers_are_named(tmp_path, values, message):
     with pytest.raises(ValueError, match=message):
         peers(tmp_path, values)
+
+
+def on_terminal(table, columns):
+    console = Console(file=io.StringIO(), width=columns, force_terminal=True)
+    console.print(terminal(table))
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("columns", [70, 80, 120])
+def test_a_terminal_shows_every_word_of_a_table_in_one_piece(columns):
+    others = {"ssim": 0.9168, "psnr_dynamic": 22.31, "num_static": 4_950, "num_dynamic": 2_464}
+    labels = {"a": "[d] everything without its predecessor", "b": "b"}
+    (table,) = make_tables(measured({("a", "as"): [27.0, 28.0], ("b", "as"): [29.0, 29.0]}, **others), labels, {})
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", on_terminal(table, columns))
+    assert {"[d]", "everything", "without", "its", "predecessor", "27.50", "dynamic", "Gaussians", "seeds"} <= set(
+        shown.split()
+    )
+    assert "…" not in shown
+    assert "|" not in shown
+    assert "**" not in shown
+
+
+def test_a_terminal_shows_the_best_value_in_bold():
+    (table,) = make_tables(measured({("a", "as"): [27.0], ("b", "as"): [29.0]}), LABELS, {})
+    shown = on_terminal(table, 80)
+    assert re.search(r"\x1b\[1m *29\.00", shown)
+    assert not re.search(r"\x1b\[1m *27\.00", shown)

@@ -1,15 +1,21 @@
-"""Tables as Markdown, LaTeX and CSV."""
+"""Tables as Markdown, LaTeX and CSV, and for a terminal."""
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
+
+import rich.table
+from rich.box import SIMPLE_HEAD
+from rich.text import Text
 
 from .cells import Cell
 from .table import Metric, Row, Statistic, Table, best_means
 
 NOTHING = "–"
 """Stands where nothing was measured."""
+
+SPREAD = "Mean ± standard deviation over seeds."
 
 LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
@@ -71,7 +77,7 @@ def heads(table: Table) -> list[str]:
 
 def markdown(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
     """A document with all tables and, below them, notes (one paragraph each)."""
-    parts = [f"# {title}", "Mean ± standard deviation over seeds."]
+    parts = [f"# {title}", SPREAD]
     for table in tables:
         lines = [["", *heads(table)], ["---"] * (len(table.metrics) + 2)]
         for row, cells in zip(table.rows, texts(table), strict=True):
@@ -80,6 +86,22 @@ def markdown(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
             )
         parts += [f"## {table.title}", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
     return "\n\n".join([*parts, *notes]) + "\n"
+
+
+def terminal(table: Table) -> rich.table.Table:
+    """A table for a terminal, which breaks lines between words where it is narrow; the best values are bold."""
+    lines = [[(row.label, False), *cells] for row, cells in zip(table.rows, texts(table), strict=True)]
+    columns: list[rich.table.Column] = []
+    for head, *cells in zip(["", *heads(table)], *([text for text, _ in line] for line in lines), strict=True):
+        longest = max(len(word) for text in (head, *cells) for word in text.split() or [""])
+        justify: Literal["left", "right"] = "right" if columns else "left"
+        columns.append(rich.table.Column(Text(head), justify=justify, vertical="bottom", min_width=longest))
+    style: dict[str, Any] = {"box": SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0), "title_justify": "left"}
+    shown = rich.table.Table(*columns, title=Text(table.title), **style)
+    for line in lines:
+        # Without markup: labels may have brackets.
+        shown.add_row(*(Text(text, "bold" if is_best else "") for text, is_best in line))
+    return shown
 
 
 def latex(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:

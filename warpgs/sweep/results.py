@@ -1,14 +1,17 @@
 """The files with a sweep's results: table.md, table.tex, table.csv, cells.csv and report.html."""
 
+import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+from rich import get_console
 
 from warpgs.files import write_text
 
 from .board import CELLS, Board
 from .cells import Cell
-from .formats import cells_csv, latex, markdown, means_csv
+from .formats import SPREAD, cells_csv, latex, markdown, means_csv, terminal
 from .page import write_page
 from .spec import SweepSpec
 from .table import Peers, Table, make_tables
@@ -58,6 +61,18 @@ def _resampled(board: Board) -> list[str]:
 def tables_text(spec: SweepSpec, board: Board, peers: Peers) -> str:
     """The tables as Markdown, without the commands."""
     return markdown(spec.title, tables_of(board, spec, peers), notes_of(board))
+
+
+def show_tables(spec: SweepSpec, board: Board, peers: Peers, log: Callable[[str], object]) -> None:
+    """Prints the tables: as tables if stdout is a terminal, else as Markdown by ``log``."""
+    if not sys.stdout.isatty():
+        log(tables_text(spec, board, peers))
+        return
+    console = get_console()
+    log(f"\n{spec.title}\n{SPREAD}\n")
+    for table in tables_of(board, spec, peers):
+        console.print(terminal(table))
+    log("\n".join(notes_of(board)))
 
 
 def write_tables(out: Path, spec: SweepSpec, board: Board, peers: Peers) -> None:

@@ -31,7 +31,7 @@ from .cells import (
 from .command import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
-from .results import tables_text, write_report, write_tables
+from .results import show_tables, write_report, write_tables
 from .scheduler import Event, Pool, run_jobs
 from .shared_gpu import shared_gpus
 from .spec import MAX_SEEDS, SweepSpec, read_spec
@@ -180,7 +180,7 @@ def _run(options: Sweep, spec: SweepSpec, board: Board, peers: Peers, log: Log) 
         if code or stopped:
             board.stop()
         # Before Ray ends, which takes seconds: a SIGKILL may soon follow the SIGTERM.
-        log(tables_text(spec, board, peers))  # before they are written: the disk may be full
+        show_tables(spec, board, peers, log)  # before they are written: the disk may be full
         try:
             write_tables(board.out, spec, board, peers)
             write_report(board.out, spec, board, peers)
