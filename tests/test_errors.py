@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -18,6 +19,7 @@ from warpgs.errors import (
     command,
     is_out_of_memory,
     missing,
+    not_one_of,
     one_line,
     run_command,
     suggestion,
@@ -169,6 +171,18 @@ def test_a_missing_path_is_told_a_similar_one_that_exists(tmp_path, monkeypatch)
 
 def test_one_line_has_no_line_breaks():
     assert one_line(ValueError("a\n\n  b\tc ")) == "a b c"
+
+
+def test_a_very_long_message_is_shortened_in_its_middle():
+    assert one_line(ValueError("a" * 4000)) == "a" * 4000
+    assert one_line(ValueError("a" * 9000 + "b" * 9000)) == "a" * 2000 + " … " + "b" * 2000
+
+
+def test_something_unknown_of_any_length_is_compared_at_once():
+    start = time.process_time()
+    message = not_one_of("preset", "quick" + "x" * 2_000_000, ["quick", "best" * 500_000])
+    assert time.process_time() - start < 2.0
+    assert "got 'quickxxxxxxx...xxxxxxxxxxxxx'" in message
 
 
 def test_importing_errors_imports_no_torch():

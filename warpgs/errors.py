@@ -7,6 +7,7 @@ import functools
 import io
 import os
 import re
+import reprlib
 import shlex
 import signal
 import sys
@@ -33,6 +34,9 @@ CLOSED = 141
 
 ADVICE = "free some, or use smaller images or fewer Gaussians; --device cpu if a GPU has too little"
 """What to do without enough memory, where a command has no advice of its own."""
+
+MAX_GIVEN = 200
+"""Maximum number of characters of something unknown to which what is known is compared."""
 
 MAX_MESSAGE = 4000
 """Maximum number of characters of a message: names and values in it come from files."""
@@ -198,6 +202,7 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
         known: What may be meant.
         shown: How the message writes what may be meant.
     """
+    given = given[:MAX_GIVEN]
     by_lower_case = {name.lower(): name for name in known}
     close = difflib.get_close_matches(given.lower(), by_lower_case, 1)
     return f"; did you mean {shown(by_lower_case[close[0]])}?" if close else ""
@@ -206,7 +211,7 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
 def not_one_of(name: str, given: object, known: Iterable[str]) -> str:
     """Message that the value of an option is not one of those that are known, and the similar one."""
     known = list(known)
-    return f"{name} must be one of {', '.join(known)}, got {given!r}{suggestion(str(given), known)}"
+    return f"{name} must be one of {', '.join(known)}, got {reprlib.repr(given)}{suggestion(str(given), known)}"
 
 
 def similar_path(path: Path) -> str:

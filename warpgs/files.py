@@ -6,7 +6,6 @@ Every error names the file: writing functions raise an OSError if it cannot be w
 import glob
 import io
 import json
-import math
 import os
 import re
 import reprlib
@@ -28,7 +27,7 @@ from filelock import FileLock, Timeout
 from jaxtyping import Float, Shaped, UInt
 
 from .command_line import posix
-from .parsed import parse_json
+from .parsed import finite, parse_json
 
 MAX_JSON = 64 << 20
 """Maximum size of a JSON file [bytes]; metadata.json of a long capture has a few MiB."""
@@ -43,6 +42,12 @@ OWNED = ".warpgs.lock"
 
 MAX_NPY_HEADER = 1 << 20
 """Maximum size of what precedes the numbers of a .npy file [bytes]."""
+
+DAMAGED_ARRAY = (
+    *(ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError),
+    *(RecursionError, MemoryError),  # a header is parsed as Python, whose parser has a stack of limited size
+)
+"""Errors of NumPy for a damaged .npy file."""
 
 
 def first_file(paths: Iterable[Path]) -> Path | None:
@@ -220,15 +225,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, values: Any) -> None:
     """Writes values as JSON; numbers that are not finite become null, which every reader understands."""
-    write_text(path, json.dumps(_finite(values), indent=2) + "\n")
-
-
-def _finite(values: Any) -> Any:
-    if isinstance(values, float):
-        return values if math.isfinite(values) else None
-    if isinstance(values, dict):
-        return {key: _finite(value) for key, value in values.items()}
-    return [_finite(value) for value in values] if isinstance(values, list | tuple) else values
+    write_text(path, json.dumps(finite(values), indent=2) + "\n")
 
 
 def write_png(path: Path, image: UInt[np.ndarray, "H W"] | UInt[np.ndarray, "H W C"]) -> None:
@@ -304,14 +301,23 @@ def read_bounded(path: Path, max_bytes: int, hint: str = "") -> bytes:
         ValueError: If it is missing, not a regular file (a device would never end) or larger; the message names it.
     """
     size = require_file(path, max_bytes, hint)
-    try:
-        with path.open("rb") as file:
-            data = file.read(size + 1)  # the size of a file in /proc says nothing about its content
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
+    data = read_start(path, size + 1)
     if len(data) != size:
         raise ValueError(f"{path} changes while it is read: expected {size:,} bytes")
     return data
+
+
+def read_start(path: Path, max_bytes: int) -> bytes:
+    """The first ``max_bytes`` of a file that ``require_file`` accepted, or all of it.
+
+    Raises:
+        ValueError: If it cannot be read; the message names it.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(max_bytes)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def read_json(path: Path, hint: str = "", max_bytes: int = MAX_JSON) -> dict[str, Any]:
@@ -335,9 +341,9 @@ def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
     """
     require_file(path, MAX_NPY_HEADER + 8 * max_values)
     try:
-        with _parsing_headers:
+        with _parsing_headers, np.errstate(over="ignore"):  # the product of the sides that a header claims
             array = np.load(path, mmap_mode="r", allow_pickle=False)  # allocates nothing, whatever the header claims
-    except (ValueError, OSError, EOFError, OverflowError, TypeError, SyntaxError, TokenError) as error:
+    except DAMAGED_ARRAY as error:
         raise ValueError(f"{path} is damaged or not a .npy file of numbers") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         raise ValueError(f"{path} must be a .npy file of numbers")

@@ -1,6 +1,7 @@
 """Parsed JSON and TOML, with bounds on what no reader expects: deep nesting, huge integers, a name twice."""
 
 import json
+import math
 import re
 import reprlib
 import sys
@@ -60,6 +61,15 @@ def parse_toml(source: Path | str, data: bytes) -> dict[str, Any]:
         raise ValueError(f"{source} is not valid TOML: {reason(error)}") from error
     check_parsed(source, value)
     return value
+
+
+def finite(values: Any) -> Any:
+    """Values for JSON, in which numbers that are not finite are None."""
+    if isinstance(values, float):
+        return values if math.isfinite(values) else None
+    if isinstance(values, dict):
+        return {key: finite(value) for key, value in values.items()}
+    return [finite(value) for value in values] if isinstance(values, list | tuple) else values
 
 
 def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

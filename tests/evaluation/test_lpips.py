@@ -4,6 +4,7 @@ import dataclasses
 import os
 import re
 import shutil
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -282,6 +283,20 @@ def test_a_file_with_code_is_refused_and_not_executed(tmp_path):
     with pytest.raises(ValueError, match="cannot be read as weights"):
         lpips.find(tmp_path, "squeeze")
     assert not (tmp_path / "executed").exists()
+
+
+def test_a_file_whose_tensors_claim_more_than_it_holds_is_refused(tmp_path):
+    path = write(tmp_path, network("squeeze")) / FILES["squeeze"]
+    torch.save({"features.0.weight": torch.zeros(1).expand(1 << 20, 1 << 20)}, path)
+    with pytest.raises(ValueError, match=r"features\.0\.weight has more numbers than the file has bytes"):
+        lpips.find(tmp_path, "squeeze")
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data + bytes(10_000))
+    with pytest.raises(ValueError, match="cannot be read as weights: its content is compressed"):
+        lpips.find(tmp_path, "squeeze")
 
 
 @needs_weights

@@ -2,6 +2,7 @@
 
 import os
 import struct
+import zipfile
 
 import cv2
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 from tests.prepare.boards import record, write_folder, write_video
 from warpgs.data.images import decode
+from warpgs.data.lens import Lens
+from warpgs.prepare.cameras import Cameras
 from warpgs.prepare.frames import Frames, check_selection, take_frames
 from warpgs.prepare.images import sharpness
 from warpgs.prepare.options import Selection
@@ -198,3 +201,18 @@ def test_a_truncated_video_is_noted(tmp_path, images):
     video.write_bytes(data[: len(data) // 2])
     taken = take_frames(video, tmp_path / "part", Selection(), notes=notes).taken
     assert notes == [f"{video} should have 20 frames, only {len(taken)} could be decoded: is it truncated?"]
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED])
+def test_damaged_cameras_are_refused_by_name(tmp_path, method):
+    lens = Lens(40, 24, (50.0, 50.0), (20.0, 12.0))
+    saved = Cameras(["a"], lens, np.eye(4)[None, :3], np.zeros((0, 3)), 0.5, 3.0)
+    saved.save(tmp_path / "cameras")
+    assert Cameras.load(tmp_path / "cameras").lens == lens
+    with zipfile.ZipFile(tmp_path / "cameras.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(tmp_path / "cameras.npz", "w", method) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data[:-8] + struct.pack("<d", np.inf) if name == "quality.npy" else data[:90])
+    with pytest.raises(ValueError, match=r"cameras\.npz"):
+        Cameras.load(tmp_path / "cameras")

@@ -10,6 +10,10 @@ from warpgs.files import require_file
 METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 """Compression that is read: that of NumPy and ViPE. LZMA takes as much memory as its header says, up to 4 GiB."""
 
+MAX_SMALL, MAX_RATIO = 64 << 20, 200
+"""Size up to which a member may be compressed by any ratio, and the maximum ratio of larger ones: images of a video
+rarely reach 10, and 1,000 is the most that deflate can do, of zeros."""
+
 DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, OverflowError, RuntimeError)
 """Errors of a damaged archive: RuntimeError if a member is encrypted, OverflowError for offsets beyond 63 bits."""
 
@@ -48,6 +52,8 @@ class Archive:
         where, size = f"{self.path}: {name}", info.file_size
         if size > max_bytes:
             raise ValueError(f"{where} has {size:,} bytes, more than the maximum of {max_bytes:,}")
+        if size > max(MAX_SMALL, MAX_RATIO * info.compress_size):
+            raise ValueError(f"{where} claims {size:,} bytes, too many for {info.compress_size:,} compressed ones")
         if info.compress_type not in METHODS:
             raise ValueError(f"{where} is compressed by method {info.compress_type}, expected stored or deflated")
         try:

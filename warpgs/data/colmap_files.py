@@ -13,6 +13,7 @@ file until memory is exhausted. So the sizes of all entries are added up first. 
 
 from __future__ import annotations
 
+import reprlib
 import struct
 import tempfile
 from collections.abc import Callable
@@ -36,6 +37,9 @@ NUM_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 """Number of parameters of each camera model, by its index in COLMAP's ``CameraModelId``."""
 
 MISFIT = "one refers to a camera, image or point that another lacks; copy all files of one model again"
+
+MAX_NAME = 1024
+"""Maximum length of the name of an image, with its folders."""
 
 REQUIRED, OPTIONAL = ("cameras", "images", "points3D"), ("rigs", "frames")
 
@@ -64,8 +68,9 @@ def read_model(folder: Path, note: Callable[[str], None] = lambda text: None) ->
     model = _opened(folder, suffix, [name for name in present if name not in lonely], note)
     try:
         _check_values(model)
-    except ValueError as error:
-        raise ValueError(f"{folder} is not a COLMAP model of files that fit together: {error}") from error
+    except (ValueError, RuntimeError, IndexError) as error:
+        reason = error if isinstance(error, ValueError) else MISFIT
+        raise ValueError(f"{folder} is not a COLMAP model of files that fit together: {reason}") from error
     return model
 
 
@@ -175,7 +180,9 @@ def _check_values(model: pycolmap.Reconstruction) -> None:
             raise ValueError(f"the pose of image {number} is not finite")
         name = PurePosixPath(_name(image, number).replace("\\", "/"))
         if name.is_absolute() or ".." in name.parts or not name.parts or "\0" in image.name:
-            raise ValueError(f"the name of image {number} leads out of the folder: {image.name!r}")
+            raise ValueError(f"the name of image {number} leads out of the folder: {reprlib.repr(image.name)}")
+        if len(image.name) > MAX_NAME:
+            raise ValueError(f"the name of image {number} has {len(image.name):,} characters")
 
 
 def _name(image: pycolmap.Image, number: int) -> str:

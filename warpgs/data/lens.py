@@ -24,6 +24,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from warpgs.files import MAX_NUMBER
+
 from .images import MAX_PIXELS, MAX_SIDE
 
 MIN_FOCAL = 1e-3
@@ -81,12 +83,16 @@ class Lens:
             undistort: Whether its images are to be undistorted.
 
         Raises:
-            ValueError: If a number is not finite, a focal length is below ``MIN_FOCAL``, the size is out of range, or
-                the distortion is too strong to undistort and ``undistort`` is true.
+            ValueError: If a number is not finite or larger than ``files.MAX_NUMBER``, a focal length is below
+                ``MIN_FOCAL``, the size is out of range, or the distortion is too strong to undistort and ``undistort``
+                is true.
         """
         values = (*self.focal, *self.center, *self.radial, *self.tangential, *(self.fisheye or ()))
-        if not np.isfinite(values).all() or min(self.focal) < MIN_FOCAL:
-            raise ValueError(f"focal lengths must be at least {MIN_FOCAL} px and intrinsics finite, got {values}")
+        if not (np.abs(values) <= MAX_NUMBER).all() or min(self.focal) < MIN_FOCAL:
+            raise ValueError(
+                f"focal lengths must be at least {MIN_FOCAL} px and intrinsics finite and at most {MAX_NUMBER:g}, "
+                f"got {values}"
+            )
         if not 0 < min(self.width, self.height) <= max(self.width, self.height) <= MAX_SIDE:
             raise ValueError(f"image size {self.width}×{self.height}, expected 1 to {MAX_SIDE} pixels per side")
         if self.width * self.height > MAX_PIXELS:

@@ -3,10 +3,11 @@
 import io
 from collections.abc import Collection
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from jaxtyping import Shaped
+
+from warpgs.files import DAMAGED_ARRAY
 
 from .archive import Archive
 
@@ -45,5 +46,5 @@ def _parse(path: Path, name: str, data: bytes) -> np.ndarray:
         if dtype.kind not in "fiub" or dtype.itemsize > 8 or count * dtype.itemsize > len(data) - file.tell():
             raise ValueError("not an array of numbers of the file's size")
         return np.frombuffer(data, dtype, count, file.tell()).reshape(shape, order="F" if fortran else "C")
-    except (ValueError, TypeError, SyntaxError, TokenError, OverflowError, RecursionError, MemoryError) as error:
+    except DAMAGED_ARRAY as error:
         raise ValueError(f"{path}: {name} is damaged or not an array of numbers") from error

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from warpgs.files import read_bounded
+from warpgs.files import read_start, require_file
 
 TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -29,6 +29,9 @@ MAX_HEADER = 1 << 16
 MAX_PROPERTIES = 256
 MAX_FILE = 8 << 30
 """Maximum size of the header and of a file [bytes]."""
+
+MAX_TEXT = 40
+"""Characters that a number of an ASCII file takes at most, with the space or the line break after it."""
 
 
 @dataclass
@@ -51,19 +54,27 @@ def read_ply(path: Path, formats: Collection[str] = (LITTLE,), *, first_only: bo
     Raises:
         ValueError: If it is not such a file, or damaged; the message names it.
     """
-    data = read_bounded(path, MAX_FILE)
-    if not re.match(rb"ply\r?\n", data):
+    size = require_file(path, MAX_FILE)
+    header = read_start(path, MAX_HEADER)
+    if not re.match(rb"ply\r?\n", header):
         raise ValueError(f"{path} is not a PLY file")
-    end = re.search(rb"\nend_header\r?\n", data[:MAX_HEADER])
+    end = re.search(rb"\nend_header\r?\n", header)
     if end is None:
         raise ValueError(f"{path} has no PLY header within its first {MAX_HEADER:,} bytes")
-    order, elements = _elements(path, data[: end.start()], formats)
+    order, elements = _elements(path, header[: end.start()], formats)
+    chosen = [*elements.items()][: 1 if first_only else None]
+    layouts = {name: _row_type(path, name, element, order) for name, element in chosen}
+    # The rest of the file may be anything: of a file system that keeps no zeros, even 8 GB in a few KiB.
+    rows = sum(
+        element.count * (layouts[name].itemsize if order else MAX_TEXT * len(element.columns))
+        for name, element in chosen
+    )
+    data = read_start(path, min(size, end.end() + rows))
     tables, offset = {}, end.end()
-    for name, element in [*elements.items()][: 1 if first_only else None]:
-        layout = _row_type(path, name, element, order)
-        tables[name], offset = (_rows if order else _lines)(path, name, element.count, layout, data, offset)
-    if offset != len(data) and not first_only:
-        raise ValueError(f"{path} is damaged: {len(data) - offset:,} bytes follow its last element")
+    for name, element in chosen:
+        tables[name], offset = (_rows if order else _lines)(path, name, element.count, layouts[name], data, offset)
+    if offset != size and not first_only:
+        raise ValueError(f"{path} is damaged: {size - offset:,} bytes follow its last element")
     return tables
 
 

@@ -92,15 +92,17 @@ def read_metric_depth(
     if stored.ndim != 2:
         raise ValueError(f"{path}: depth must be one channel, [H, W], got shape {list(stored.shape)}")
     stored = _fitting(path, "the depth", stored, size, image)
-    return inverse_of(stored.astype(np.float32) * np.float32(unit), size)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return inverse_of(stored.astype(np.float32) * np.float32(unit), size)
 
 
 def inverse_of(depth: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     """1 / depth, resized to ``size`` (width, height) without interpolation; NaN where depth is not positive."""
-    depth = depth.astype(np.float32)
-    known = np.isfinite(depth) & (depth > 0)
-    inverse = np.full(depth.shape, np.nan, np.float32)
-    inverse[known] = 1.0 / depth[known]
+    with np.errstate(over="ignore"):  # what is not finite then is unknown
+        depth = depth.astype(np.float32)
+        known = np.isfinite(depth) & (depth > 0)
+        inverse = np.full(depth.shape, np.nan, np.float32)
+        inverse[known] = 1.0 / depth[known]
     inverse[~np.isfinite(inverse)] = np.nan
     return resize_inverse(inverse, size)
 

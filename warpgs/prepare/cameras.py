@@ -2,15 +2,16 @@
 
 import dataclasses
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float
 
+from warpgs.data.archive import Archive
 from warpgs.data.lens import Lens, pinhole_matrix
-from warpgs.files import read_bounded
+from warpgs.files import DAMAGED_ARRAY
 
 MAX_BYTES = 1 << 30
 """Maximum size of a file of cameras and points [bytes]."""
@@ -91,10 +92,11 @@ class Cameras:
             ValueError: If the file is missing or damaged.
         """
         (file,) = Cameras.files(path)
-        data = io.BytesIO(read_bounded(file, MAX_BYTES))
+        archive = Archive(file, MAX_BYTES)
+        contents = {name.removesuffix(".npy"): archive.read(name, MAX_BYTES) for name in archive.sizes}
         try:
-            found = Cameras._parse(data)
-        except (BadZipFile, KeyError, TypeError, IndexError, EOFError, OSError) as error:
+            found = Cameras._parse({name: np.load(io.BytesIO(data)) for name, data in contents.items()})
+        except (*DAMAGED_ARRAY, KeyError, IndexError) as error:
             raise ValueError(f"{file} is damaged: {error}") from error
         numbers = (found.poses, found.points, found.lens.focal, found.lens.center)
         if found.poses.shape != (len(found.names), 3, 4) or not all(np.isfinite(n).all() for n in numbers):
@@ -102,15 +104,14 @@ class Cameras:
         return found
 
     @staticmethod
-    def _parse(data: io.BytesIO) -> "Cameras":
-        with np.load(data) as z:
-            v = z["lens"].tolist()
-            lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
-            if len(fisheye := z["fisheye"].tolist()):
-                lens = dataclasses.replace(lens, fisheye=(fisheye[0], fisheye[1], fisheye[2], fisheye[3]))
-            error, angle = z["quality"].tolist()
-            weak = bool(z["weak_features"])
-            return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)
+    def _parse(z: Mapping[str, np.ndarray]) -> "Cameras":
+        v = z["lens"].tolist()
+        lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
+        if len(fisheye := z["fisheye"].tolist()):
+            lens = dataclasses.replace(lens, fisheye=(fisheye[0], fisheye[1], fisheye[2], fisheye[3]))
+        error, angle = z["quality"].tolist()
+        weak = bool(z["weak_features"])
+        return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)
 
 
 def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"]:

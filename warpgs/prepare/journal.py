@@ -161,7 +161,7 @@ class Journal:
         self.step(name, lambda: make(path), lambda: files(path))
         try:
             return load(path)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{path}, a result of an earlier call, is damaged ({error}): use --force") from error
 
     def require_space(self, megabytes: int) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
-from warpgs.data.images import MAX_SIDE
+from warpgs.data.images import MAX_PIXELS, MAX_SIDE
 from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.files import require_file
 
@@ -118,8 +118,11 @@ def _open(source: Path) -> Iterator[tuple[Any, Any]]:
             raise unusable
         stream = container.streams.video[0]
         width, height = stream.codec_context.width, stream.codec_context.height
-        if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
-            raise ValueError(f"{source} claims frames of {width}×{height} pixels, the maximum is {MAX_SIDE}")
+        if not 0 < min(width, height) <= max(width, height) <= MAX_SIDE or width * height > MAX_PIXELS:
+            raise ValueError(
+                f"{source} claims frames of {width}×{height} pixels, the maximum is {MAX_SIDE} per side and "
+                f"{MAX_PIXELS:,} together"
+            )
         stream.thread_type = "AUTO"
         yield container, stream
 

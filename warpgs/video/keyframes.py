@@ -116,7 +116,7 @@ def read_keyframes(path: Path, capture: Capture) -> tuple[list[Camera], list[flo
     """The cameras of a file's keyframes, and the position of each on the path; raises as ``read_path``."""
     values = read_json(path, max_bytes=MAX_BYTES)
     if unknown := sorted(set(values) - {"up", "keyframes"}):
-        raise ValueError(f"{path} has an unknown field {unknown[0]!r}, expected up and keyframes")
+        raise ValueError(f"{path} has an unknown field {unknown[0][:60]!r}, expected up and keyframes")
     keyframes = values.get("keyframes")
     if not isinstance(keyframes, list) or not keyframes:
         raise ValueError(f"{path} has no list of keyframes")
@@ -133,7 +133,7 @@ def _keyframe(name: str, value: Any, capture: Capture, up: Tensor, size: tuple[i
     if not isinstance(value, dict):
         raise ValueError(f"{name} must be a JSON object, got {type(value).__name__}")
     if unknown := sorted(set(value) - KEYS):
-        raise ValueError(f"{name} has an unknown field {unknown[0]!r}, expected some of {', '.join(sorted(KEYS))}")
+        raise ValueError(f"{name} has an unknown field {unknown[0][:60]!r}, expected some of {', '.join(sorted(KEYS))}")
     if sum(pose in value for pose in POSES) != 1 or ("target" in value) != ("position" in value):
         raise ValueError(f"{name} must have either a view, or a position and a target, or a viewmat")
     camera = _posed(name, value, capture, up)
@@ -184,7 +184,9 @@ def _from_matrices(name: str, value: dict[str, Any], first: Camera) -> Camera:
         raise ValueError(f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
     width, height = value["width"], value["height"]
     if any(type(side) is not int or not 0 < side <= MAX_SIDE for side in (width, height)):
-        raise ValueError(f"{name}: expected a width and a height of 1 to {MAX_SIDE}, got {width!r} and {height!r}")
+        raise ValueError(
+            f"{name}: expected a width and a height of 1 to {MAX_SIDE}, got {reprlib.repr((width, height))}"
+        )
     return Camera(viewmat, K, width, height)
 
 
@@ -207,7 +209,7 @@ def _knots(path: Path, keyframes: Sequence[dict[str, Any]]) -> list[float]:
         raise ValueError(f"{path}: either every keyframe has a field at, or none has")
     knots = [_number(f"{path}: at", value) for value in given]
     if any(b <= a for a, b in itertools.pairwise(knots)):
-        raise ValueError(f"{path}: at must increase from keyframe to keyframe, got {knots}")
+        raise ValueError(f"{path}: at must increase from keyframe to keyframe, got {reprlib.repr(knots)}")
     return knots
 
 

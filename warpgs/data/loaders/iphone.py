@@ -58,4 +58,7 @@ class IPhoneLoader(NerfiesLoader):
             return values
         known = (values > 0) & (values != CLAMPED_DEPTH)
         metres = np.where(known, values, np.float32(np.nan))
-        return 1.0 / (metres * np.float32(units.scale))
+        with np.errstate(over="ignore", divide="ignore"):
+            inverse = 1.0 / (metres * np.float32(units.scale))
+        inverse[np.isinf(inverse)] = np.nan
+        return inverse

@@ -18,6 +18,9 @@ from warpgs.files import first_file
 
 from .left_out import IMAGE_SUFFIXES
 
+MAX_PATH = 1024
+"""Maximum length of a name that an index lists."""
+
 MAX_SEARCHED = 20_000
 """Maximum number of files that are looked at for a message about a missing one."""
 

@@ -5,6 +5,7 @@ sparse/0, resized_mask/<factor>x/<id>.png.png (0 = dynamic), depth/<factor>x/<id
 covisible/<factor>x/val/<id>.png.
 """
 
+import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -40,6 +41,9 @@ LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.jso
 
 MAX_STEP = 10**19
 """Maximum time_id: today's nanoseconds since 1970 are 1.8e18."""
+
+MAX_NAME = 200
+"""Maximum length of the id of a frame; a file's name has at most 255 bytes."""
 
 
 class Split(NamedTuple):
@@ -121,7 +125,7 @@ class NerfiesLoader(ABC):
 def _are_estimates(path: Path, dataset: dict[str, Any]) -> bool:
     masks = dataset.get("masks", GIVEN)
     if masks not in (GIVEN, ESTIMATED):
-        raise ValueError(f"{path}: masks must be {GIVEN!r} or {ESTIMATED!r}, got {masks!r}")
+        raise ValueError(f"{path}: masks must be {GIVEN!r} or {ESTIMATED!r}, got {reprlib.repr(masks)}")
     return masks == ESTIMATED
 
 
@@ -135,8 +139,8 @@ def read_ids(path: Path, values: dict[str, Any], key: str) -> list[str]:
     if not isinstance(ids, list) or not all(isinstance(i, str) for i in ids) or len(set(ids)) < len(ids):
         raise ValueError(f"{path}: {key} must be a list of distinct ids")
     for i in ids:
-        if not is_plain_id(i):
-            raise ValueError(f"{path}: {key} must hold plain names, got {i!r}")
+        if not is_plain_id(i) or len(i) > MAX_NAME:
+            raise ValueError(f"{path}: {key} must hold plain names, got {reprlib.repr(i)}")
     return ids
 
 

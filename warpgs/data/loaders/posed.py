@@ -23,6 +23,7 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.taken import taken_reader, without_distortion
 from warpgs.data.time_source import TimeSource
 from warpgs.data.units import SceneUnits, scene_units, units_around
+from warpgs.files import MAX_NUMBER
 
 from .listed import without_image_suffix
 from .options import LoadOptions
@@ -122,7 +123,7 @@ def posed_capture(
         cameras,
         train,
         evaluated,
-        torch.tensor(units.from_world(points), dtype=torch.float32),
+        torch.tensor(_in_scene(root, units, points), dtype=torch.float32),
         None if colors is None else torch.tensor(colors),
         reader.read,
         options.cache_frames,
@@ -144,6 +145,13 @@ def _points(
 def _units(frames: Sequence[PosedFrame], points: Float[np.ndarray, "P 3"]) -> SceneUnits:
     centers = np.array([frame.center for frame in frames])
     return scene_units(points, centers) if len(points) else units_around(centers)
+
+
+def _in_scene(root: Path, units: SceneUnits, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    try:
+        return units.from_world(points)
+    except ValueError as error:
+        raise ValueError(f"{root}: points: {error}") from error
 
 
 def _check_names(root: Path, names: Sequence[str]) -> None:
@@ -178,11 +186,12 @@ def world_to_camera(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarr
     """The inverse of a rigid [3, 4] camera-to-world matrix.
 
     Raises:
-        ValueError: If it is not finite, or its first three columns are not a rotation.
+        ValueError: If a number is not finite or larger than ``files.MAX_NUMBER``, or its first three columns are not a
+            rotation.
     """
     rotation = camera_to_world[:, :3].T
-    if not np.isfinite(camera_to_world).all():
-        raise ValueError("the pose is not finite")
+    if not (np.abs(camera_to_world) <= MAX_NUMBER).all():
+        raise ValueError(f"the pose is not finite, or its numbers are larger than {MAX_NUMBER:g}")
     if not is_rotation(rotation):
         raise ValueError(f"the pose is not a rotation and a translation: {_flaw(rotation)}")
     return np.hstack([rotation, -rotation @ camera_to_world[:, 3:]])

@@ -22,7 +22,7 @@ from warpgs.data.lens import Lens, unsupported_model
 from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
 
-from .listed import ListedFiles
+from .listed import MAX_PATH, ListedFiles
 from .matrices import FOCAL, contradictions, scale_note, scale_of_rotations, with_intrinsics, without_scale
 from .posed import opencv_from_opengl, world_to_camera
 from .turned import unclear_note
@@ -98,8 +98,8 @@ class Transforms:
         given = frame.get(key)
         if given is None:
             return None
-        if not isinstance(given, str) or not given or "\0" in given:
-            raise ValueError(f"{self.path}: {key} must name a file, got {given!r:.60}")
+        if not isinstance(given, str) or not given or "\0" in given or len(given) > MAX_PATH:
+            raise ValueError(f"{self.path}: {key} must name a file, got {reprlib.repr(given)}")
         path = self._files.find(given, SUFFIXES, is_image=key in IMAGES)
         if path is None:
             raise ValueError(self._files.missing(given, f"{self.path.name} lists it as {key}"))

@@ -141,7 +141,7 @@ def _check_cameras(path: Path) -> None:
         lines = read_bounded(path, MAX_TEXT).decode(errors="replace").splitlines()
         models = {line.partition(":")[2].strip() for line in lines if line.strip()}
         if other := models - {PINHOLE}:
-            raise ValueError(f"{path}: {unsupported_model(min(other), f'run ViPE with a {PINHOLE} camera')}")
+            raise ValueError(f"{path}: {unsupported_model(min(other)[:60], f'run ViPE with a {PINHOLE} camera')}")
 
 
 def _still_instances(path: Path) -> list[int]:
