@@ -304,13 +304,15 @@ def test_a_capture_in_which_everything_is_dynamic_is_fit(tmp_path):
     assert "read as blender" in texts(report, "note")
 
 
-def test_depth_is_not_checked_without_points(root):
+def test_depth_that_must_be_aligned_is_said_to_be_unused_without_points(root):
     write_depth(root, lambda depth: 1.0 / depth)
     (root / "points.npy").unlink()
     report = check_capture(root)
     assert "there are no sparse points" in texts(report, "warning")
     assert "warpgs prepare CAPTURE --add points" in texts(report, "warning")
-    assert "aligned" not in str(report)
+    unused = "the depth of 12 of 12 frames is not used, because it is aligned to sparse points and there are none"
+    assert unused in texts(report, "warning")
+    assert unused in [f.text for f in quick_findings(load_capture(root))]
 
 
 def test_one_time_for_all_frames_is_an_error(root):

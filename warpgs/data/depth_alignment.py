@@ -110,9 +110,12 @@ def align_to_points(samples: Sequence[PointSamples], is_metric: bool = False) ->
     return fit_scale_offset([(part.values, 1.0 / part.depth) for part in samples])
 
 
-DepthProblem = Literal["unknown", "few points", "constant", "inverted"]
+DepthProblem = Literal["unknown", "few points", "constant", "flat", "inverted"]
 """Why a frame's depth cannot be aligned: no finite value, too few points at which it is known, one value at all of
-them, or a value that grows with distance."""
+them, one distance of all of them, or a value that grows with distance."""
+
+MIN_RELATIVE_RANGE = 0.005
+"""Range of the depths of all but a tenth of the points, relative to their median, below which they are at one."""
 
 
 def alignment_problem(samples: PointSamples, alignment: Float[Tensor, "2"]) -> DepthProblem | None:
@@ -123,6 +126,9 @@ def alignment_problem(samples: PointSamples, alignment: Float[Tensor, "2"]) -> D
         return "unknown"
     if len(samples.values) < MIN_SAMPLES:
         return "few points"
+    low, middle, high = samples.depth.quantile(samples.depth.new_tensor([0.05, 0.5, 0.95])).tolist()
+    if high - low < MIN_RELATIVE_RANGE * middle:
+        return "flat"
     return "constant" if float(samples.values.max()) == float(samples.values.min()) else "inverted"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Conventions
 from warpgs.data.images import is_transparent
 from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resized_over_white
 from warpgs.data.time_source import TimeSource, with_steps
@@ -57,6 +57,7 @@ class BlenderLoader:
             assumption="masks" if masked else "dynamic",
             time_source=_time_source(indices, frames),
             own_times=True,
+            conventions=Conventions(depth="depth"),
             background="white" if is_white else "black",
             notes=[
                 *chain(*(index.notes for index in indices)),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Conventions
 from warpgs.data.images import MAX_SIDE
 from warpgs.data.lens import Lens
 from warpgs.data.npz import read_npz
@@ -20,6 +20,8 @@ SUFFIXES = ("_sgd_cvd_hr.npz", "_droid.npz")
 """Ends of the names of the files that MegaSaM writes, the better one first."""
 
 ARRAYS = ("images", "depths", "intrinsic", "cam_c2w")
+
+CONVENTIONS = Conventions(depth="depth", depth_unit="that of the poses")
 
 
 class MegaSamLoader:
@@ -68,7 +70,8 @@ class MegaSamLoader:
             for k in range(count)
         ]
         val = every_eighth([frame.name for frame in frames])
-        return posed_capture(root, frames, val, World(points=None, notes=scale_note(path.name, scale)), options)
+        world = World(points=None, notes=scale_note(path.name, scale), conventions=CONVENTIONS)
+        return posed_capture(root, frames, val, world, options)
 
 
 def _file(root: Path) -> Path:

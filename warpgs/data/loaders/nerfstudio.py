@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Conventions
 from warpgs.data.ply import read_ply_points
 from warpgs.data.resized import read_metric_depth, read_resized_image, read_resized_mask
 from warpgs.data.time_source import TimeSource, with_steps
@@ -127,4 +127,7 @@ def _evaluated(transforms: Transforms, names: dict[Path, str]) -> tuple[set[str]
 def _world(transforms: Transforms) -> World:
     """Points of ply_file_path; without it, points of the depth."""
     path = transforms.file(transforms.fields, "ply_file_path")
-    return World(points=None) if path is None else World(*read_ply_points(path))
+    if path is not None:
+        return World(*read_ply_points(path), conventions=Conventions(depth="depth"))
+    unit = f"depth_unit_scale_factor in {INDEX} ({_depth_unit(transforms):g})"
+    return World(points=None, conventions=Conventions(depth="depth", depth_unit=unit))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from warpgs.data.archive import Archive
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Conventions
 from warpgs.data.exr import exr_size, read_exr_channel
 from warpgs.data.images import decode_bytes, max_depth_pixels
 from warpgs.data.lens import Lens, unsupported_model
@@ -42,6 +42,8 @@ MAX_TEXT = 64 << 20
 
 MAX_DIGITS = 9
 """Maximum number of digits of the number of an instance."""
+
+CONVENTIONS = Conventions(depth="depth", depth_unit="that of the poses")
 
 
 class VipeLoader:
@@ -88,7 +90,8 @@ class VipeLoader:
         if without := max(0, video.count - len(frames)):
             where = f"pose/{name}.npz has no pose for them"
             notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are left out: {where}")
-        return posed_capture(root, frames, val, World(points=None, time_source=source, notes=notes), options)
+        world = World(points=None, time_source=source, notes=notes, conventions=CONVENTIONS)
+        return posed_capture(root, frames, val, world, options)
 
 
 def _video_name(root: Path) -> str:
