@@ -59,6 +59,19 @@ def test_images_with_one_line_each_are_read(text):
     assert "images.txt has one line per image" in capture.notes[0]
 
 
+@pytest.mark.parametrize("decimals", [False, True])
+def test_names_with_spaces_are_read_in_full(text, decimals):
+    root, replace = text
+    for k, name in enumerate(layouts.NAMES):
+        (root / f"images/{name}.png").rename(root / f"images/photo of me {k:02d} (1).png")
+        replace("images", f"{name}.png", f"photo of me {k:02d} (1).png")
+    if decimals:
+        replace("points3D", with_decimals, "")
+    capture = load_capture(root)
+    assert capture.train[:2] == ("photo of me 00 (1)", "photo of me 01 (1)")
+    assert np.array_equal(capture.frame("photo of me 07 (1)").image, layouts.image(7))
+
+
 TEXT = [
     (
         "points3D",

@@ -24,7 +24,7 @@ import numpy as np
 
 from warpgs.files import MAX_NUMBER, read_bounded, require_file
 
-from .colmap_text import lacks_features, rewrite_text_model
+from .colmap_text import lacks_features, names_with_spaces, rewrite_text_model
 from .images import MAX_SIDE
 
 if TYPE_CHECKING:
@@ -66,6 +66,9 @@ def read_model(folder: Path, note: Callable[[str], None] = lambda text: None) ->
         (other,) = (other for other in OPTIONAL if other != name)
         note(f"{folder} has {name}{suffix} but not {other}{suffix}: poses are those of images{suffix}")
     model = _opened(folder, suffix, [name for name in present if name not in lonely], note)
+    for number, full in (names_with_spaces(folder) if suffix == ".txt" else {}).items():
+        if number in model.images:
+            model.images[number].name = full
     try:
         _check_values(model)
     except (ValueError, RuntimeError, IndexError) as error:

@@ -6,7 +6,7 @@ second line for their features, and tracks of points where the images have no fe
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -67,6 +67,16 @@ def lacks_features(folder: Path) -> bool:
     return all(_is_image(line) for line in itertools.islice(_lines(folder / "images.txt"), 2))
 
 
+def names_with_spaces(folder: Path) -> dict[int, str]:
+    """The names in images.txt that have spaces, by ids of images; COLMAP writes them, but reads the first word."""
+    found = {}
+    for line, _ in _pairs(_lines(folder / "images.txt")):
+        fields = line.text.strip().split(None, 9)
+        if len(fields) == 10 and " " in fields[9] and fields[0].isdecimal():
+            found[int(fields[0])] = fields[9]
+    return found
+
+
 def _lines(path: Path) -> Iterator[_Line]:
     """The lines of a file that are not comments."""
     text = read_bounded(path, MAX_BYTES).decode(errors="surrogateescape")
@@ -106,7 +116,7 @@ def _images(path: Path, cameras: set[int], note: Callable[[str], None]) -> tuple
         note(f"{path} has one line per image, without the second one for features")
         pairs = [(line, None) for line in lines]
     else:
-        pairs = list(itertools.zip_longest(lines[::2], lines[1::2]))
+        pairs = list(_pairs(lines))
     written: list[str] = []
     num_features = {}
     for line, features in pairs:
@@ -120,6 +130,14 @@ def _images(path: Path, cameras: set[int], note: Callable[[str], None]) -> tuple
         written += [line.text.strip(), " ".join(words)]
         num_features[number] = len(words) // 3
     return written, num_features
+
+
+def _pairs(lines: Iterable[_Line]) -> Iterator[tuple[_Line, _Line | None]]:
+    """The line of every image and that of its features, as COLMAP reads them."""
+    remaining = iter(lines)
+    for line in remaining:
+        if line.words:
+            yield line, next(remaining, None)
 
 
 def _is_image(line: _Line) -> bool:
