@@ -109,7 +109,8 @@ class ListedFiles:
 def _spellings(name: str) -> Iterator[Parts]:
     """The parts of a path; absolute paths begin with "/"."""
     text = name.strip()
-    for spelled in dict.fromkeys((text, unquote(text))):
+    decoded = unquote(text)
+    for spelled in (text,) if decoded == text or ".." in decoded else (text, decoded):  # loaders looked for .. in text
         plain = spelled.removeprefix("file://").replace("\\", "/")
         has_drive = plain[1:3] == ":/"
         parts = [part for part in plain[2 * has_drive :].split("/") if part not in ("", ".")]
