@@ -43,6 +43,7 @@ def captures(*paths):
         ("D-NeRF/data/lego", "https://github.com/albertpumarola/D-NeRF"),
         ("dnerf/hook", "https://github.com/albertpumarola/D-NeRF"),
         ("nvidia/Balloon1", "https://gorokee.github.io/jsyoon/dynamic_synth"),
+        ("hand", "https://github.com/facebookresearch/nonrigid_nerf"),
         ("nonrigid_nerf/data/example_sequence", "https://github.com/facebookresearch/nonrigid_nerf"),
     ],
 )

@@ -54,7 +54,7 @@ PUBLISHED = (
     Published(
         "the example of NR-NeRF",
         "https://github.com/facebookresearch/nonrigid_nerf",
-        ("nonrigidnerf", "nrnerf"),
+        ("nonrigidnerf", "nrnerf", "hand"),
     ),
 )
 """Datasets whose layouts are read."""
