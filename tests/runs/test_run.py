@@ -56,6 +56,12 @@ def test_a_config_round_trips(tmp_path, capture, config):
     assert read_config(create(config, capture)) == config
 
 
+def test_a_run_prints_as_what_was_trained_on_what(run):
+    opened = Run.open(run, "cpu")
+    iterations, preset = opened.config.schedule.num_iterations, opened.config.preset or "no preset"
+    assert repr(opened) == f"<Run {run}: {preset} on {opened.config.data}, {iterations:,} iterations>"
+
+
 def test_a_moved_run_has_its_present_folder(run, tmp_path):
     moved = run.rename(tmp_path / "elsewhere")
     assert read_config(moved).out == moved

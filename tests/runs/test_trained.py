@@ -38,6 +38,12 @@ def translated(camera, by, time):
     return dataclasses.replace(camera, viewmat=viewmat, time=time)
 
 
+def test_a_trained_scene_prints_as_what_it_is(trained):
+    static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
+    gaussians = f"{static:,} static and {dynamic:,} dynamic Gaussians"
+    assert repr(trained) == f"<TrainedScene: {gaussians}, iteration {trained.metadata.iteration:,}, on cpu>"
+
+
 def test_one_graph_plays_every_camera_of_a_size(trained, captured):
     for k in range(3):
         camera = translated(scenes.camera(), 0.1 * k, 0.1 * k)

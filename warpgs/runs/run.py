@@ -90,6 +90,10 @@ class Run:
     folder: Path
     config: TrainConfig
 
+    def __repr__(self) -> str:
+        data, preset = self.config.data or "the built-in scene", self.config.preset or "no preset"
+        return f"<Run {self.folder}: {preset} on {data}, {self.config.schedule.num_iterations:,} iterations>"
+
     @staticmethod
     def open(folder: Path, device: Device | None = None, data: Path | None = None) -> "Run":
         """Opens a run folder.

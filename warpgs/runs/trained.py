@@ -50,6 +50,11 @@ class TrainedScene:
         color = background_color(config.background)
         self.background = torch.tensor(color, device=self.device) if any(color) else None
 
+    def __repr__(self) -> str:
+        static, dynamic = len(self.scene.static), len(self.scene.dynamic)
+        gaussians = f"{static:,} static and {dynamic:,} dynamic Gaussians"
+        return f"<TrainedScene: {gaussians}, iteration {self.metadata.iteration:,}, on {self.device}>"
+
     @property
     def device(self) -> torch.device:
         return self.scene.static.means.device
