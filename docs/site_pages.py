@@ -14,6 +14,9 @@ from warpgs.config.presets import PRESETS
 
 MARKER = "<!-- options -->"
 
+FILE_ONLY = re.compile(r"(<!-- (?:options|nothing) -->)\n.*?<!-- end -->\n?", re.DOTALL)
+"""What is said where the file is read instead of the site, which has the tables of options, or nothing, there."""
+
 ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 
 CELLS = {
@@ -37,7 +40,7 @@ SHOWN = "best"
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """mkdocs calls this for the text of every page."""
-    filled = markdown.replace(MARKER, "\n".join(sections())) if MARKER in markdown else markdown
+    filled = FILE_ONLY.sub(lambda note: "\n".join(sections()) if note[1] == MARKER else "", markdown)
     # GitHub needs pipes escaped also in the code of a table, where Python's Markdown shows the backslash.
     return ROW.sub(lambda row: CODE.sub(lambda code: code[0].replace("\\|", "|"), row[0]), filled)
 

@@ -118,9 +118,18 @@ def pages(monkeypatch):
     return importlib.import_module("site_pages")
 
 
+@pytest.mark.parametrize("name", ["options.md", "api.md"])
+def test_the_site_has_no_notes_on_how_it_is_made(pages, name):
+    text = pages.on_page_markdown((ROOT / "docs" / name).read_text())
+    assert text.startswith("# ")
+    for note in ("<!--", "mkdocs", "site_pages", "entries that begin"):
+        assert note not in text
+
+
 def test_every_option_is_on_the_page_of_options(pages):
     text = pages.on_page_markdown((ROOT / "docs" / "options.md").read_text())
     assert pages.MARKER not in text
+    assert "mkdocs serve" not in text  # which is for readers of the file
     for command in COMMANDS:
         for option in pages.options_of(command):
             name, default, meaning = pages.row(option)
