@@ -3,10 +3,11 @@
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 
-from tests.prepare.boards import record, write_video
+from tests.prepare.boards import record, texture, write_video
 from warpgs.prepare.cuts import CutFinder
 from warpgs.prepare.options import Selection
 from warpgs.prepare.timeline import plan_timeline
@@ -147,6 +148,27 @@ def test_a_single_other_frame_and_constant_change_are_no_cuts(levels, cuts):
     for k, grey in enumerate(greys(*levels)):
         finder.add(k, k / 10.0, grey)
     assert [step for step, _ in finder.found] == cuts
+
+
+def pan(*positions: tuple[int, int]) -> list[np.ndarray]:
+    """What a camera sees of one of two long walls, from these columns on."""
+    walls = [cv2.cvtColor(texture(seed, (150, 140, 120), 900, (20, 60, 200)), cv2.COLOR_RGB2GRAY) for seed in (3, 4)]
+    return [walls[wall][300:480, column : column + 320] for wall, column in positions]
+
+
+def cuts_of(frames: list[np.ndarray]) -> list[int]:
+    finder = CutFinder()
+    for k, grey in enumerate(frames):
+        finder.add(k, k / 10.0, grey)
+    return [step for step, _ in finder.found]
+
+
+@pytest.mark.parametrize("jump", [60, 110, 150, -140])
+def test_a_pan_that_drops_frames_is_no_cut(jump):
+    """The frames beside the gap correlate with their neighbours, but not with each other."""
+    before, after = [200, 206, 212], [212 + jump, 218 + jump, 224 + jump]
+    assert cuts_of(pan(*((0, column) for column in before + after))) == []
+    assert cuts_of(pan(*((0, column) for column in before), *((1, column) for column in after))) == [3]
 
 
 def test_a_part_of_a_video_is_taken(tmp_path, images):
