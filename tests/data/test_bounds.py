@@ -2,6 +2,7 @@
 
 import shutil
 import struct
+import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -181,6 +182,15 @@ def test_points_too_far_away_are_refused_with_their_capture(edited):
     header = data.index(b"end_header\n") + len(b"end_header\n")
     (root / "points.ply").write_bytes(data[:header] + struct.pack("<d", 1e30) + data[header + 8 :])
     refused(root, rf"{root}.*: positions must be finite and at most 1e\+09 scene units")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "points3D.txt"])
+def test_links_into_proc_are_refused_before_colmap_never_returns_from_them(edited, name):
+    path = edited("colmap as text") / "sparse/0" / name
+    path.unlink()
+    path.symlink_to("/proc/self/mem")
+    refused(path.parents[2], rf"sparse/0/{name} cannot be read")
 
 
 @pytest.mark.parametrize("length", [1025, 300_000])

@@ -397,6 +397,11 @@ def test_a_damaged_file_is_refused_with_its_name_and_what_is_wrong(capsys, run, 
     assert message in error
 
 
+def test_a_text_in_place_of_a_metric_is_refused(capsys, run):
+    (run / "metrics.json").write_text('{"device": "A", "psnr": "B"}')
+    assert f"{run / 'metrics.json'} is damaged: 'psnr' cannot be 'B'" in error_line(capsys, "report", run, "--views", 0)
+
+
 @pytest.mark.parametrize("number", ["Infinity", "-Infinity", "NaN", "1" + 400 * "0", "1" + 5000 * "0"])
 @pytest.mark.parametrize("name", ["train_seconds", "peak_bytes", "psnr"])
 def test_impossible_metrics_of_a_run_are_refused(capsys, run, name, number):
