@@ -56,10 +56,11 @@ def test_a_config_round_trips(tmp_path, capture, config):
     assert read_config(create(config, capture)) == config
 
 
-def test_a_run_prints_as_what_was_trained_on_what(run):
-    opened = Run.open(run, "cpu")
-    iterations, preset = opened.config.schedule.num_iterations, opened.config.preset or "no preset"
-    assert repr(opened) == f"<Run {run}: {preset} on {opened.config.data}, {iterations:,} iterations>"
+def test_a_run_prints_as_what_was_trained_on_what(tmp_path, capture):
+    folder = create(dataclasses.replace(tiny.CONFIG, out=tmp_path / "own", data=tmp_path), capture)
+    assert repr(Run.open(folder, "cpu")) == f"<Run {folder}: quick on {tmp_path}, 32 iterations>"
+    built_in = Run.open(create(dataclasses.replace(PRESETS["best"], out=tmp_path / "other"), capture), "cpu")
+    assert repr(built_in) == f"<Run {tmp_path / 'other'}: best on the built-in scene, 45,400 iterations>"
 
 
 def test_a_moved_run_has_its_present_folder(run, tmp_path):
