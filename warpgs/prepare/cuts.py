@@ -5,7 +5,7 @@ of one shot it stays above 0.7 (11 clips of DAVIS 2016), across cuts it is below
 
 A fast pan, or one with dropped frames, has a low correlation, too, but shows a part of the frame before at another
 place: a half of the image that is turned by 2°, 4 % larger and blurred is found again with a correlation of its details
-above 0.7 after a shift by up to half of the width; between unrelated images it is 0.5 at most (32 images).
+above 0.7 after a shift by up to half of the width; in 99 % of the pairs of 32 unrelated images it is below 0.5.
 """
 
 from collections import deque
