@@ -26,7 +26,7 @@ def write_json(path: Path, values: object) -> None:
 
 
 def edit_json(path: Path, **changes: object) -> None:
-    """Changes some entries of a JSON object; None removes an entry."""
+    """Changes some entries of a JSON object; None removes an entry, while others that are null stay."""
     values = {**json.loads(path.read_text()), **changes}
     write_json(path, {key: value for key, value in values.items() if value is not None or key not in changes})
 
