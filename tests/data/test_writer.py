@@ -79,7 +79,7 @@ def test_distortion_is_written(root):
 def test_frames_are_split_and_ordered_by_time(root):
     capture = load_capture(root)
     assert (capture.train, capture.val) == (("a", "b", "c"), ("d",))
-    assert [capture.cameras[name].time for name in TIMES] == [3 / 9, 5 / 9, 1.0, 5 / 9]
+    assert [capture.cameras[name].time for name in TIMES] == [0.0, 2 / 6, 1.0, 2 / 6]
 
 
 def test_warp_ids_count_the_distinct_times(root):
