@@ -5,7 +5,7 @@ import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -59,6 +59,13 @@ def background_color(background: Background | Literal["capture", "mean"]) -> Col
     if background == "mean":
         raise ValueError('background is "mean": call fitted(config, capture, log) first')
     return background if isinstance(background, tuple) else COLORS["white" if background == "white" else "black"]
+
+
+class UnknownFrameError(KeyError):
+    """A capture has no frame of an id."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # KeyError shows its representation
 
 
 @dataclass(frozen=True)
@@ -119,6 +126,8 @@ class TakenFrame:
 class Capture:
     """A capture in scene units: a position p of the files is (p − center) · scale.
 
+    It can be pickled, without the frames that it keeps in memory: each worker of a DataLoader reads its own.
+
     Attributes:
         name: For messages and reports.
         cameras: The camera of each id of ``train`` and ``val``.
@@ -172,9 +181,26 @@ class Capture:
         self.extent = extent_of([self.cameras[name] for name in self.train])
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()
+        self._make_cache()
+
+    def _make_cache(self) -> None:
         largest = max(camera.width * camera.height for camera in self.cameras.values())
         fitting = max(1, MAX_CACHE_BYTES // (FRAME_BYTES_PER_PIXEL * largest))
         self._cached = lru_cache(maxsize=min(self.cache_frames, fitting))(self.read)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What another process needs, such as a worker of a DataLoader: all but the cache of frames."""
+        return {name: value for name, value in vars(self).items() if name != "_cached"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_cache()
+
+    def __copy__(self) -> "Capture":
+        """A copy with the same cache of frames, which ``__getstate__`` leaves out."""
+        capture = object.__new__(Capture)
+        vars(capture).update(vars(self))
+        return capture
 
     def __repr__(self) -> str:
         frames = f"{len(self.train)} frames to train on, {len(self.val)} to evaluate on"
@@ -221,11 +247,11 @@ class Capture:
         """A frame, from the cache if it is among the last ``cache_frames`` read.
 
         Raises:
-            KeyError: If the capture has no frame of this id.
+            KeyError: If the capture has no frame of this id; the message has a similar one.
             ValueError: If a file of the frame is missing, damaged or of another size; the message names it.
         """
         if name not in self.cameras:
-            raise KeyError(name)
+            raise UnknownFrameError(missing_view(self, name))
         frame = self._cached(name)
         if name in self._moved:
             frame = replace(frame, camera=self.cameras[name])

@@ -1,6 +1,8 @@
 """Images, masks and depth of any resolution, resized to that of the camera; captures of smaller images."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -128,7 +130,11 @@ def resize_mask(static: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[
 def reduced_capture(capture: Capture, max_side: int) -> Capture:
     """The capture with frames of at most ``max_side`` pixels along the larger side; larger frames are averaged."""
     cameras = {name: _reduced_camera(camera, max_side) for name, camera in capture.cameras.items()}
-    return replace(capture, cameras=cameras, read=lambda name: reduced_frame(capture.frame(name), cameras[name]))
+    return replace(capture, cameras=cameras, read=partial(_read_reduced, capture, cameras))
+
+
+def _read_reduced(capture: Capture, cameras: Mapping[str, Camera], name: str) -> Frame:
+    return reduced_frame(capture.frame(name), cameras[name])
 
 
 def _reduced_camera(camera: Camera, max_side: int) -> Camera:

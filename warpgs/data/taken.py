@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -47,15 +47,13 @@ def taken_reader(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens])
         read: Reads a frame, undistorted as for a lens.
         lenses: The lens of each frame.
     """
-    if all(lens.is_pinhole for lens in lenses.values()):
-        return None
+    return None if all(lens.is_pinhole for lens in lenses.values()) else partial(_read_taken, read, lenses)
 
-    def read_taken(name: str) -> TakenFrame:
-        if lenses[name].fisheye:
-            raise ValueError(f"frame {name} was taken by a fisheye lens: it can only be evaluated undistorted")
-        return taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
 
-    return read_taken
+def _read_taken(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens], name: str) -> TakenFrame:
+    if lenses[name].fisheye:
+        raise ValueError(f"frame {name} was taken by a fisheye lens: it can only be evaluated undistorted")
+    return taken_frame(read(name, without_distortion(lenses[name])), lenses[name])
 
 
 @lru_cache(maxsize=4)

@@ -48,6 +48,9 @@ class VideoFrames:
         first = self.read(0)
         self.size = first.shape[1], first.shape[0]
 
+    def __reduce__(self) -> tuple[type["VideoFrames"], tuple[Path]]:
+        return VideoFrames, (self.path,)  # each process decodes on its own
+
     def read(self, index: int) -> UInt8[np.ndarray, "H W 3"]:
         """The RGB frame of an index.
 

@@ -9,6 +9,7 @@ import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,10 +96,7 @@ class NerfiesLoader(ABC):
             path = find_file(root / "camera", f"{name}.json") or root / f"camera/{name}.json"
             cameras[name], lenses[name] = read_camera(path, units, factor, time, options.lens)
         points, colors = read_points(root, units)
-
-        def read_depth(path: Path, size: tuple[int, int], image: Path) -> np.ndarray:
-            return self.inverse_depth(path, size, units, image)
-
+        read_depth = partial(_read_depth, self, units)
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
         depths = [files[name].depth for name in split.train]
         listed = f"the split of {split.source.name} uses them neither for training nor for evaluation"
@@ -120,6 +118,12 @@ class NerfiesLoader(ABC):
                 *images_left_out(root, (file.image for file in files.values()), listed),
             ],
         )
+
+
+def _read_depth(
+    loader: NerfiesLoader, units: SceneUnits, path: Path, size: tuple[int, int], image: Path
+) -> Float[np.ndarray, "H W"]:
+    return loader.inverse_depth(path, size, units, image)
 
 
 def _are_estimates(path: Path, dataset: dict[str, Any]) -> bool:
