@@ -1,14 +1,20 @@
 """Pinhole cameras."""
 
 import dataclasses
+import math
+import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
-from .runtime.checks import check_image_size, check_same_device, check_tensor
+from .runtime.checks import as_whole_number, check_image_size, check_same_device, check_tensor
+
+Point = Shaped[Tensor, "3"] | Shaped[np.ndarray, "3"] | Sequence[float]
+"""Three numbers."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,8 @@ class Camera:
         check_tensor("viewmat", self.viewmat, (4, 4), {})
         check_tensor("K", self.K, (3, 3), {})
         check_same_device({"viewmat": self.viewmat, "K": self.K})
+        object.__setattr__(self, "width", as_whole_number(self.width))
+        object.__setattr__(self, "height", as_whole_number(self.height))
         check_image_size(self.width, self.height)
 
     @property
@@ -49,7 +57,7 @@ class Camera:
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view as an image of another size."""
-        scale = torch.tensor([width / self.width, height / self.height, 1.0], device=self.K.device)
+        scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=torch.float32, device=self.K.device)
         return dataclasses.replace(self, K=self.K * scale[:, None], width=width, height=height)
 
     @property
@@ -77,7 +85,7 @@ class Camera:
         self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
     ) -> Float[Tensor, "P 3"]:
         """[P, 3] points of the world at the centres of pixels, at a depth [scene units]."""
-        pixels = torch.stack([column + 0.5, row + 0.5, torch.ones_like(depth)], 1)
+        pixels = torch.stack([column.to(depth) + 0.5, row.to(depth) + 0.5, torch.ones_like(depth)], 1)
         viewed = (pixels @ torch.linalg.inv(self.K).T) * depth[:, None]
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
@@ -96,9 +104,9 @@ class Camera:
 
     @staticmethod
     def looking_at(
-        position: Float[Tensor, "3"],
-        target: Float[Tensor, "3"],
-        up: Float[Tensor, "3"],
+        position: Point,
+        target: Point,
+        up: Point,
         focal: float,
         size: tuple[int, int],
         time: float = 0.0,
@@ -106,16 +114,25 @@ class Camera:
         """A camera that sees ``target`` in the middle of its image.
 
         Args:
-            position: [3] centre of the camera in the world.
+            position: [3] centre of the camera in the world: a tensor, whose device the camera has, an array or a
+                sequence, of any type of numbers.
             target: [3] point of the world.
             up: [3] direction that is up in the image.
-            focal: Focal length [px].
+            focal: Focal length [px], positive.
             size: (width, height) of the image [px].
             time: Time in [0, 1].
 
         Raises:
-            ValueError: If ``position`` and ``target`` coincide, or the view direction is parallel to ``up``.
+            ValueError: If ``position``, ``target`` or ``up`` is not three finite numbers, ``position`` and ``target``
+                coincide, the view direction is parallel to ``up``, or the focal length is not positive and finite.
         """
+        device = position.device if isinstance(position, Tensor) else torch.device("cpu")
+        position, target, up = (
+            _vector(name, value, device) for name, value in (("position", position), ("target", target), ("up", up))
+        )
+        focal = float(focal)
+        if not 0.0 < focal < math.inf:
+            raise ValueError(f"focal must be positive and finite, got {focal}")
         forward = torch.nn.functional.normalize(target - position, dim=0)
         sideways = torch.linalg.cross(forward, up)
         if not sideways.norm() > 1e-6 * up.norm():
@@ -125,9 +142,20 @@ class Camera:
             )
         right = torch.nn.functional.normalize(sideways, dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat = torch.eye(4, device=position.device)
+        viewmat = torch.eye(4, dtype=torch.float32, device=device)
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ position
         width, height = size
-        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], device=position.device)
-        return Camera(viewmat, K, width, height, time)
+        K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+        return Camera(viewmat, torch.tensor(K, dtype=torch.float32, device=device), width, height, time)
+
+
+def _vector(name: str, value: Point, device: torch.device) -> Float[Tensor, "3"]:
+    """Three numbers in single precision; a tensor keeps its gradient."""
+    try:
+        vector = torch.as_tensor(value, dtype=torch.float32, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{name} must be three numbers, got {reprlib.repr(value)}") from error
+    if vector.shape != (3,) or not bool(vector.isfinite().all()):
+        raise ValueError(f"{name} must be three finite numbers, got {reprlib.repr(vector.tolist())}")
+    return vector

@@ -49,7 +49,12 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     data = config.data if config.data is None or is_builtin(config.data) else config.data.resolve()
     weights = config.lpips and config.lpips.resolve()
     plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
-    write_text(folder / NAME, json.dumps(plain, indent=2, default=str) + "\n")
+    write_text(folder / NAME, json.dumps(plain, indent=2, default=_as_json) + "\n")
+
+
+def _as_json(value: Any) -> Any:
+    """A path as text; a number of NumPy or torch as one of Python."""
+    return value.item() if hasattr(value, "item") else str(value)
 
 
 def read_config(folder: Path) -> TrainConfig:

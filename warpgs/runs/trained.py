@@ -23,12 +23,22 @@ MAX_GRAPHS = 4
 """Image sizes whose frames stay captured: several browsers may watch one scene."""
 
 
+TIME_ROUNDING = 1e-6
+"""How far a time may be outside of [0, 1], because sums and single precision round."""
+
+
 class _Inputs(NamedTuple):
     """What a captured frame reads, at addresses that stay the same."""
 
     viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
     time: Float[Tensor, "1"]
+
+
+def require_time(time: float) -> None:
+    """Raises ValueError unless a time is in [0, 1], but for rounding; NaN is not."""
+    if not -TIME_ROUNDING <= time <= 1.0 + TIME_ROUNDING:
+        raise ValueError(f"time must be in [0, 1], from the first frame to the last, got {time}")
 
 
 class TrainedScene:
@@ -48,7 +58,7 @@ class TrainedScene:
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
         color = background_color(config.background)
-        self.background = torch.tensor(color, device=self.device) if any(color) else None
+        self.background = torch.tensor(color, dtype=torch.float32, device=self.device) if any(color) else None
 
     def __repr__(self) -> str:
         static, dynamic = len(self.scene.static), len(self.scene.dynamic)
@@ -86,10 +96,14 @@ class TrainedScene:
         Args:
             time: Time in [0, 1].
             residual: Whether the appearance network changes the static Gaussians (paper Eq. 8).
+
+        Raises:
+            ValueError: If the time is not in [0, 1]: nothing was trained there.
         """
         return self._splats(self._on_device(time), residual)
 
     def _on_device(self, time: float) -> Float[Tensor, "1"]:
+        require_time(time)
         # A double of numpy would become a tensor of doubles.
         return torch.tensor([time], dtype=torch.float32, device=self.device)
 
@@ -110,6 +124,9 @@ class TrainedScene:
             depth: Whether to render depth as well, as ``depth`` [H, W] of each layer: the mean depth of its Gaussians
                 along the camera's z axis, weighted by their contribution [scene units]. Where alpha is 0, it is 0;
                 where alpha is low, it is that of the little that is there.
+
+        Raises:
+            ValueError: If the time is not in [0, 1]: nothing was trained there.
         """
         at = self._on_device(camera.time if time is None else time)
         return self._render(camera.to(self.device), at, branches, depth)
@@ -118,10 +135,11 @@ class TrainedScene:
         """The joint image at the camera's time, as fast as possible.
 
         On CUDA the frame is captured in a CUDA graph and replayed for every camera of the same size; the image is then
-        the same tensor in every call, with new values.
+        the same tensor in every call, with new values. Raises as ``render``.
         """
         if not self.uses_graphs:
             return self.render(camera).joint.image
+        require_time(camera.time)
         if self._inputs is None:
             self._inputs = _Inputs(camera.viewmat.clone(), camera.K.clone(), camera.viewmat.new_zeros(1))
         inputs = self._inputs

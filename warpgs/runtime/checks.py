@@ -1,6 +1,8 @@
 """Input checks of the public functions, with readable messages."""
 
+import operator
 from collections.abc import Mapping
+from typing import SupportsIndex
 
 import torch
 from torch import Tensor
@@ -56,6 +58,16 @@ def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
                 raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
         elif device != first:
             raise ValueError(f"all tensors must be on one device: {first_name} is on {first}, {name} on {device}")
+
+
+def as_whole_number(value: object) -> object:
+    """An integer of NumPy or torch as one of Python; everything else as it is."""
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex):
+        return value
+    try:
+        return operator.index(value)
+    except TypeError:  # a tensor that is not a whole number
+        return value
 
 
 def check_image_size(width: int, height: int) -> None:
