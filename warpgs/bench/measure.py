@@ -114,7 +114,7 @@ def time_in_turn(steps: Mapping[str, Callable[[], object]], device: str, repeats
 def time_stages(workload: Workload, device: str, repeats: int) -> dict[str, float]:
     """Median time [ms] of the kernels of each stage, and of SSIM between the rendered image and noise."""
     image = workload.forward()[0].contiguous().requires_grad_()
-    noise = torch.rand(image.shape, generator=torch.Generator().manual_seed(SEED)).to(image.device)
+    noise = torch.rand(image.shape, dtype=torch.float32, generator=torch.Generator().manual_seed(SEED)).to(image.device)
     samples: list[dict[str, float]] = []
     for _ in range(WARM_UPS[device] + repeats):
         with profile() as kernels:

@@ -46,7 +46,9 @@ class Scene:
         if sh_degree is not None:
             splats = with_harmonics(splats, sh_degree)
         if branches == "random":
-            coins = torch.rand(self.num_gaussians, generator=torch.Generator().manual_seed(SEED + 1))
+            coins = torch.rand(
+                self.num_gaussians, dtype=torch.float32, generator=torch.Generator().manual_seed(SEED + 1)
+            )
             splats = dataclasses.replace(splats, is_dynamic=coins < 0.5)
         if branches == "disc":
             splats = dataclasses.replace(splats, is_dynamic=in_disc(splats.means, camera))
@@ -80,30 +82,35 @@ def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> 
     """
     generator = torch.Generator().manual_seed(seed)
     focal = 0.9 * width
-    z = torch.rand(N, generator=generator) * 8 + 2
-    u = torch.rand(N, generator=generator) * width
-    v = torch.rand(N, generator=generator) * height
+    z = torch.rand(N, dtype=torch.float32, generator=generator) * 8 + 2
+    u = torch.rand(N, dtype=torch.float32, generator=generator) * width
+    v = torch.rand(N, dtype=torch.float32, generator=generator) * height
     means = torch.stack([(u - width / 2) * z / focal, (v - height / 2) * z / focal, z], -1)
-    quats = torch.randn(N, 4, generator=generator)
-    scales = torch.exp(torch.randn(N, 3, generator=generator) * 0.8) * (pixels * 0.5) * z[:, None] / focal
-    opacities = torch.sigmoid(torch.randn(N, generator=generator) * 1.5)
-    colors = torch.rand(N, 3, generator=generator)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-    return Splats(means, quats, scales, opacities, colors), Camera(torch.eye(4), K, width, height)
+    quats = torch.randn(N, 4, dtype=torch.float32, generator=generator)
+    scales = (
+        torch.exp(torch.randn(N, 3, dtype=torch.float32, generator=generator) * 0.8)
+        * (pixels * 0.5)
+        * z[:, None]
+        / focal
+    )
+    opacities = torch.sigmoid(torch.randn(N, dtype=torch.float32, generator=generator) * 1.5)
+    colors = torch.rand(N, 3, dtype=torch.float32, generator=generator)
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    return Splats(means, quats, scales, opacities, colors), Camera(torch.eye(4, dtype=torch.float32), K, width, height)
 
 
 def with_harmonics(splats: Splats, degree: int) -> Splats:
     """The splats with spherical harmonics of a degree whose mean over all directions is their colour."""
     assert splats.colors is not None
     generator = torch.Generator().manual_seed(SEED + 2)
-    sh = SH_NOISE * torch.randn(len(splats.means), num_bases(degree), 3, generator=generator)
+    sh = SH_NOISE * torch.randn(len(splats.means), num_bases(degree), 3, dtype=torch.float32, generator=generator)
     sh[:, 0] = (splats.colors - 0.5) / SH_C0
     return dataclasses.replace(splats, colors=None, sh=sh)
 
 
 def in_disc(means: Tensor, camera: Camera) -> Tensor:
     """[N] whether means in camera space project into a disc around the image center that covers ``DISC_AREA`` of it."""
-    center = torch.tensor([camera.width / 2, camera.height / 2])
+    center = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float32)
     homogeneous = means @ camera.K.T
     means2d = homogeneous[:, :2] / homogeneous[:, 2:]
     return (means2d - center).square().sum(-1) < DISC_AREA * camera.width * camera.height / math.pi

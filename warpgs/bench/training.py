@@ -57,7 +57,7 @@ def random_capture(splats: Splats, camera: Camera) -> Capture:
     static = ~in_disc(rays.reshape(-1, 3), camera).reshape(height, width)
     image = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=generator)
     cameras = {str(k): dataclasses.replace(camera, time=k / (NUM_VIEWS - 1)) for k in range(NUM_VIEWS)}
-    inverse_depth = torch.full((height, width), 0.2)
+    inverse_depth = torch.full((height, width), 0.2, dtype=torch.float32)
 
     def read(name: str) -> Frame:
         return Frame(name, cameras[name], image, static, inverse_depth)
@@ -77,7 +77,7 @@ def random_scene(splats: Splats, dynamic: Bool[Tensor, " N"], config: ModelConfi
                 splats.scales[part].log(),
                 splats.opacities[part].clamp(1e-4, 1.0 - 1e-4).logit(),
                 ((splats.colors[part] - 0.5) / SH_C0)[:, None],
-                torch.zeros(int(part.sum()), (config.sh_degree + 1) ** 2 - 1, 3),
+                torch.zeros(int(part.sum()), (config.sh_degree + 1) ** 2 - 1, 3, dtype=torch.float32),
             )
         )
     return SplitScene(parts[0], parts[1], config, *scene_box(splats.means))
@@ -100,8 +100,11 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     config = dataclasses.replace(PRESETS[preset], device="cuda" if device == "cuda" else "cpu")
     capture = random_capture(splats, camera)
     views = Views(capture, torch.device(device), config.resident_bytes)
-    alignments = torch.tensor([[1.0, 0.0]], device=device).repeat(NUM_VIEWS, 1)
-    trust = DepthTrust(torch.ones(NUM_VIEWS, device=device), torch.zeros(NUM_VIEWS, device=device))
+    alignments = torch.tensor([[1.0, 0.0]], dtype=torch.float32, device=device).repeat(NUM_VIEWS, 1)
+    trust = DepthTrust(
+        torch.ones(NUM_VIEWS, dtype=torch.float32, device=device),
+        torch.zeros(NUM_VIEWS, dtype=torch.float32, device=device),
+    )
     dynamic = in_disc(splats.means, camera)
     scene = random_scene(splats, dynamic, config.model).to(device)
     if device == "cuda":
@@ -130,7 +133,8 @@ def plain_phase(phase: Phase) -> Phase:
 
 def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterable[float]:
     samples = [
-        Sample(k % NUM_VIEWS, 0.0, torch.rand(3, generator=torch.Generator().manual_seed(k)), k) for k in range(repeats)
+        Sample(k % NUM_VIEWS, 0.0, torch.rand(3, dtype=torch.float32, generator=torch.Generator().manual_seed(k)), k)
+        for k in range(repeats)
     ]
     for sample in [samples[0]] * (WARM_UPS + 2 if device == "cuda" else 1):
         step(plan, sample)

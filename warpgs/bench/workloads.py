@@ -73,7 +73,9 @@ def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> W
     with torch.no_grad():
         images = run()
     generator = torch.Generator().manual_seed(SEED)
-    v_images = tuple(torch.randn(image.shape, generator=generator).to(image.device) for image in images)
+    v_images = tuple(
+        torch.randn(image.shape, dtype=torch.float32, generator=generator).to(image.device) for image in images
+    )
     return Workload(run, tuple(getattr(splats, name) for name in names), names, v_images)
 
 

@@ -84,10 +84,10 @@ def trace(time: float, position: Float[np.ndarray, "3"], size: BallsSize) -> tup
     """
     cpu, side = torch.device("cpu"), size.side * SUPERSAMPLING
     focal = 0.5 * side / math.tan(0.5 * ANGLE)
-    target, up = torch.tensor(TARGET), torch.tensor([0.0, 0.0, 1.0])
+    target, up = torch.tensor(TARGET, dtype=torch.float32), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32)
     camera = Camera.looking_at(torch.from_numpy(position).float(), target, up, focal, (side, side), time)
-    lamp = torch.tensor([[1.5, -1.0, 6.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
-    center = torch.full((1, 4), 0.5)
+    lamp = torch.tensor([[1.5, -1.0, 6.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], dtype=torch.float32)
+    center = torch.full((1, 4), 0.5, dtype=torch.float32)
     traced = raytrace(as_tensors(_balls(time, size), cpu), lamp, center, camera.viewmat, camera.K, camera.size)
     hit = (traced.bodies >= 0).float()[..., None]
     alpha, color = averaged(hit, SUPERSAMPLING), averaged(traced.image.clamp(0, 1) * hit, SUPERSAMPLING)

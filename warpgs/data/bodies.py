@@ -65,9 +65,9 @@ def as_tensors(bodies: Sequence[Body], device: torch.device) -> Bodies:
     return Bodies(
         torch.tensor([body.shape for body in bodies], dtype=torch.int32, device=device),
         torch.stack(rows).contiguous().to(device),
-        torch.tensor([body.colors for body in bodies], device=device),
-        torch.tensor([body.frequency for body in bodies], device=device),
-        torch.tensor([(body.shine, body.mirror, body.bulge) for body in bodies], device=device),
+        torch.tensor([body.colors for body in bodies], dtype=torch.float32, device=device),
+        torch.tensor([body.frequency for body in bodies], dtype=torch.float32, device=device),
+        torch.tensor([(body.shine, body.mirror, body.bulge) for body in bodies], dtype=torch.float32, device=device),
     )
 
 

@@ -164,7 +164,7 @@ def smooth_factor(samples: PointSamples, alignment: Float[Tensor, "2"]) -> tuple
     ratios = -(samples.depth * aligned).log()
     row, column, ratios = (part[used].cpu() for part in (samples.row, samples.column, ratios))
     if len(ratios) < 2 * MIN_SAMPLES:
-        return torch.ones(samples.size), torch.inf
+        return torch.ones(samples.size, dtype=torch.float32), torch.inf
     even = torch.arange(len(ratios)) % 2 == 0
     half = _smoothed(row[even], column[even], ratios[even], samples.size)
     error = (half[row, column] - ratios)[~even].expm1().abs().median().item()

@@ -33,7 +33,7 @@ def exposure_gains(capture: Capture) -> Float[Tensor, "T 3"]:
         [T, 3] factors of red, green and blue, in the order of ``capture.train``; their median over frames is 1.
     """
     order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
-    logs, log, before = torch.zeros(len(order), 3), torch.zeros(3), None
+    logs, log, before = torch.zeros(len(order), 3, dtype=torch.float32), torch.zeros(3, dtype=torch.float32), None
     for k, frame in zip(order, capture.frames([capture.train[k] for k in order]), strict=True):
         after = _log_intensities(frame)
         if before is not None:
@@ -59,10 +59,10 @@ def _log_intensities(frame: Frame) -> np.ndarray:
 def _jump(before: np.ndarray, after: np.ndarray) -> Float[Tensor, "3"]:
     """Change of the logarithms of red, green and blue from one small image to the next; 0 if it is no jump."""
     if before.shape != after.shape:
-        return torch.zeros(3)
+        return torch.zeros(3, dtype=torch.float32)
     change = (after - before).reshape(-1, 3)
     known = np.isfinite(change).all(1)
     if known.sum() < MIN_PIXELS:
-        return torch.zeros(3)
+        return torch.zeros(3, dtype=torch.float32)
     median = torch.from_numpy(np.median(change[known], axis=0))
-    return median if bool(median.abs().max() >= MIN_JUMP) else torch.zeros(3)
+    return median if bool(median.abs().max() >= MIN_JUMP) else torch.zeros(3, dtype=torch.float32)

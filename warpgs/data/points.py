@@ -34,7 +34,7 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         _, points, stored, _ = load_model(model, undistort=False)
         colors = torch.from_numpy(stored)
     else:
-        return torch.zeros(0, 3), None
+        return torch.zeros(0, 3, dtype=torch.float32), None
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
         raise ValueError(f"{path} must hold finite points, [P, 3] with P > 0, got shape {list(points.shape)}")
     try:

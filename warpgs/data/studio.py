@@ -127,7 +127,7 @@ def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, 
     cpu = torch.device("cpu")  # a GPU rounds otherwise
     static = _static_bodies()
     bodies = as_tensors([*static, *_moving_bodies(time)], cpu)
-    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]])
+    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]], dtype=torch.float32)
     camera = _camera(time, shift, size)
     traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
     return traced.image, traced.depth, traced.bodies < len(static)

@@ -84,8 +84,8 @@ def _camera(time: float, scene: BuiltinScene, shift: float) -> Camera:
     """The hand-held training camera at a time, moved to its right by ``shift``."""
     angle = -0.5 * math.pi + 0.42 * math.sin(2.0 * math.pi * (0.75 * time - 0.125))
     height = 1.25 + 0.18 * math.sin(2.0 * math.pi * (time + 0.2))
-    position = torch.tensor([2.55 * math.cos(angle), 2.55 * math.sin(angle), height])
-    target, up = torch.tensor([0.0, 0.1, 0.28]), torch.tensor([0.0, 0.0, 1.0])
+    position = torch.tensor([2.55 * math.cos(angle), 2.55 * math.sin(angle), height], dtype=torch.float32)
+    target, up = torch.tensor([0.0, 0.1, 0.28], dtype=torch.float32), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32)
     camera = Camera.looking_at(position, target, up, 0.95 * scene.width, (scene.width, scene.height), time)
     moved = camera.viewmat.clone()
     moved[0, 3] -= shift
@@ -93,7 +93,7 @@ def _camera(time: float, scene: BuiltinScene, shift: float) -> Camera:
 
 
 def _lamp(device: torch.device) -> Tensor:
-    return torch.tensor([[0.9, -1.1, 2.7], [0.22, 0.0, 0.0], [0.0, 0.22, 0.0]], device=device)
+    return torch.tensor([[0.9, -1.1, 2.7], [0.22, 0.0, 0.0], [0.0, 0.22, 0.0]], dtype=torch.float32, device=device)
 
 
 def trace(
@@ -160,7 +160,7 @@ def _surface_points(depth: Tensor, static: Tensor, camera: Camera, k: int, scene
     chosen = torch.randperm(len(rows), generator=generator)[:num_points]
     row, column = rows[chosen], columns[chosen]
     points = camera.unproject(row, column, depth[row, column])
-    return points + POINT_NOISE * torch.randn(points.shape, generator=generator)
+    return points + POINT_NOISE * torch.randn(points.shape, dtype=torch.float32, generator=generator)
 
 
 def builtin_capture(

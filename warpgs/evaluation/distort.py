@@ -16,7 +16,7 @@ def distort(rendering: Rendering, positions: Float[Tensor, "H W 2"]) -> Renderin
         positions: [H, W, 2] its positions, on any device.
     """
     height, width = rendering.joint.alpha.shape
-    size = torch.tensor([width, height], device=rendering.joint.alpha.device)
+    size = torch.tensor([width, height], dtype=torch.float32, device=rendering.joint.alpha.device)
     grid = 2.0 * positions.to(size.device) / size - 1.0
     static, dynamic = (
         None if layer is None else _sampled(layer, grid) for layer in (rendering.static, rendering.dynamic)

@@ -90,7 +90,9 @@ def aligned_camera(
         difference = render(splats, moved(pose), settings=settings).joint.image - truth
         return (difference if region is None else difference[region]).flatten()
 
-    return moved(_minimize(errors, torch.zeros(6, device=device), DIFFERENCE / float(camera.K[0, 0])))
+    return moved(
+        _minimize(errors, torch.zeros(6, dtype=torch.float32, device=device), DIFFERENCE / float(camera.K[0, 0]))
+    )
 
 
 def _minimize(errors: Errors, pose: Float[Tensor, "6"], width: float) -> Float[Tensor, "6"]:
@@ -122,7 +124,7 @@ def _normal_equations(
     errors: Errors, pose: Float[Tensor, "6"], error: Float[Tensor, " M"], width: float
 ) -> tuple[Float[Tensor, "6 6"], Float[Tensor, "6"]]:
     """JᵀWJ and JᵀWe, of the errors e with derivatives J and the weights W that make their squares the Huber loss."""
-    axes = torch.eye(len(pose), device=pose.device)
+    axes = torch.eye(len(pose), dtype=torch.float32, device=pose.device)
     roots = error.abs().clamp_min(ROBUST_ERROR).rsqrt()  # of the weights
     derivatives = torch.stack([(errors(pose + width * axis) - error) * (roots / width) for axis in axes])
     return derivatives @ derivatives.T, derivatives @ (roots * error)

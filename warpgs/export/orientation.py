@@ -89,10 +89,10 @@ def _band_rotation(rotation: np.ndarray, degree: int) -> Float64[np.ndarray, "K 
 def _bases(directions: np.ndarray, degree: int) -> Float64[np.ndarray, "D K"]:
     """The basis functions of one degree, as the colours ½ + Y_k(d) / 4 that the renderer gives to coefficients of ¼."""
     first, end = num_bases(degree - 1), num_bases(degree)
-    sh = torch.zeros(end - first, len(directions), end, 3)
+    sh = torch.zeros(end - first, len(directions), end, 3, dtype=torch.float32)
     sh[torch.arange(end - first), :, torch.arange(first, end)] = 0.25
     means = torch.from_numpy(directions).float().expand(end - first, -1, -1).reshape(-1, 3)
-    colors = sh_fwd(means.contiguous(), sh.reshape(-1, end, 3), torch.eye(4), degree)[:, 0]
+    colors = sh_fwd(means.contiguous(), sh.reshape(-1, end, 3), torch.eye(4, dtype=torch.float32), degree)[:, 0]
     return ((colors.double() - 0.5) * 4).reshape(end - first, -1).T.numpy()
 
 

@@ -127,7 +127,7 @@ def _palette(vectors: np.ndarray) -> tuple[Int64[np.ndarray, " N"], np.ndarray]:
     if len(vectors) <= MAX_PALETTE:
         return np.arange(len(vectors)), vectors
     points = torch.from_numpy(np.ascontiguousarray(vectors))
-    entries = points[torch.linspace(0, len(points) - 1, CLUSTERS).round().long()].clone()
+    entries = points[torch.linspace(0, len(points) - 1, CLUSTERS, dtype=torch.float32).round().long()].clone()
     for _ in range(CLUSTER_ITERATIONS):
         labels = _closest(points, entries)
         sums = torch.zeros_like(entries).index_add_(0, labels, points)

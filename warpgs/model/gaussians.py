@@ -70,7 +70,7 @@ class Gaussians(nn.Module):
         # Only calls that make new tensors: on torch's "meta" device others import torch's compiler, a second and 90 MB.
         rest = (sh_degree + 1) ** 2 - 1
         widths = ((3,), (4,), (3,), (), (1, 3), (rest, 3))
-        return Gaussians(*(torch.zeros(num, *width) for width in widths))
+        return Gaussians(*(torch.zeros(num, *width, dtype=torch.float32) for width in widths))
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -27,10 +27,10 @@ class PoseCorrections(nn.Module):
 
     def __init__(self, num: int, unit: float) -> None:
         super().__init__()
-        self.rotations = nn.Parameter(torch.zeros(num, 3))
-        self.translations = nn.Parameter(torch.zeros(num, 3))
+        self.rotations = nn.Parameter(torch.zeros(num, 3, dtype=torch.float32))
+        self.translations = nn.Parameter(torch.zeros(num, 3, dtype=torch.float32))
         self._unit = unit
-        axes = torch.zeros(3, 3, 3)
+        axes = torch.zeros(3, 3, 3, dtype=torch.float32)
         axes[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
         self.register_buffer("_cross", axes - axes.mT, persistent=False)
 

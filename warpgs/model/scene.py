@@ -50,7 +50,9 @@ class SplitScene(nn.Module):
     def empty(num_static: int, num_dynamic: int, config: ModelConfig) -> "SplitScene":
         """A scene with arbitrary values, to load a checkpoint into."""
         static, dynamic = (Gaussians.empty(num, config.sh_degree) for num in (num_static, num_dynamic))
-        return SplitScene(static, dynamic, config, torch.zeros(3), torch.ones(3))
+        return SplitScene(
+            static, dynamic, config, torch.zeros(3, dtype=torch.float32), torch.ones(3, dtype=torch.float32)
+        )
 
     def splats(
         self,

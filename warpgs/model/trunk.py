@@ -45,7 +45,7 @@ class Trunk(nn.Module):
         self.shapes[-1] = (aligned(sum(outputs)), config.width)
         self.values = nn.Parameter(center.new_zeros(num_values(self.shapes)))
         for layer, (rows, c) in zip(self.layers(self.values.data)[:-1], self.sizes, strict=False):
-            initial = nn.Linear(c, rows)
+            initial = nn.Linear(c, rows, dtype=center.dtype)
             layer.weight.copy_(initial.weight.data)
             layer.bias.copy_(initial.bias.data)
 

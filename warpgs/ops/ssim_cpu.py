@@ -14,7 +14,7 @@ from warpgs.runtime.profiling import span
 MAX_CHANNELS = 128
 """OpenCV's limit."""
 
-TAPS = torch.tensor(list(kernels.TAPS)).numpy()
+TAPS = torch.tensor(list(kernels.TAPS), dtype=torch.float32).numpy()
 
 
 def can_filter(image: Tensor) -> bool:

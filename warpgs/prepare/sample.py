@@ -80,7 +80,9 @@ def _frame(clutter: list[Body], time: float, size: SampleSize) -> UInt8[np.ndarr
     """[H, W, 3] the image at a time in [0, 1]."""
     cpu = torch.device("cpu")
     camera = _camera(time, size)
-    lamp = torch.tensor([[0.8, -2.2, 3.4], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])  # small: sharp shadows
+    lamp = torch.tensor(
+        [[0.8, -2.2, 3.4], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]], dtype=torch.float32
+    )  # small: sharp shadows
     bodies = as_tensors([*clutter, *_moving(time)], cpu)
     traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
     return to_bytes(traced.image)
@@ -90,9 +92,11 @@ def _camera(time: float, size: SampleSize) -> Camera:
     """The camera: 1.6 m sideways, with the shake of a hand."""
     sway = 2.0 * math.pi * time
     shake = [0.02 * math.sin(5.1 * sway + k) + 0.01 * math.sin(11.7 * sway + 2.0 * k) for k in range(5)]
-    position = torch.tensor([1.6 * (time - 0.5) + shake[0], -3.0 + 0.25 * math.sin(sway), 1.3 + 3.0 * shake[1]])
-    target = torch.tensor([0.35 * (time - 0.5) + shake[2], 0.6 + shake[3], 0.75 + shake[4]])
-    up = torch.tensor([0.0, 0.0, 1.0])
+    position = torch.tensor(
+        [1.6 * (time - 0.5) + shake[0], -3.0 + 0.25 * math.sin(sway), 1.3 + 3.0 * shake[1]], dtype=torch.float32
+    )
+    target = torch.tensor([0.35 * (time - 0.5) + shake[2], 0.6 + shake[3], 0.75 + shake[4]], dtype=torch.float32)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32)
     return Camera.looking_at(position, target, up, 0.9 * size.width, (size.width, size.height), time)
 
 

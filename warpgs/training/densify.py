@@ -31,9 +31,9 @@ class GradientStatistics:
     """
 
     def __init__(self, num: int, device: torch.device) -> None:
-        self.total = torch.zeros(num, device=device)
-        self.count = torch.zeros(num, device=device)
-        self.screen_offsets = torch.zeros(num, 2, device=device, requires_grad=True)
+        self.total = torch.zeros(num, dtype=torch.float32, device=device)
+        self.count = torch.zeros(num, dtype=torch.float32, device=device)
+        self.screen_offsets = torch.zeros(num, 2, dtype=torch.float32, device=device, requires_grad=True)
 
     @torch.no_grad()
     def observe(self, radii: Int32[Tensor, "N 2"]) -> None:
@@ -116,7 +116,7 @@ def densify(
 def _scatter_children(gaussians: Gaussians, first: int, generator: torch.Generator) -> None:
     """Samples the positions of the children of splits, from ``first`` on, from their parents' density; shrinks them."""
     scales = gaussians.scales[first:]
-    noise = torch.randn(scales.shape, generator=generator).to(scales.device) * scales
+    noise = torch.randn(scales.shape, dtype=torch.float32, generator=generator).to(scales.device) * scales
     quats = torch.nn.functional.normalize(gaussians.quats[first:], dim=1)
     w, axis = quats[:, :1], quats[:, 1:]
     # Rotation of v by a unit quaternion (w, u): v + 2 u × (u × v + w v).
@@ -145,6 +145,6 @@ def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) 
 @torch.no_grad()
 def reset_opacities(gaussians: Gaussians, optimizer: Adam) -> None:
     """Lowers all opacities to at most 0.01, so that Gaussians that are not needed become removable (3DGS)."""
-    highest = torch.logit(torch.tensor(RESET_OPACITY)).item()
+    highest = torch.logit(torch.tensor(RESET_OPACITY, dtype=torch.float32)).item()
     gaussians.logit_opacities.clamp_(max=highest)
     optim.reset_moments(optimizer, gaussians.logit_opacities)

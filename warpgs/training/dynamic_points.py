@@ -101,7 +101,7 @@ def to_canonical(
         The [P, 3] positions [scene units], and [P] which of them the deformation moves to within this distance.
     """
     found, step = start, torch.zeros_like(start)
-    axes, width = torch.eye(3, device=start.device)[:, None], max_error / 3.0
+    axes, width = torch.eye(3, dtype=torch.float32, device=start.device)[:, None], max_error / 3.0
     for _ in range(NEWTON_STEPS + 1):
         found = found + step
         probes = torch.cat([found[None], found + width * axes])
@@ -179,7 +179,7 @@ def _unproject(
         mask = mask_of(view)
         depth = depth_of(index, view, mask)
         if fraction < 1.0:
-            mask = mask & (torch.rand(mask.shape, generator=generator) < fraction).to(mask.device)
+            mask = mask & (torch.rand(mask.shape, dtype=torch.float32, generator=generator) < fraction).to(mask.device)
         positions, colors = unproject(depth, mask, view.image, view.camera)
         parts.append((positions.cpu(), colors.cpu(), torch.full((len(positions),), index)))
     return tuple(torch.cat(values) for values in zip(*parts, strict=True))
@@ -197,7 +197,7 @@ def _depth_before_points(
     Dynamic objects occlude the static points around them. One camera does not determine their depth; with this one they
     look right from the training view and occlude little else.
     """
-    depth = torch.full(view.static_mask.shape, torch.nan, device=points.device)
+    depth = torch.full(view.static_mask.shape, torch.nan, dtype=torch.float32, device=points.device)
     row, column, z, inside = view.camera.project(points)
     visible = inside.nonzero()[:, 0]
     visible = visible[subsample(visible, MAX_POINTS_PER_IMAGE, generator).to(visible.device)]

@@ -58,7 +58,7 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     chosen = subsample(points, max_count, generator)
     points = points[chosen]
     if config.model.point_colors == "grey":
-        return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, generator=generator)
+        return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, dtype=torch.float32, generator=generator)
     if colors is not None:
         return points, colors[chosen].float() / 255.0
     views = []
@@ -104,7 +104,7 @@ def dynamic_gaussians(
     if found is None:
         return Gaussians.empty(0, degree)
     if protocol.fits_motion and found.depth_known:
-        times = torch.tensor([capture.cameras[name].time for name in capture.train])
+        times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
         fitted = fit_motion(deformation, found, times, capture.extent, config, generator, is_stopped)
         if fitted is None:
             return None
@@ -162,8 +162,8 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
             that were held out.
     """
     smooth = smooth and not capture.metric_depth
-    alignments = torch.full((len(views), 2), torch.nan, device=views.device)
-    errors = torch.full((len(views), 2), torch.inf, device=views.device)
+    alignments = torch.full((len(views), 2), torch.nan, dtype=torch.float32, device=views.device)
+    errors = torch.full((len(views), 2), torch.inf, dtype=torch.float32, device=views.device)
     plain = errors[:, 0].clone()
     points = capture.points.to(views.device)
     for batch in _batches(views, len(points)):

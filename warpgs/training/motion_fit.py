@@ -102,7 +102,10 @@ def _fit(
 ) -> bool:
     """Takes the steps, on CUDA as replays of a graph, until stopped; whether all were taken."""
     device, num_steps = points.home.device, config.schedule.fit_motion
-    rate, index = torch.tensor(LEARNING_RATE, device=device), torch.zeros(1, dtype=torch.int64, device=device)
+    rate, index = (
+        torch.tensor(LEARNING_RATE, dtype=torch.float32, device=device),
+        torch.zeros(1, dtype=torch.int64, device=device),
+    )
     optimizer = Adam([{"params": list(deformation.parameters()), "lr": rate}])
     take_step = partial(_take_step, deformation, points, index, optimizer)
     is_replayed = config.graph and device.type == "cuda"

@@ -151,7 +151,9 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
-        return {k: torch.full((len(item.pixels[k]),), 1.0 / value) for k, value in corrections.items()}
+        return {
+            k: torch.full((len(item.pixels[k]),), 1.0 / value, dtype=torch.float32) for k, value in corrections.items()
+        }
 
     found = {
         index: factor
@@ -269,7 +271,7 @@ def _by_object(
         choose = values_of_cut if item.is_mostly_cut else values_of
         for index, found in choose(item, seen, points_of).items():
             size = scaled_size(capture.cameras[capture.train[index]])
-            values = images.setdefault(index, torch.full(size[::-1], torch.nan)).view(-1)
+            values = images.setdefault(index, torch.full(size[::-1], torch.nan, dtype=torch.float32)).view(-1)
             pixels = torch.from_numpy(item.pixels[index]).long()
             values[pixels] = torch.where(values[pixels].isnan(), found, values[pixels])
     return images
@@ -317,7 +319,9 @@ def _depths_around(
     found = {}
     for index, view in seen.items():
         weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
-        found[index] = torch.full((len(item.pixels[index]),), math.exp(np.average(logs, weights=weights)))
+        found[index] = torch.full(
+            (len(item.pixels[index]),), math.exp(np.average(logs, weights=weights)), dtype=torch.float32
+        )
     return found
 
 
@@ -361,8 +365,12 @@ class _ObjectView:
         self.time = camera.time
         rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
-        viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4))
-        self._slopes = viewed.unproject(self._rows, self._columns, torch.ones(len(pixels)))[:, :2].contiguous().numpy()
+        viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4, dtype=torch.float32))
+        self._slopes = (
+            viewed.unproject(self._rows, self._columns, torch.ones(len(pixels), dtype=torch.float32))[:, :2]
+            .contiguous()
+            .numpy()
+        )
 
     def diameter(self) -> float:
         """Largest distance of two of its pixels at depth 1."""
@@ -375,7 +383,9 @@ class _ObjectView:
 
     def position(self, depth: float) -> Float[np.ndarray, "3"]:
         """Where its centre is at a depth, in scene units."""
-        points = self._camera.unproject(self._rows, self._columns, torch.full(self._rows.shape, depth))
+        points = self._camera.unproject(
+            self._rows, self._columns, torch.full(self._rows.shape, depth, dtype=torch.float32)
+        )
         return points.mean(0).double().numpy()
 
     def surface(self, depth: float) -> Float[Tensor, " P"]:

@@ -55,7 +55,7 @@ def gaussians_at(
     """
     first, place = distinct(points)
     if len(first) <= NUM_NEIGHBOURS:
-        scales = torch.full((points.shape[0],), min(FEW_POINTS_SCALE, max_scale))
+        scales = torch.full((points.shape[0],), min(FEW_POINTS_SCALE, max_scale), dtype=torch.float32)
         return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
     places = points[first].numpy()
     distances, _ = cKDTree(places).query(places, k=NUM_NEIGHBOURS + 1, workers=-1)
@@ -94,7 +94,7 @@ def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[T
     """
     points = points[distinct(points)[0]]
     if points.shape[0] < 2:
-        return torch.zeros(3), torch.ones(3)
+        return torch.zeros(3, dtype=torch.float32), torch.ones(3, dtype=torch.float32)
     ordered = points.sort(0).values
     last = points.shape[0] - 1
     low, high = ordered[round(0.005 * last)], ordered[round(0.995 * last)]
@@ -106,7 +106,7 @@ def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[T
 def random_points(points: Float[Tensor, "P 3"], count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:
     """``count`` points, uniformly distributed in the box of other points."""
     center, half_size = scene_box(points)
-    return center + half_size * (2.0 * torch.rand(count, 3, generator=generator) - 1.0)
+    return center + half_size * (2.0 * torch.rand(count, 3, dtype=torch.float32, generator=generator) - 1.0)
 
 
 def front_of_ball(offsets: Float[np.ndarray, "P D"]) -> Float[np.ndarray, " P"]:
@@ -137,7 +137,10 @@ def color_points(
     Returns:
         [P, 3]; grey for points that no view sees.
     """
-    total, count = torch.zeros(points.shape[0], 3), torch.zeros(points.shape[0], 1)
+    total, count = (
+        torch.zeros(points.shape[0], 3, dtype=torch.float32),
+        torch.zeros(points.shape[0], 1, dtype=torch.float32),
+    )
     for camera, image, mask in views:
         row, column, _, inside = camera.project(points)
         counts = (inside & mask[row, column])[:, None]

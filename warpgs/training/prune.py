@@ -58,7 +58,7 @@ def visibility(
     """
     static, settings = scene.static, replace(settings, statistics=True)
     splats = scene.static_splats(sh_degree)
-    num_rendered = torch.zeros(len(static), device=static.means.device)
+    num_rendered = torch.zeros(len(static), dtype=torch.float32, device=static.means.device)
     num = 0
     for camera in cameras:
         rendering = render(splats, camera, settings=settings)
@@ -108,7 +108,7 @@ def blend_weights(
         assert weights is not None
         return (weights,)
 
-    total = torch.zeros(len(scene.static) + len(scene.dynamic), device=views.device)
+    total = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float32, device=views.device)
     for (weights,) in views.map(weights_in):
         total += weights
     return total

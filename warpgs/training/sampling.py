@@ -34,11 +34,11 @@ class Sampler:
         """The choices of an iteration; the noise has a standard deviation in frame intervals."""
         generator = random_numbers(self._seed, "draw", iteration, rollbacks)
         for _ in range(ranks.rank() + 1):  # each rank has numbers of its own, after those of the ranks before it
-            noise = noise_deviation / self._num_views * torch.randn(1, generator=generator).item()
-            background = torch.rand(3, generator=generator)
+            noise = noise_deviation / self._num_views * torch.randn(1, dtype=torch.float32, generator=generator).item()
+            background = torch.rand(3, dtype=torch.float32, generator=generator)
             dropout_seed = int(torch.randint(MAX_SEED, (1,), generator=generator))
         view = next(self.views(iteration, rollbacks))
-        return Sample(view, noise, torch.zeros(3) if self._black else background, dropout_seed)
+        return Sample(view, noise, torch.zeros(3, dtype=torch.float32) if self._black else background, dropout_seed)
 
     def views(self, iteration: int, rollbacks: int) -> Iterator[int]:
         """The views of this rank from an iteration on, without end."""

@@ -100,9 +100,12 @@ class Step:
         self.alignments, self._depth_trust = alignments, depth_trust
         sums = (*TERMS, "psnr", STEPS)
         self._inputs = StepInputs(sums, optim.GROUPS, device)
-        self._sums = torch.zeros(len(sums), device=device)
+        self._sums = torch.zeros(len(sums), dtype=torch.float32, device=device)
         self._counts: Counter[str] = Counter()  # iterations with each term since the last check, and of all
-        self._zero, self._one = torch.zeros((), device=device), torch.ones((), device=device)
+        self._zero, self._one = (
+            torch.zeros((), dtype=torch.float32, device=device),
+            torch.ones((), dtype=torch.float32, device=device),
+        )
         self.optimizer = optim.make_optimizer(self.parameters(), self._inputs.learning_rates)
         self._graphs: GraphCache[Phase] | None = None
         if views.uses_graphs:

@@ -25,7 +25,7 @@ class StepInputs:
 
     def __init__(self, sums: Sequence[str], groups: Sequence[str], device: torch.device) -> None:
         lengths = (1, 1, 9, len(sums), len(groups))
-        self._buffer = torch.zeros(sum(lengths), device=device)
+        self._buffer = torch.zeros(sum(lengths), dtype=torch.float32, device=device)
         self.time_noise, self.dropout_seed, backgrounds, self.scales, rates = self._buffer.split(lengths)
         self.backgrounds = backgrounds.view(3, 3)
         self.scale: dict[str, Tensor] = dict(zip(sums, self.scales.unbind(), strict=True))
@@ -57,4 +57,4 @@ class StepInputs:
         numbers = [time_noise, dropout_seed, *background, *background, *dynamic_background]
         numbers += [scales[name] for name in self.scale]
         numbers += [learning_rates[name] for name in self.learning_rates]
-        self._buffer.copy_(torch.tensor(numbers), non_blocking=True)
+        self._buffer.copy_(torch.tensor(numbers, dtype=torch.float32), non_blocking=True)

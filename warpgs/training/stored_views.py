@@ -121,7 +121,7 @@ class ViewReader:
                 f"{self._capture.name}: frame {frame.name} has no mask of the dynamic region, which training needs; "
                 f"make masks {MASKS_REMEDY}"
             )
-        depth = torch.full(size, torch.nan) if frame.inverse_depth is None else frame.inverse_depth
+        depth = torch.full(size, torch.nan, dtype=torch.float32) if frame.inverse_depth is None else frame.inverse_depth
         margin = round(self._mask_margin * max(size))
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None

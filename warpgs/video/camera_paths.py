@@ -106,7 +106,7 @@ class BoundingSphere:
 def upward(capture: Capture) -> Float[Tensor, "3"]:
     """The mean upward direction of the training images of a capture, in world coordinates."""
     up = -torch.stack([capture.cameras[name].viewmat[1, :3] for name in capture.train]).mean(0)
-    return up if float(up.norm()) > 1e-3 else torch.tensor(UP)
+    return up if float(up.norm()) > 1e-3 else torch.tensor(UP, dtype=torch.float32)
 
 
 def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
@@ -114,9 +114,11 @@ def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.
 
     The direction from the center of the scene to the camera has ``side`` as its x and z.
     """
-    position = sphere.center + DEFAULT_DISTANCE * sphere.radius * torch.tensor([side[0], 0.0, side[1]])
+    position = sphere.center + DEFAULT_DISTANCE * sphere.radius * torch.tensor(
+        [side[0], 0.0, side[1]], dtype=torch.float32
+    )
     focal = DEFAULT_FOCAL * DEFAULT_SIZE[1]
-    return Camera.looking_at(position, sphere.center, torch.tensor(UP), focal, DEFAULT_SIZE, time)
+    return Camera.looking_at(position, sphere.center, torch.tensor(UP, dtype=torch.float32), focal, DEFAULT_SIZE, time)
 
 
 def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:
@@ -244,7 +246,7 @@ def spiral(camera: Camera, distance: float, reach: float, times: Sequence[float]
     for k, time in enumerate(times):
         angle = 2.0 * math.pi * SPIRAL_TURNS * k / len(times)
         offset = [reach * math.sin(angle), 0.5 * reach * math.cos(angle), 0.5 * reach * math.sin(angle / SPIRAL_TURNS)]
-        path.append(_aimed(camera, torch.tensor(offset), distance, time))
+        path.append(_aimed(camera, torch.tensor(offset, dtype=torch.float32), distance, time))
     return path
 
 
@@ -270,7 +272,7 @@ def bullet(path: Sequence[Camera], clouds: Sequence[Float[Tensor, "_ 3"]], stop:
         part = (k + 1) / (swing + 1)
         angle = BULLET_ARC * math.sin(2.0 * math.pi * part**2 * (3.0 - 2.0 * part))  # slow at both ends
         offset = [distance * math.sin(angle), 0.0, distance * (1.0 - math.cos(angle))]
-        swung.append(_aimed(stopped, torch.tensor(offset), distance, stop))
+        swung.append(_aimed(stopped, torch.tensor(offset, dtype=torch.float32), distance, stop))
     return running[:before] + swung + running[before + 1 :]
 
 

@@ -230,10 +230,10 @@ def _focal(name: str, value: Any) -> float:
 def _vector(name: str, value: Any) -> Tensor:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError(f"{name} must be three numbers, got {reprlib.repr(value)}")
-    return torch.tensor([_number(name, v) for v in value])
+    return torch.tensor([_number(name, v) for v in value], dtype=torch.float32)
 
 
 def _matrix(name: str, value: Any, size: int) -> Tensor:
     if not isinstance(value, list) or len(value) != size or any(type(r) is not list or len(r) != size for r in value):
         raise ValueError(f"{name} must be {size} rows of {size} numbers")
-    return torch.tensor([[_number(name, v) for v in row] for row in value])
+    return torch.tensor([[_number(name, v) for v in row] for row in value], dtype=torch.float32)

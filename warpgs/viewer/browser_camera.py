@@ -46,7 +46,7 @@ def start_camera(source: Source, training: TrainingCameras | None) -> BrowserCam
     if training is not None:
         return through_training_camera(training, len(training.views) // 2)
     trained = None if source.follow else source.current()
-    sphere = BoundingSphere(torch.zeros(3), 1.0)
+    sphere = BoundingSphere(torch.zeros(3, dtype=torch.float32), 1.0)
     if trained is not None:
         means = torch.cat([trained.scene.static.means, trained.scene.dynamic.means]).detach().cpu()
         sphere = BoundingSphere.around(means) if len(means) else sphere
