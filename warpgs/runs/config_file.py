@@ -24,8 +24,7 @@ RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""
 
 ALWAYS = {
-    "": "antialias app assume checkpoint_every dap data dataset device factor graph iterations "
-    "keep_checkpoints lpips out preset resident_bytes resume seed stage2 static_appearance "
+    "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
     "static_geometry vdp",
     "densify": "dense_fraction every gradient max_gaussians max_size min_opacity visibility",
     "loss": "depth depth_dynamic depth_end dynamic dynamic_background joint ssim static",
@@ -36,8 +35,8 @@ ALWAYS = {
     "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every realign_at "
     "reset_every sh_degree_every stage1 stage2 warmup",
 }
-"""Fields of each section, "" for those outside, that every version since 0.1.0 writes: others may be missing. With the
-default of another one, a run would be resumed as another run."""
+"""Fields of each section, "" for those outside, that every version since 0.1.0 writes, but for those that may be null.
+Others may be missing. With the default of one of these, a run would be resumed as another run."""
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

@@ -32,7 +32,7 @@ from warpgs.data.masks import nearest_pixels
 
 from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_all_objects, num_cut_off
-from .point_cloud import front_of_ball
+from .point_cloud import filled, front_of_ball
 from .views import View, Views
 
 AROUND = 0.015
@@ -151,9 +151,7 @@ def _average_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T
         known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(_sizes(item, seen, points_of), known, times, 1.0 - weight)
-        return {
-            k: torch.full((len(item.pixels[k]),), 1.0 / value, dtype=torch.float32) for k, value in corrections.items()
-        }
+        return {k: filled(len(item.pixels[k]), 1.0 / value) for k, value in corrections.items()}
 
     found = {
         index: factor
@@ -319,9 +317,7 @@ def _depths_around(
     found = {}
     for index, view in seen.items():
         weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
-        found[index] = torch.full(
-            (len(item.pixels[index]),), math.exp(np.average(logs, weights=weights)), dtype=torch.float32
-        )
+        found[index] = filled(len(item.pixels[index]), math.exp(np.average(logs, weights=weights)))
     return found
 
 
@@ -366,11 +362,7 @@ class _ObjectView:
         rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
         viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4, dtype=torch.float32))
-        self._slopes = (
-            viewed.unproject(self._rows, self._columns, torch.ones(len(pixels), dtype=torch.float32))[:, :2]
-            .contiguous()
-            .numpy()
-        )
+        self._slopes = viewed.unproject(self._rows, self._columns, filled(len(pixels), 1.0))[:, :2].contiguous().numpy()
 
     def diameter(self) -> float:
         """Largest distance of two of its pixels at depth 1."""
@@ -383,9 +375,7 @@ class _ObjectView:
 
     def position(self, depth: float) -> Float[np.ndarray, "3"]:
         """Where its centre is at a depth, in scene units."""
-        points = self._camera.unproject(
-            self._rows, self._columns, torch.full(self._rows.shape, depth, dtype=torch.float32)
-        )
+        points = self._camera.unproject(self._rows, self._columns, filled(len(self._rows), depth))
         return points.mean(0).double().numpy()
 
     def surface(self, depth: float) -> Float[Tensor, " P"]:

@@ -159,3 +159,8 @@ def unproject(
     row, column = (mask & depth.isfinite()).nonzero(as_tuple=True)
     z = depth[row, column]
     return camera.unproject(row, column, z), image[row, column]
+
+
+def filled(count: int, value: float) -> Float[Tensor, " P"]:
+    """[P] the same number in single precision, whatever torch's default type is."""
+    return torch.full((count,), value, dtype=torch.float32)
