@@ -77,11 +77,7 @@ class Trainer:
         self.config, self.run = config, run
         self.capture = capture.assuming(config.assume).over(known_background(config, capture))
         self.device = torch.device(config.device or "cpu")
-        self.gains = (
-            exposure_gains(self.capture)
-            if config.exposure
-            else torch.ones(len(self.capture.train), 3, dtype=torch.float32)
-        )
+        self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3).float()
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
         poses = None
         if config.optim.poses:
