@@ -104,12 +104,7 @@ class Camera:
 
     @staticmethod
     def looking_at(
-        position: Point,
-        target: Point,
-        up: Point,
-        focal: float,
-        size: tuple[int, int],
-        time: float = 0.0,
+        position: Point, target: Point, up: Point, focal: float, size: tuple[int, int], time: float = 0.0
     ) -> "Camera":
         """A camera that sees ``target`` in the middle of its image.
 
