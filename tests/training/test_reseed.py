@@ -163,6 +163,20 @@ def test_dynamic_gaussians_that_are_all_lost_are_added_again_at_once(data, tmp_p
     assert "100% of the dynamic pixels show no dynamic Gaussian" in logger.log.call_args.args[0]
 
 
+def test_an_empty_branch_is_filled_where_thin_objects_have_nothing_but_borders_of_their_masks(data, tmp_path):
+    config = dataclasses.replace(
+        tiny.CONFIG,
+        loss=dataclasses.replace(tiny.CONFIG.loss, mask_margin=1.0),
+        densify=dataclasses.replace(tiny.CONFIG.densify, reseed=0.05),
+    )
+    trainer = tiny.trainer(data, tmp_path / "run", config)
+    trainer._add_dynamic_gaussians()
+    assert all((view.static_mask | view.mask_border).all() for view in trainer.views)
+    make_transparent(trainer.scene.dynamic)
+    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+    assert len(trainer.scene.dynamic) > 10
+
+
 def test_an_empty_branch_is_filled_at_random_where_the_deformation_has_no_inverse(trainer):
     make_transparent(trainer.scene.dynamic)
     deform(trainer.scene, 1e4)

@@ -64,7 +64,7 @@ def require_branches(before: tuple[int, int], scene: SplitScene, views: Views) -
 
 def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Callable[[View], Bool[Tensor, "H W"]]:
     """The function that finds the pixels of a view that are dynamic, and that no dynamic Gaussian shows."""
-    settings = replace(settings, branches=True)
+    settings, is_empty = replace(settings, branches=True), not len(scene.dynamic)
 
     @torch.no_grad()
     def mask_of(view: View) -> Bool[Tensor, "H W"]:
@@ -72,7 +72,8 @@ def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Ca
         layer = render(splats, view.camera, settings=settings).dynamic
         assert layer is not None
         lost = ~view.static_mask & (layer.alpha < MAX_LOST_ALPHA)
-        return lost if view.mask_border is None else lost & ~view.mask_border
+        # Borders of masks may show something else, but thin objects have nothing but borders.
+        return lost if view.mask_border is None or is_empty else lost & ~view.mask_border
 
     return mask_of
 
