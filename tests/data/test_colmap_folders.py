@@ -44,7 +44,7 @@ def test_of_models_of_one_size_the_first_is_read(edited):
     layouts.write_binary_model(root / "sparse/1", [90.0, 90.0, *layouts.PARAMS[2:]])
     capture = load_capture(root)
     assert capture.cameras["frame_00000"].K[0, 0] == layouts.FOCAL
-    assert "sparse/0 (12 images) is read" in capture.notes[0]
+    assert "sparse/0 (12 images) is read as the first of the largest" in capture.notes[0]
 
 
 def test_a_model_that_lacks_a_file_is_not_read_if_another_is_whole(edited):

@@ -67,7 +67,8 @@ def largest_model(root: Path) -> tuple[ModelFolder | None, list[str]]:
     shown = [f"{model.shown(root)} ({count} images)" for model, count in zip(found, counts, strict=True)]
     used = shown.pop(best)
     few, more = ", ".join(shown[:4]), f" and {len(shown) - 4} more" if len(shown) > 4 else ""
-    return found[best], [f"the COLMAP model in {used} is read as the largest; left out: {few}{more}"]
+    rank = "the largest" if counts.count(max(counts)) == 1 else "the first of the largest"
+    return found[best], [f"the COLMAP model in {used} is read as {rank}; left out: {few}{more}"]
 
 
 def _subfolders(folder: Path) -> list[Path]:
