@@ -128,10 +128,12 @@ def test_names_are_counted_where_their_numbers_are_no_times_and_the_reason_is_sa
     assert source.problem == "number the images in the order of time if that is wrong"
 
 
-def test_the_counter_of_a_camera_may_begin_again_after_9999():
-    times, source, _ = times_of_names([f"DSC_{k:04d}.JPG" for k in (1, 2, 9997, 9998, 9999)])
+@pytest.mark.parametrize("prefix", ["DSC_", "DSC0"])
+def test_the_counter_of_a_camera_may_begin_again_after_9999(prefix):
+    times, source, _ = times_of_names([f"{prefix}{k:04d}.JPG" for k in (1, 2, 9997, 9998, 9999)])
     assert times == [4.0, 5.0, 0.0, 1.0, 2.0]
-    assert "begin again after 9999, as there are none between DSC_0002.JPG and DSC_9997.JPG" in source.problem
+    between = f"there are none between {prefix}0002.JPG and {prefix}9997.JPG"
+    assert f"begin again after 9999, as {between}" in source.problem
 
 
 def test_a_long_gap_between_time_stamps_stays_and_is_a_problem():

@@ -25,7 +25,8 @@ MAX_GAP, MAX_STEPS, MIN_TIMES = 0.9, 10.0, 4
 step; of fewer times, nothing is said."""
 
 ROLLOVER = 10_000
-"""Counters of cameras have four digits, by the Design rule for Camera File systems, and begin again after 9999."""
+"""Counters of cameras have four digits, by the Design rule for Camera File systems, and begin again after 9999; Sony
+writes a zero before them."""
 
 REMEDY = "number the images in the order of time if that is wrong"
 
@@ -134,7 +135,7 @@ def _after_jump(values: list[int], jump: tuple[int, int], before: str, is_stamp:
     """
     if is_stamp:
         return values, "nearly all of the time is from {} to {}: remove frames of another recording"
-    is_padded = re.search(rf"(?<![0-9]){jump[0]:04d}(?![0-9])", before) is not None
+    is_padded = re.search(rf"(?<![0-9])0?{jump[0]:04d}(?![0-9])", before) is not None
     if is_padded and jump[0] < ROLLOVER // 100 and ROLLOVER - ROLLOVER // 100 <= max(values) < ROLLOVER:
         problem = f"they are taken to begin again after {ROLLOVER - 1}, as there are none between {{}} and {{}}"
         return [value + ROLLOVER * (value <= jump[0]) for value in values], problem
