@@ -82,6 +82,20 @@ def test_estimated_masks_of_nearly_everything_are_a_warning_only(root):
     assert any("on average" in text for text in of_masks(findings, "warning"))
 
 
+def test_masks_of_nearly_everything_are_a_warning_only_if_that_moves(root):
+    marked = np.arange(256) >= 20
+    convert_masks(root, lambda mask, k: np.where(marked, 0, 255).astype(np.uint8) + 0 * mask)
+    assert any("92.2% of the pixels" in text for text in of_masks(check_capture(root).findings, "error"))
+    for k, path in enumerate(sorted((root / "rgb/1x").iterdir())):
+        image = cv2.imread(str(path))
+        image[:, marked] = np.roll(image, 3 * k, axis=0)[:, marked]
+        cv2.imwrite(str(path), image)
+    findings = check_capture(root).findings
+    assert not of_masks(findings, "error")
+    assert any("92.2% of the pixels" in text for text in of_masks(findings, "warning"))
+    assert not of_masks(quick_findings(load_capture(root)), "error")
+
+
 def test_wrong_cameras_do_not_make_masks_inverted(root):
     """Far from their epipolar lines are all pixels then, and which ones more so is chance."""
     convert_masks(root, lambda mask, k: np.where(np.arange(256) < 100, 0, 255).astype(np.uint8) + 0 * mask)

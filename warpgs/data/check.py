@@ -14,7 +14,7 @@ from .findings import Finding, Report
 from .frames_check import check_counts, check_files
 from .loaders import describe_layout, load_capture, missing_capture
 from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
-from .motion_check import check_motion
+from .motion_check import check_motion, motions_of
 from .points_check import check_points
 from .turning_check import check_turning
 
@@ -50,14 +50,16 @@ def check_capture(
         *check_counts(capture),
         *check_files(capture, contents),
     ]
+    is_readable = not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings)
+    motions = motions_of(sample.capture, sample.pairs) if is_readable else []
     if masks := _masks(capture, contents):
-        findings += [*check_masks(masks, capture), *check_dynamic_depth(masks)]
-    if not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings):
+        findings += [*check_masks(masks, capture, motions), *check_dynamic_depth(masks)]
+    if is_readable:
         findings += [
             *check_points(sample.capture, sample.names),
             *check_turning(sample.capture, sample.names),
             *check_depth(sample.capture, sample.names),
-            *check_motion(sample.capture, sample.pairs),
+            *check_motion(motions, capture.conventions.masks),
         ]
     return Report(root, findings)
 
@@ -78,7 +80,8 @@ def quick_findings(capture: Capture) -> list[Finding]:
     findings = [*check_counts(capture)]
     if (masks := _masks(capture, contents)) and are_suspect(masks):
         masks = _masks(capture, {name: sample.look(name) for name in capture.train})
-        findings += [*check_masks(masks, capture), *check_motion(sample.capture, sample.pairs)]
+        motions = motions_of(sample.capture, sample.pairs)
+        findings += [*check_masks(masks, capture, motions), *check_motion(motions, capture.conventions.masks)]
     findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]
     return [f for f in findings if f.level != "note" or f.topic == "files"]
 

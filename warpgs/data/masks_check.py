@@ -8,12 +8,13 @@ import numpy as np
 from .capture import Capture, Frame
 from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
 from .findings import Finding
+from .motion_check import Motion, confirm_masks
 
 MAX_DYNAMIC_FRACTION = 0.4
 """Mean fraction of dynamic pixels; masks with more are rarely correct."""
 
 MAX_USABLE_FRACTION = 0.9
-"""The same of masks that are inverted or hold something else: too little is left that is static."""
+"""The same of masks that are inverted or hold something else, unless the images show that so much moves."""
 
 
 class DynamicCounts(NamedTuple):
@@ -45,12 +46,13 @@ def are_suspect(masks: Sequence[DynamicCounts]) -> bool:
     return max(fractions) == 0.0 or float(np.mean(fractions)) > MAX_DYNAMIC_FRACTION
 
 
-def check_masks(masks: Sequence[DynamicCounts], capture: Capture) -> Iterator[Finding]:
+def check_masks(masks: Sequence[DynamicCounts], capture: Capture, motions: Sequence[Motion]) -> Iterator[Finding]:
     """How much the masks of training frames mark as dynamic.
 
     Args:
         masks: Those of at least one frame.
         capture: Their capture.
+        motions: Motion between some of its frames, which may show that nearly everything moves indeed.
     """
     meaning, mean = capture.conventions.masks, float(np.mean([mask.fraction for mask in masks]))
     largest = max(mask.fraction for mask in masks)
@@ -61,7 +63,8 @@ def check_masks(masks: Sequence[DynamicCounts], capture: Capture) -> Iterator[Fi
     whole = min(mask.fraction for mask in masks) == 1.0
     marked = "everything" if whole else f"{mean:.1%} of the pixels"
     text = f"the masks mark {marked} as dynamic" + ("" if whole else f" on average, {largest:.1%} at most")
-    if whole or (mean > MAX_USABLE_FRACTION and not capture.estimated_masks):
+    is_doubtful = mean > MAX_USABLE_FRACTION and not capture.estimated_masks and not confirm_masks(motions)
+    if whole or is_doubtful:
         text += f": {meaning}, and instance ids are not understood; if nearly everything moves, use --assume dynamic"
         yield Finding("error", "masks", text)
     else:

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,6 +41,9 @@ MAX_EPIPOLAR_DISTANCE = 3.0
 """Maximum median distance of static pixels from their epipolar lines [px]; more means that cameras and images do not
 match."""
 
+MIN_DIFFERENCE = 0.2
+"""Minimum difference of the median distances of static and dynamic pixels, for one of them to fit better [px]."""
+
 
 def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
     """Training frames that follow each other in time and look in similar directions, evenly spread over the capture."""
@@ -47,33 +51,6 @@ def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
     names = sorted(capture.train, key=lambda name: cameras[name].time)
     pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
     return evenly_spaced(pairs, max_count)
-
-
-def check_motion(capture: Capture, pairs: Sequence[tuple[str, str]]) -> Iterator[Finding]:
-    """Compares masks and cameras with the motion in the images of pairs of frames."""
-    motions = [motion_between(capture.frame(first), capture.frame(second)) for first, second in pairs]
-    found = [motion for motion in motions if motion is not None]
-    if not found:
-        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
-        yield Finding("note", "cameras", f"{text}, to compare their motion")
-        return
-    static = float(np.median([motion.static for motion in found]))
-    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
-    hint = ": the cameras may not match the images" if level == "warning" else ""
-    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
-    both = np.array([(motion.static, motion.dynamic) for motion in found if motion.dynamic is not None])
-    if len(both) >= MIN_PAIRS:
-        yield _compare_regions(both[:, 0], both[:, 1], capture.conventions.masks)
-
-
-def _compare_regions(static: Float[np.ndarray, " P"], dynamic: Float[np.ndarray, " P"], meaning: str) -> Finding:
-    """Whether masked regions move more than the others; if cameras fit them better, masks are inverted."""
-    more, difference = float((dynamic > static).mean()), float(np.median(dynamic - static))
-    if more < 0.25 and difference < -0.2 and float(np.median(dynamic)) < MAX_EPIPOLAR_DISTANCE:
-        text = f"static regions of the masks move more than dynamic ones: the masks may be inverted ({meaning})"
-        return Finding("error", "masks", text)
-    text = f"dynamic pixels are farther off their epipolar lines than static ones in {more:.0%} of the frames"
-    return Finding("note", "masks", text)
 
 
 @dataclass(frozen=True)
@@ -119,6 +96,72 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
         return None
     dynamic = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
     return Motion(float(np.median(values[0])), dynamic)
+
+
+def motions_of(capture: Capture, pairs: Sequence[tuple[str, str]]) -> list[Motion]:
+    """The motion between the frames of pairs, of those that can be compared."""
+    motions = (motion_between(capture.frame(first), capture.frame(second)) for first, second in pairs)
+    return [motion for motion in motions if motion is not None]
+
+
+def check_motion(motions: Sequence[Motion], meaning: str) -> Iterator[Finding]:
+    """Compares cameras and masks with the motion in the images; ``meaning`` is the convention of the masks."""
+    if not motions:
+        text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
+        yield Finding("note", "cameras", f"{text}, to compare their motion")
+        return
+    static = float(np.median([motion.static for motion in motions]))
+    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
+    hint = ": the cameras may not match the images" if level == "warning" else ""
+    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
+    found = _compare_regions(motions)
+    if found is not None and found.are_inverted:
+        text = f"static regions of the masks move more than dynamic ones: the masks may be inverted ({meaning})"
+        yield Finding("error", "masks", text)
+    elif found is not None:
+        text = f"dynamic pixels are farther off their epipolar lines than static ones in {found.more:.0%} of the frames"
+        yield Finding("note", "masks", text)
+
+
+def confirm_masks(motions: Sequence[Motion]) -> bool:
+    """Whether what masks mark as dynamic moves, and the rest fits the cameras."""
+    found = _compare_regions(motions)
+    return found is not None and found.are_right
+
+
+class _Regions(NamedTuple):
+    """Static and dynamic regions of pairs of frames, compared.
+
+    Attributes:
+        more: Fraction of the pairs whose dynamic pixels are farther off their epipolar lines.
+        difference: Median of how much farther they are [px].
+        static, dynamic: Medians of their distances [px].
+    """
+
+    more: float
+    difference: float
+    static: float
+    dynamic: float
+
+    @property
+    def are_inverted(self) -> bool:
+        """Whether the cameras fit the dynamic regions better."""
+        return self.more < 0.25 and self.difference < -MIN_DIFFERENCE and self.dynamic < MAX_EPIPOLAR_DISTANCE
+
+    @property
+    def are_right(self) -> bool:
+        """Whether the cameras fit the static regions better."""
+        return self.more > 0.75 and self.difference > MIN_DIFFERENCE and self.static < MAX_EPIPOLAR_DISTANCE
+
+
+def _compare_regions(motions: Sequence[Motion]) -> _Regions | None:
+    """Compares the regions; None if there are too few pairs with both."""
+    both = np.array([(motion.static, motion.dynamic) for motion in motions if motion.dynamic is not None])
+    if len(both) < MIN_PAIRS:
+        return None
+    static, dynamic = both.T
+    medians = (float(np.median(values)) for values in (dynamic - static, static, dynamic))
+    return _Regions(float((dynamic > static).mean()), *medians)
 
 
 def are_comparable(first: Camera, second: Camera) -> bool:
