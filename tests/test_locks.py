@@ -1,5 +1,8 @@
 """Locks of folders."""
 
+import errno
+import fcntl
+
 import pytest
 
 from warpgs.locks import lock_folder
@@ -27,3 +30,23 @@ def test_a_folder_that_is_moved_while_it_is_locked_is_unlocked(tmp_path):
         (tmp_path / "old").rename(tmp_path / "new")
     with lock_folder(tmp_path / "new", "filled"):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_on_a_file_system_without_locks_nothing_is_locked(tmp_path, monkeypatch, number):
+    def refuse(*_):
+        raise OSError(number, "flock failed")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with lock_folder(tmp_path, "filled"), lock_folder(tmp_path, "filled"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_fails_for_another_reason_is_an_error(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EIO, "flock failed")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="flock failed"):
+        lock_folder(tmp_path, "filled").__enter__()

@@ -1,5 +1,6 @@
 """Locks of folders into which several processes may write: run folders, captures, sweeps."""
 
+import errno
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -7,6 +8,9 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from .files import kept_if_used
+
+WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP}
+"""Errors of file systems without locks, such as NFS without a lock daemon."""
 
 LOCK = ".lock"
 """File that a process which writes into a folder that others may write into, too, keeps locked; then it is removed."""
@@ -31,12 +35,14 @@ def lock_folder(folder: Path, activity: str, bookkeeping: Collection[str] = ()) 
     with kept_if_used(folder, (*bookkeeping, LOCK)):
         lock = FileLock(folder / LOCK)
         try:
-            with suppress(NotImplementedError):
-                lock.acquire(timeout=0)
+            lock.acquire(timeout=0)
         except Timeout as error:
             raise ValueError(
                 f"{folder} is being {activity} by another process: wait until it has ended, or choose another folder"
             ) from error
+        except (OSError, NotImplementedError) as error:
+            if isinstance(error, OSError) and error.errno not in WITHOUT_LOCKS:
+                raise
         try:
             yield
         finally:
