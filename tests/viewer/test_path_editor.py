@@ -391,6 +391,13 @@ def test_a_video_ends_with_the_browser(editor, started):
     assert started.signals == [signal.SIGINT]
 
 
+def test_no_video_is_begun_after_the_browser_has_left(editor, started):
+    add(editor, 0.0, 2.0)
+    editor.stop()
+    editor.click("render")
+    assert started.commands == []
+
+
 @pytest.mark.parametrize(
     ("duration", "rate", "size", "expected"),
     [

@@ -48,11 +48,11 @@ class PathVideo:
     def cancel(self) -> bool:
         """Ends a video that is being rendered, as Ctrl-C does: nothing is left of it; whether there was one."""
         with self._lock:
-            is_rendering = self._child is not None and self._child.poll() is None
-            if is_rendering and self._child is not None:
-                self._is_cancelled = True
-                interrupt(self._child)
-        return is_rendering
+            if self._child is None or self._child.poll() is not None:
+                return False
+            self._is_cancelled = True
+            interrupt(self._child)
+        return True
 
     def stop(self) -> None:
         """Ends a video that is being rendered, and shows nothing any more."""
@@ -63,20 +63,19 @@ class PathVideo:
         """Renders a path that was saved; returns when its video is complete."""
         folder, size = self._run.folder, "{}x{}".format(*options.size)
         with self._lock:
-            if self._child is not None and self._child.poll() is None:
+            if self._is_stopped or (self._child is not None and self._child.poll() is None):
                 return
-            command = [
-                sys.executable,
-                "-m",
-                "warpgs",
-                "render",
-                str(folder),
-                "--keyframes",
-                str(path),
+            command = [sys.executable, "-m", "warpgs", "render", str(folder), "--keyframes", str(path)]
+            command += [
                 "--write",
                 "mp4",
+                "--frames",
+                str(options.frames),
+                "--rate",
+                f"{options.rate:g}",
+                "--size",
+                size,
             ]
-            command += ["--frames", str(options.frames), "--rate", f"{options.rate:g}", "--size", size]
             self._is_cancelled = False
             self._child = child = subprocess.Popen(
                 [*command, "--device", self._run.device.type],
