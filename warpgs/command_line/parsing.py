@@ -100,7 +100,7 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
 
 
 class _Like(io.StringIO):
-    """A file in memory that looks like another one to what chooses colours and characters."""
+    """A file in memory with the encoding of another one, and a terminal if that is one: tyro looks at both."""
 
     def __init__(self, other: Stream) -> None:
         super().__init__()

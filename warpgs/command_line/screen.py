@@ -18,7 +18,7 @@ START = re.compile(r"usage: | +\S+ {2,}| *")
 
 @runtime_checkable
 class Stream(Protocol):
-    """What text is written to, such as standard output."""
+    """A stream of text, such as standard output."""
 
     def write(self, text: str, /) -> object: ...
 
@@ -49,7 +49,7 @@ def wrapped(text: str, columns: int | None = None) -> str:
 
     Args:
         text: The text.
-        columns: Width of a line; that of the terminal if None.
+        columns: Width of a line; the terminal's if None.
     """
     columns = columns or shutil.get_terminal_size().columns
     return "\n".join(_wrapped(line, columns) for line in text.split("\n"))

@@ -27,7 +27,7 @@ MASK_TRIAL = "mask_trial.json"
 """File in a run folder: what the trial of the masks found, for metrics.json. It exists only after a trial."""
 
 TRAINED = "trained"
-"""What is done with a run folder that is locked."""
+"""What a process does with the run folder that it locks, for messages."""
 
 Device = Literal["cuda", "cpu"]
 

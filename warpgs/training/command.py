@@ -48,12 +48,9 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     default = PRESETS[preset]
     config, unknown = tyro.cli(TrainConfig, default=default, args=list(arguments), prog=prog, return_unknown_args=True)
     if unknown:
-        is_option = unknown[0].startswith("-")
-        advice = (
-            suggestion(f"-{unknown[0]}", [*flags(TrainConfig), *ALWAYS])
-            if is_option
-            else f"; a capture is given by --data {unknown[0]}"
-        )
+        advice = f"; a capture is given by --data {unknown[0]}"
+        if unknown[0].startswith("-"):
+            advice = suggestion(f"-{unknown[0]}", [*flags(TrainConfig), *ALWAYS])
         raise ValueError(f"unrecognized options: {', '.join(unknown)}{advice}")
     return config
 
