@@ -68,6 +68,7 @@ def test_cameras_near_others_and_more_than_the_maximum_are_left_out():
     row = [Camera.looking_at(p - torch.tensor([0.0, 0.0, DEPTH]), p, UP, 50.0, (64, 48), float(p[0])) for p in points]
     apart = Filmed.by(capture_of(row), points)
     assert len(apart.depths) == MAX_CAMERAS
+    assert max(apart.outside(*position_and_axis(camera)) for camera in row) < 1  # along a walk of 120 times the depth
 
 
 def test_the_scale_of_a_scene_does_not_matter():

@@ -32,8 +32,8 @@ DRAG_LIMIT = 1.5
 SPACING = 0.25
 """Cameras that are less outside than this of another one are left out."""
 
-MAX_CAMERAS, MAX_POINTS = 100, 20_000
-"""Maximum number of cameras that are kept, and of points that their depths are measured from."""
+MAX_CAMERAS, MAX_POINTS = 400, 5_000
+"""Maximum number of cameras that are looked at, and of points that their depths are measured from."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,10 @@ class Filmed:
         points = [cloud[:: max(1, len(cloud) // MAX_POINTS)] for cloud in (capture.points, *clouds)]
         cameras = [capture.cameras[name] for name in sorted(capture.train, key=lambda n: (capture.cameras[n].time, n))]
         seen = Filmed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-        for k in evenly_spaced_indices(len(cameras), 4 * MAX_CAMERAS):
+        for k in evenly_spaced_indices(len(cameras), MAX_CAMERAS):
             if seen.outside(*position_and_axis(cameras[k])) > SPACING:
                 seen = seen._with(cameras[k], focus(cameras[k], *points))
-        kept = evenly_spaced_indices(len(seen.depths), MAX_CAMERAS)
-        return Filmed(seen.positions[kept], seen.forwards[kept], seen.depths[kept], seen.angles[kept])
+        return seen
 
     def outside(self, position: Float[np.ndarray, "3"], forward: Float[np.ndarray, "3"]) -> float:
         """How far a view is outside of what was filmed: at most 1 within it; infinite without cameras.
