@@ -198,16 +198,20 @@ def test_a_run_ends_when_lost_dynamic_gaussians_cannot_be_added_again(trainer):
         trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
 
 
-def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer):
-    view = trainer.views[0]
-    static_only = view._replace(static_mask=torch.ones_like(view.static_mask))
-    views = Mock(spec=trainer.views, num_pixels=view.static_mask.numel())
-    views.map.side_effect = lambda work: iter([work(static_only)])
+@pytest.mark.parametrize("is_needed", [False, True])
+def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer, is_needed):
+    static = torch.tensor(9_989 if is_needed else 9_991)
+    views = Mock(spec=trainer.views, num_pixels=10_000)
+    views.map.side_effect = lambda _: iter([(static,)])
     before, trainer.scene.dynamic = (len(trainer.scene.static), 7), Gaussians.empty(0, 1)
-    assert require_branches(before, trainer.scene, views) == (
-        "the last dynamic Gaussian was removed, as transparent, oversized or rarely seen; 0.00% of the training pixels "
-        "are dynamic"
-    )
+    if is_needed:
+        with pytest.raises(ValueError, match=r"but 0\.1% of the training pixels are dynamic"):
+            require_branches(before, trainer.scene, views)
+    else:
+        assert require_branches(before, trainer.scene, views) == (
+            "the last dynamic Gaussian was removed, as transparent, oversized or rarely seen; 0.09% of the training "
+            "pixels are dynamic"
+        )
 
 
 def test_a_branch_that_never_had_gaussians_has_lost_none(trainer):
