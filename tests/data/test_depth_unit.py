@@ -1,5 +1,6 @@
 """Depth in another unit than that of the cameras, and inverse depth where depth is expected."""
 
+import json
 import shutil
 
 import cv2
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.data import layouts
-from tests.data.captures import write_array, write_json
+from tests.data.captures import edit_json, write_array, write_json
 from tests.prepare import boards
 from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.loaders import load_capture
@@ -100,6 +101,15 @@ def test_depth_that_does_not_fit_the_cameras_is_a_warning_that_names_its_unit(wr
 )
 def test_depth_in_the_unit_of_the_cameras_is_no_warning(write, convert, fields):
     assert of_depth(write(convert, **fields)) == ""
+
+
+def test_nothing_is_said_of_the_unit_of_a_single_frame_with_depth(write):
+    root = write(lambda z: z.astype(np.float32))
+    frames = json.loads((root / "transforms.json").read_text())["frames"]
+    for frame in frames[1:]:
+        del frame["depth_file_path"]
+    edit_json(root / "transforms.json", frames=frames)
+    assert "unit" not in of_depth(root)
 
 
 def test_any_unit_of_depth_will_do_where_there_are_points(write):

@@ -59,10 +59,12 @@ def fit_unit(frames: Sequence[Frame], is_inverted: bool = False) -> UnitFit:
     """The factor of depth at which each frame agrees best with the next one.
 
     Args:
-        frames: In the order of time, with depth, in which the cameras move.
+        frames: In the order of time, with depth, in which the cameras move; of a single one, nothing is said.
         is_inverted: Whether to take the inverse of the depth, in any unit, instead of the depth.
     """
     pairs = list(itertools.pairwise(frames))
+    if not pairs:
+        return UnitFit(1.0, 0.0, 0.0)
     scale = 1.0
     if is_inverted:
         shifts = [float((first.camera.position - second.camera.position).norm()) for first, second in pairs]
