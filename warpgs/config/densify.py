@@ -34,7 +34,7 @@ class DensifyConfig:
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.0
     """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start at
-    the next pruning during densification. 0: never."""
+    the next pruning during densification. 0: only if no dynamic Gaussian is left."""
     weakest: Annotated[float, Bounds(max=0.99)] = 0.0
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
