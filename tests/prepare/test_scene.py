@@ -62,6 +62,13 @@ def test_outlier_points_do_not_shrink_the_scene():
     assert scene_units(with_outliers, points[:5]).scale == pytest.approx(expected, rel=0.1)
 
 
+def test_a_crowd_of_points_at_one_place_does_not_enlarge_the_scene():
+    points = np.random.default_rng(0).uniform(-1, 1, (1000, 3))
+    crowded = np.vstack([points, np.zeros((100_000, 3))])
+    expected = scene_units(points, points[:5]).scale
+    assert scene_units(crowded, points[:5]).scale == pytest.approx(expected, rel=0.01)
+
+
 def test_a_pinhole_lens_is_unchanged_and_a_distorted_one_zooms_in():
     lens = Lens(64, 48, (50.0, 50.0), (32.0, 24.0))
     assert pinhole_lens(lens) == lens

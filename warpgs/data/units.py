@@ -59,7 +59,10 @@ def scene_units(points: Float[np.ndarray, "P 3"], centers: Float[np.ndarray, "F 
         points: [P, 3] static points.
         centers: [F, 3] centres of the cameras.
     """
-    low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
+    parts = [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION]
+    low, high = np.quantile(points, parts, axis=0)
+    if (low == high).all():  # nearly all points are at one place, such as the origin where depth was unknown
+        low, high = np.quantile(np.unique(points, axis=0), parts, axis=0)
     low, high = np.minimum(low, centers.min(0)), np.maximum(high, centers.max(0))
     return SceneUnits((low + high) / 2.0, float(2.0 / max((high - low).max(), MIN_SIZE)))
 
