@@ -123,10 +123,10 @@ def test_a_terminal_shows_the_table_from_the_start_and_the_progress_of_cells_whi
 
 @pytest.mark.parametrize("columns", [60, 80])
 def test_the_table_fits_the_terminal_with_one_line_per_cell(board, monkeypatch, columns):
-    monkeypatch.setenv("LINES", "8")
+    console = Console(file=io.StringIO(), width=columns, height=8)
+    monkeypatch.setattr("warpgs.sweep.board.get_console", lambda: console)
     for seed in range(5):
         board.tell(Event(f"as-full-seed{seed}", "failed", "CUDA error: out of memory, " * 9))
-    console = Console(file=io.StringIO(), width=columns)
     console.print(board.table())
     shown = console.file.getvalue().splitlines()
     assert len(shown) < 8

@@ -208,14 +208,25 @@ def test_a_capture_of_one_training_frame_trains(data, run, monkeypatch, capsys):
     assert metrics["psnr"] > 0
 
 
-@pytest.mark.parametrize(("value", "shown", "other"), [(0, "dynamic", "static"), (255, "static", "dynamic")])
-def test_a_capture_in_which_everything_or_nothing_moves_trains(data, run, monkeypatch, capsys, value, shown, other):
+def fill_masks(data, value):
     for path in (data / "resized_mask/1x").iterdir():
         write_png(path, np.full((tiny.SCENE.height, tiny.SCENE.width), value, np.uint8))
+
+
+def test_a_capture_in_which_nothing_moves_trains(data, run, monkeypatch, capsys):
+    fill_masks(data, 255)
     _, metrics = end_to_end(data, run, monkeypatch, capsys)
-    assert metrics[f"psnr_{other}"] is None
-    assert metrics[f"psnr_{shown}"] == metrics["psnr"]
-    assert metrics["num_dynamic"] > 0 or shown == "static"
+    assert metrics["psnr_dynamic"] is None
+    assert metrics["psnr_static"] == metrics["psnr"]
+
+
+def test_a_capture_in_which_everything_moves_trains_only_where_that_is_assumed(data, run, monkeypatch, capsys):
+    fill_masks(data, 0)
+    assert command.run(dataclasses.replace(tiny.CONFIG, data=data, out=run)) == 1
+    assert "the masks mark everything as dynamic" in capsys.readouterr().err
+    assert not run.exists()
+    _, metrics = end_to_end(data, run, monkeypatch, capsys, assume="dynamic")
+    assert metrics["num_static"] == 0 < metrics["num_dynamic"]
 
 
 @pytest.mark.parametrize(("assume", "other"), [("static", "dynamic"), ("dynamic", "static")])

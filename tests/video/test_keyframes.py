@@ -101,7 +101,6 @@ def test_a_single_keyframe_gives_a_constant_path(path):
         ({"view": "0", "time": 0, "speed": 2}, "unknown field 'speed'"),
         ({"view": "0", "time": 0, "focal": -1}, "focal must have a focal length of at least 0.001 px"),
         ({"view": "0", "time": 0, "focal": 1e-300}, "focal must have a focal length of at least"),
-        ({"view": "0", "time": 10**400}, "time must be a number, got 1000"),
         ({**SAVED, "K": [[1e-300, 0, 1], [0, 1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
         ({**SAVED, "K": [[1, 0, 1], [0, -1, 1], [0, 0, 1]], "width": 9, "height": 9}, "K must have a focal length"),
         ({**AIMED, "target": AIMED["position"]}, "position and target coincide"),
@@ -137,7 +136,8 @@ def test_an_invalid_keyframe_is_refused_with_its_number(path, keyframe, words):
         ('{"keyframes": [{"view": "0", "time": 0}], "up": 1}', "up must be three numbers"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0}]}', "every keyframe has a field"),
         ('{"keyframes": [{"view": "0", "time": 0, "at": 1}, {"view": "0", "time": 0, "at": 1}]}', "at must increase"),
-        ('{"keyframes": [{"view": "0", "time": 0, "at": 1' + 400 * "0" + "}]}", "at must be a number"),
+        ('{"keyframes": [{"view": "0", "time": 0, "at": 1' + 400 * "0" + "}]}", "at has more than 64 bits"),
+        ('{"keyframes": [{"view": "0", "time": 1' + 400 * "0" + "}]}", "time has more than 64 bits"),
     ],
 )
 def test_an_invalid_path_is_refused_with_a_one_line_message(path, text, words):
