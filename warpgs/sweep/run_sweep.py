@@ -146,12 +146,16 @@ def _known_commands(out: Path) -> dict[str, str]:
     """The command of each cell when the sweep last started in this folder."""
     path = out / INDEX
     commands = read_json(path) if path.exists() else {}
-    for name, command in commands.items():
-        try:
-            shlex.split(command if isinstance(command, str) else "'")
-        except ValueError as error:
-            raise ValueError(f"{path} is damaged: it has no command of {name:.100}") from error
+    for name, value in commands.items():
+        if not _is_command(value):
+            raise ValueError(f"{path} is damaged: it has no command of {name:.100}")
     return commands
+
+
+def _is_command(value: Any) -> bool:
+    with suppress(ValueError):  # of quotes that do not end
+        return isinstance(value, str) and bool(shlex.split(value))
+    return False
 
 
 def _write_index(out: Path, cells: list[Cell], known: dict[str, str]) -> None:

@@ -37,11 +37,6 @@ class Origin(NamedTuple):
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.scheme}://{host}" + ("" if self.port == PORTS[self.scheme] else f":{self.port}")
 
-    @property
-    def is_local(self) -> bool:
-        """Whether its host is this machine, whatever a name server says."""
-        return is_local(self.host)
-
 
 def is_local(host: str) -> bool:
     """Whether a host is this machine, whatever a name server says."""
@@ -106,7 +101,7 @@ def is_foreign(origin: str | None, host: str | None, listening: str, allowed: Co
         own = parse_origin(f"{page.scheme}://{host or ''}")  # a proxy may add the port that browsers leave out
     except ValueError:
         return True
-    return page != own or (is_local(listening) and not page.is_local)
+    return page != own or (is_local(listening) and not is_local(page.host))
 
 
 class Refusals:
