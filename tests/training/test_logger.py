@@ -152,6 +152,14 @@ def test_events_are_written_when_training_fails(tmp_path):
     assert events(tmp_path)["loss/total"] == [(50, 0.75)]
 
 
+def test_a_run_that_goes_on_from_a_checkpoint_replaces_the_events_after_it(tmp_path):
+    for start, loss in ((0, 0.75), (100, 0.5)):
+        with TrainingLogger(tmp_path, 500, start, quiet=True) as log:
+            for iteration in range(start + 50, 201, 50):
+                log.report(status(iteration, loss=loss))
+    assert events(tmp_path)["loss/total"] == [(50, 0.75), (100, 0.75), (150, 0.5), (200, 0.5)]
+
+
 def test_a_disk_that_is_full_is_one_error_that_names_the_event_file(tmp_path, monkeypatch):
     def fail(data):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -26,7 +26,7 @@ class Events:
 
     Args:
         folder: Folder of all event files of a run.
-        first_iteration: Events of earlier files from there on do not count.
+        first_iteration: Iterations that are done: events of earlier files after them do not count.
 
     Raises:
         OSError: If the file cannot be written; all methods do so, and the message names it.
@@ -39,7 +39,7 @@ class Events:
         self._file = open(self.path, "xb")  # noqa: SIM115  closed by ``close``
         self._records = RecordWriter(self._file)
         self.add(first_iteration, file_version="brain.Event:2")
-        self.add(first_iteration, session_log=SessionLog(status=SessionLog.START))
+        self.add(first_iteration + 1, session_log=SessionLog(status=SessionLog.START))
         self.flush()
 
     def add(self, iteration: int, **content: Any) -> None:
