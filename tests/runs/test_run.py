@@ -13,9 +13,11 @@ from tests.scenes import error
 from warpgs.config import MaskPerturbation, ModelConfig, RenderSettings, Schedule, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.data.loaders import load_capture
+from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint
+from warpgs.runs import run as runs
 from warpgs.runs.config_file import ALWAYS, read_config
-from warpgs.runs.run import Run, choose_device, new_folder, open_run
+from warpgs.runs.run import Run, choose_device, locked_new_folder, new_folder, open_run
 from warpgs.training.schedule import Protocol
 
 UNUSUAL = dataclasses.replace(
@@ -113,6 +115,14 @@ def test_a_run_folder_cannot_be_locked_twice_and_is_unlocked_after_an_error(run)
             fail_locked(run)
     with Run.open(run, "cpu").lock(), pytest.raises(ValueError, match="is being trained by another process"):
         fail_locked(run)
+
+
+def test_a_folder_that_another_training_has_filled_before_it_is_locked_is_refused(tmp_path, capture, monkeypatch):
+    config = dataclasses.replace(tiny.CONFIG, out=tmp_path / "run")
+    monkeypatch.setattr(runs, "lock_folder", lambda *args: create(config, capture) and lock_folder(*args))
+    with pytest.raises(ValueError, match="exists and is not empty"):
+        locked_new_folder(config, capture).__enter__()
+    assert read_config(tmp_path / "run").out == tmp_path / "run"
 
 
 @pytest.mark.parametrize("dap", [False, True])
