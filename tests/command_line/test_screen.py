@@ -39,6 +39,21 @@ def test_what_is_no_terminal_gets_whole_lines():
     assert file.getvalue() == "word " * 100 + "end\n"
 
 
+def test_a_stream_that_does_not_know_whether_it_is_a_terminal_gets_whole_lines():
+    class Tee:
+        written = ""
+
+        def write(self, text):
+            self.written += text
+
+        def flush(self):
+            pass
+
+    tee = Tee()
+    show("word " * 100 + "end", tee)
+    assert tee.written == "word " * 100 + "end\n"
+
+
 @pytest.mark.parametrize("columns", [60, 80])
 @pytest.mark.parametrize(
     ("code", "words"),

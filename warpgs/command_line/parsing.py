@@ -22,7 +22,7 @@ import tyro
 
 from warpgs.errors import not_one_of, suggestion
 
-from .screen import Stream, wrapped
+from .screen import Stream, is_terminal, wrapped
 
 Options = TypeVar("Options")
 
@@ -111,7 +111,7 @@ class _Like(io.StringIO):
         return getattr(self._other, "encoding", None) or "utf-8"
 
     def isatty(self) -> bool:
-        return self._other.isatty()
+        return is_terminal(self._other)
 
 
 def _unboxed(text: str) -> str:

@@ -24,7 +24,10 @@ class Stream(Protocol):
 
     def flush(self) -> object: ...
 
-    def isatty(self) -> bool: ...
+
+def is_terminal(stream: Stream) -> bool:
+    """Whether a stream is a terminal; a program's own one in place of standard error may not know."""
+    return bool(getattr(stream, "isatty", bool)())
 
 
 def show(text: object, file: Stream | None = None) -> None:
@@ -41,7 +44,7 @@ def show_error(text: object) -> None:
 
 def fitted(text: str, stream: Stream) -> str:
     """A text for a stream: as it is unless that is a terminal."""
-    return wrapped(text) if stream.isatty() else text
+    return wrapped(text) if is_terminal(stream) else text
 
 
 def wrapped(text: str, columns: int | None = None) -> str:
