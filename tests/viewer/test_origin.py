@@ -38,6 +38,7 @@ from warpgs.viewer.source import open_source
         ("http://evil.example:8080", "evil.example:8080", "127.0.0.2", True),
         ("http://127.0.0.1.evil.example:8080", "127.0.0.1.evil.example:8080", "127.0.0.1", True),
         ("http://127.0.0.1:8080@evil.example", "127.0.0.1:8080", "127.0.0.1", True),
+        ("http://evil.example@127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
         ("http://127.0.0.1:99999", "127.0.0.1:99999", "127.0.0.1", True),
         ("file://", "127.0.0.1:8080", "127.0.0.1", True),
         ("", "127.0.0.1:8080", "127.0.0.1", True),
