@@ -97,7 +97,7 @@ def test_masks_of_the_images_before_undistortion_are_not_taken_for_those_after(e
         shutil.move(root / name, root / "dense" / name)
     capture = load_capture(root)
     assert capture.frame("frame_00003").static_mask is None
-    assert capture.notes[0] == "masks is left out: those of the images in dense/images are read from dense/masks"
+    assert capture.notes[0] == "masks is left out: dense/images is read with dense/masks"
 
 
 def test_an_undistorted_copy_is_not_preferred_to_the_images(edited):

@@ -120,7 +120,7 @@ def test_rigs_or_frames_alone_are_not_needed(edited, written, removed, kept):
     root = edited("colmap")
     (four_files(root) / f"{removed}.bin").unlink()
     capture, expected = load_capture(root), load_capture(written["colmap"])
-    assert f"has {kept}.bin but not {removed}.bin: poses are those of images.bin" in capture.notes[0]
+    assert f"has {kept}.bin but not {removed}.bin: poses are read from images.bin" in capture.notes[0]
     assert all((capture.cameras[n].viewmat - c.viewmat).abs().max() < 1e-6 for n, c in expected.cameras.items())
 
 

@@ -139,7 +139,7 @@ def test_metric_depth_in_another_unit_is_a_warning_with_the_factor(tmp_path, ori
     for k, view in enumerate(boards.poses(COUNT)):
         write_array(root / f"depth/1x/shot{k:03d}.npy", (1000 * boards.depth(view)).astype(np.float32))
     report = check_capture(root, "iphone", factor=1)
-    assert "depth is about 1,000 times as large as that of the points: it must be in metres" in str(report)
+    assert "depth is about 1,000 times as large as the depth of the points: it must be in metres" in str(report)
 
 
 def test_inverse_depth_where_metric_depth_is_expected_is_called_so(tmp_path, original):

@@ -8,7 +8,7 @@ from pathlib import Path
 from warpgs.files import require_file
 
 METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
-"""Compression that is read: that of NumPy and ViPE. LZMA takes as much memory as its header says, up to 4 GiB."""
+"""Compression that is read; NumPy and ViPE use no other. LZMA takes as much memory as its header says, up to 4 GiB."""
 
 MAX_SMALL, MAX_RATIO = 64 << 20, 200
 """Size up to which a member may be compressed by any ratio, and the maximum ratio of larger ones: images of a video

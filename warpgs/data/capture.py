@@ -99,7 +99,7 @@ class Conventions:
     Attributes:
         masks: How they mark what is dynamic.
         depth: Whether files hold inverse depth, larger is closer, or depth, larger is farther.
-        depth_unit: What says the unit of depth that must be that of the cameras; None if any will do.
+        depth_unit: Name of the unit in which depth must equal the units of the cameras; None if any will do.
     """
 
     masks: str = "0 must mean dynamic and 255 static"
@@ -144,7 +144,7 @@ class Capture:
         time_source: Where the times of the cameras come from.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
-        notes: What the loader says about the files, one sentence each: what it left out or had to interpret.
+        notes: Remarks of the loader on files that it left out or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the

@@ -87,6 +87,6 @@ def quick_findings(capture: Capture) -> list[Finding]:
 
 
 def _masks(capture: Capture, contents: dict[str, Content]) -> list[DynamicCounts]:
-    """What the masks of the training frames that were read mark as dynamic; nothing if they are not used."""
+    """Counts of the dynamic pixels in the masks of training frames that were read; none if masks are not used."""
     dynamic = [contents[name].dynamic for name in capture.train if name in contents]
     return [counts for counts in dynamic if counts is not None] if capture.assumption == "masks" else []

@@ -25,7 +25,7 @@ class Content(NamedTuple):
     Attributes:
         error: Why it cannot be read; None if it can.
         has_depth: Whether it has depth.
-        dynamic: What its mask marks as dynamic; None if it has no mask.
+        dynamic: Counts of its dynamic pixels; None if it has no mask.
     """
 
     error: str | None

@@ -64,7 +64,7 @@ def read_model(folder: Path, note: Callable[[str], None] = lambda text: None) ->
     lonely = [name for name in OPTIONAL if name in present] if not set(OPTIONAL) <= set(present) else []
     for name in lonely:
         (other,) = (other for other in OPTIONAL if other != name)
-        note(f"{folder} has {name}{suffix} but not {other}{suffix}: poses are those of images{suffix}")
+        note(f"{folder} has {name}{suffix} but not {other}{suffix}: poses are read from images{suffix}")
     model = _opened(folder, suffix, [name for name in present if name not in lonely], note)
     for number, full in (names_with_spaces(folder) if suffix == ".txt" else {}).items():
         if number in model.images:

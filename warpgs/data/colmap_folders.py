@@ -2,7 +2,7 @@
 
 COLMAP's mapper writes sparse/0, sparse/1, … when images do not connect, in no order of size; colmap image_undistorter
 writes sparse/ and images/ into a folder, dense/ in COLMAP's documentation, its automatic reconstruction dense/0,
-dense/1, …; other programs write the files beside images/.
+dense/1, …; other programs write the files next to images/.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ class ModelFolder(NamedTuple):
 
     Attributes:
         folder: The folder.
-        part: The folder with its images/, masks/ and depths/: that of the capture, or one in dense.
+        part: The folder with its images/, masks/ and depths/: the capture itself, or one in dense.
     """
 
     folder: Path

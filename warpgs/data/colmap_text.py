@@ -133,7 +133,7 @@ def _images(path: Path, cameras: set[int], note: Callable[[str], None]) -> tuple
 
 
 def _pairs(lines: Iterable[_Line]) -> Iterator[tuple[_Line, _Line | None]]:
-    """The line of every image and that of its features, as COLMAP reads them."""
+    """The two lines of every image, for itself and for its features, as COLMAP reads them."""
     remaining = iter(lines)
     for line in remaining:
         if line.words:
@@ -141,7 +141,7 @@ def _pairs(lines: Iterable[_Line]) -> Iterator[tuple[_Line, _Line | None]]:
 
 
 def _is_image(line: _Line) -> bool:
-    """Whether a line is that of an image, not of features: its last word is a name."""
+    """Whether a line describes an image, not features: its last word is a name."""
     if len(line.words) < 10:
         return False
     try:

@@ -35,7 +35,7 @@ INVERSE_FOR_DEPTH = (
 """The same as "inverted" for files that must hold depth."""
 
 MAX_FACTOR = 1.2
-"""Median ratio of metric depth and that of points, above which its unit is wrong."""
+"""Median ratio of metric depth and the depth of points, above which its unit is wrong."""
 
 MAX_POINTS = 50_000
 """Maximum number of points that depth is compared with."""
@@ -97,8 +97,9 @@ def _compare_with_points(samples: Sequence[PointSamples], capture: Capture, of: 
 def _metric_factor(samples: Sequence[PointSamples]) -> Iterator[Finding]:
     factor = float(np.median([float((1.0 / (part.values * part.depth)).median()) for part in samples]))
     if max(factor, 1.0 / factor) > MAX_FACTOR:
-        text = f"depth is about {float(f'{factor:.2g}'):,g} times as large as that of the points: it must be in metres"
-        yield Finding("warning", "depth", f"{text}, and scene.json's scale must be per metre")
+        text = f"depth is about {float(f'{factor:.2g}'):,g} times as large as the depth of the points"
+        remedy = "it must be in metres, and scene.json's scale must be per metre"
+        yield Finding("warning", "depth", f"{text}: {remedy}")
 
 
 def _depth_at_points(frames: Sequence[Frame], points: torch.Tensor) -> list[PointSamples]:

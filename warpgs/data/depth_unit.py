@@ -28,7 +28,7 @@ MIN_GAIN_OF_INVERSE = 1.15
 boards at 3 to 6 units, and the other way round if they hold depth."""
 
 MAX_FACTOR = 1.3
-"""Factors that are nearer to 1 are no other unit."""
+"""Factors that are nearer to 1 are rounding, not another unit."""
 
 
 class UnitFit(NamedTuple):

@@ -126,7 +126,7 @@ def orientation_to(path: Path, stored: tuple[int, int], fits: Fits, image: Path 
     Args:
         path: The file.
         stored: Its (width, height).
-        fits: Whether a size is that of the camera.
+        fits: Whether a size fits the camera.
         image: The image that the file belongs to: a mask without an orientation of its own may have been made of the
             stored pixels while the camera is that of the upright image, or the reverse.
     """

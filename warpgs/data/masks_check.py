@@ -50,7 +50,7 @@ def check_masks(masks: Sequence[DynamicCounts], capture: Capture, motions: Seque
     """How much the masks of training frames mark as dynamic.
 
     Args:
-        masks: Those of at least one frame.
+        masks: Counts of at least one frame.
         capture: Their capture.
         motions: Motion between some of its frames, which may show that nearly everything moves indeed.
     """

@@ -61,7 +61,7 @@ PUBLISHED = (
 
 
 def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
-    """Message that a folder of a capture does not exist: what was meant, or where to get it and what there is without.
+    """Message that a folder of a capture does not exist: similar ones, or where to get it and how to do without.
 
     Args:
         path: The folder.

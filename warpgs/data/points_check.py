@@ -14,7 +14,7 @@ MIN_VISIBLE_FRACTION = 0.2
 """Median fraction of the points that a training camera should see."""
 
 MIN_POINT_CONTRAST = 0.8
-"""Contrast at the points over that of the image: 2 to 4 for COLMAP's points, about 1 for those of a depth sensor."""
+"""Contrast at the points over the contrast of the image: 2 to 4 for points of COLMAP, about 1 for a depth sensor's."""
 
 MIN_POINT_DISTANCE = 0.01
 """Points closer to a camera than this fraction of the capture's extent are not on surfaces."""

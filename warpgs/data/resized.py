@@ -171,7 +171,7 @@ def check_shape(path: Path, what: str, stored: tuple[int, int], size: tuple[int,
 def _fitting(
     path: Path, what: str, stored: np.ndarray, size: tuple[int, int], image: Path | None = None
 ) -> Shaped[np.ndarray, "h w ..."]:
-    """Stored pixels with the shape of ``size``, turned if their EXIF orientation, or that of their image, says so."""
+    """Stored pixels with the shape of ``size``, turned if their EXIF orientation, or their image's, says so."""
     pixels = turned(path, stored, lambda other: has_shape(other, size), image)
     check_shape(path, what, (pixels.shape[1], pixels.shape[0]), size)
     return pixels

@@ -24,8 +24,8 @@ MIN_DROP = 0.25
 """By how much the correlation across a cut is below that of the frames before and after it; fast motion has no cut."""
 
 DETAILED, DETAILS = (96, 54), 6.0
-"""Width and height of the thumbnails in which parts are looked for, and standard deviation of the filter that takes
-away what is no detail [px]."""
+"""Width and height of the thumbnails in which parts are looked for, and standard deviation of the filter that
+removes everything but details [px]."""
 
 MAX_PART_CORRELATION = 0.6
 """Correlation of the details of a part, wherever it is found, above which two frames are of one shot."""

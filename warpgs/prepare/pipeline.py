@@ -75,7 +75,7 @@ def _prepare(
 
 
 def _require_whole(root: Path) -> None:
-    """Raises ValueError if a finished capture lacks a file: what it was made from is removed."""
+    """Raises ValueError if a finished capture lacks a file: the frames that it was made from are removed."""
     index = root / "dataset.json"
     lost = first_lost([index]) or first_lost(capture_files(root, list(map(str, read_json(index).get("ids", [])))))
     if lost is not None:

@@ -92,10 +92,10 @@ class _Files:
 
 
 def _unused(root: Path, part: Path) -> list[str]:
-    """Notes on masks and depth beside the original images of those that are read."""
+    """Notes on masks and depth of the original images, where undistorted ones are read."""
     names = [name for name in (MASKS, DEPTHS) if (root / name).is_dir() and not (part / name).is_dir()]
     place = part.relative_to(root)
-    return [f"{name} is left out: those of the images in {place}/images are read from {place}/{name}" for name in names]
+    return [f"{name} is left out: {place}/images is read with {place}/{name}" for name in names]
 
 
 def _first(folder: Path, *names: str) -> Path | None:

@@ -17,7 +17,7 @@ def images_left_out(
 ) -> tuple[str, ...]:
     """A note on the images that are left out, if there are any.
 
-    Files whose names extend that of a used image, such as r_000_depth.png that of r_000.png, are not images of their
+    Files whose names extend that of a used image, such as r_000_depth.png next to r_000.png, are not images of their
     own.
 
     Args:
@@ -58,5 +58,5 @@ def _images(folders: Iterable[Path], within: bool) -> Iterator[Path]:
 
 
 def _extends(path: Path, stems: set[Path]) -> bool:
-    """Whether the name of an image begins with that of a used one and a separator."""
+    """Whether the name of an image begins with the name of a used one and a separator."""
     return any(path.parent / path.stem[: end.start()] in stems for end in re.finditer(r"[\W_]", path.stem))

@@ -90,7 +90,7 @@ class ListedFiles:
         return self._names.keys()
 
     def missing(self, name: str, reason: str) -> str:
-        """Message that a file is missing, why it is needed, and what is near."""
+        """Message that a file is missing, why it is needed, and which files are near."""
         return f"{self.folder / name} is missing: {reason}{_near(self.folder, name)}"
 
     @property
@@ -121,7 +121,7 @@ def _ends(folder: Path, parts: Parts, is_image: bool) -> Iterator[Parts]:
     """What a path may mean in a folder: all of it, or an end of it.
 
     An end follows the name of the folder, or is one of an absolute path of at least two parts (one for images): the
-    name of a mask alone could be that of an image.
+    name of a mask alone could belong to an image.
     """
     is_absolute = parts[:1] == ("/",)
     if not is_absolute:
@@ -187,7 +187,7 @@ def _key(name: str) -> str:
 
 
 def _near(folder: Path, name: str) -> str:
-    """The end of a message about a missing file: one of its name elsewhere, similar names, or what is there instead."""
+    """The end of a message about a missing file: one of its name elsewhere, similar names, or its folder's names."""
     parts = [part for part in next(_spellings(name)) if part != "/"]
     same = [
         path for path in itertools.islice(_search(folder), MAX_SEARCHED) if parts and _key(path.name) == _key(parts[-1])

@@ -182,7 +182,7 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
 def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarray, "N 2"]) -> World:
     """Points of a COLMAP model, if there is one; otherwise units that contain what lies between the bounds."""
     if models := _models(root):
-        # Several models have unrelated worlds: that of the poses has as many images.
+        # Several models have unrelated worlds: the poses come from the one with as many images.
         folder = next((model.folder for model in models if model.num_images() == len(poses)), models[0].folder)
         _, points, colors, notes = load_model(folder, undistort=False)
         if len(points):

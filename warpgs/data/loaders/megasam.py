@@ -21,7 +21,7 @@ SUFFIXES = ("_sgd_cvd_hr.npz", "_droid.npz")
 
 ARRAYS = ("images", "depths", "intrinsic", "cam_c2w")
 
-CONVENTIONS = Conventions(depth="depth", depth_unit="that of the poses")
+CONVENTIONS = Conventions(depth="depth", depth_unit="the scale of the poses")
 
 
 class MegaSamLoader:

@@ -37,7 +37,7 @@ PAIR = re.compile(r"(?<![0-9])(?P<seconds>[0-9]{1,10})(?P<mark>[._-])(?P<part>[0
 DECIMAL = re.compile(r"(?<![0-9])(?P<seconds>[0-9]{1,10})(?P<mark>\.)(?P<part>[0-9]{1,9})(?![0-9])")
 
 AFTER_LETTERS = re.compile(r"(?i)(?<![a-z])(t|ts|sec|time|stamp|timestamp)$")
-"""Words that a decimal number may follow directly: that of shot1.0001 is a shot, then a frame."""
+"""Words that a decimal number may follow directly: shot1.0001 is a shot and a frame."""
 
 
 class Stamps(NamedTuple):
@@ -59,7 +59,7 @@ def find_stamps(stems: Sequence[str]) -> Iterator[Stamps]:
         counts = {len(found) for found in matches}
         if len(counts) != 1:
             continue
-        for k in reversed(range(counts.pop())):  # the last one that differs is that of the frame
+        for k in reversed(range(counts.pop())):  # the last one that differs belongs to the frame
             chosen = [found[k] for found in matches]
             stamps = _stamps(chosen, seconds_of)
             if stamps is None or len(set(stamps.nanoseconds)) == 1:

@@ -35,7 +35,7 @@ class NamedTimes(NamedTuple):
     """Times of names.
 
     Attributes:
-        times: Of each name, from that of the first frame on.
+        times: Of each name, from the first frame on.
         source: Where they come from.
         are_read: Whether the names hold them; if not, they count the names.
     """
@@ -80,7 +80,7 @@ def _stem(path: str) -> str:
 
 
 def _numbers(stems: Sequence[str]) -> Iterator[_Reading]:
-    """Numbers of the names that may be a frame's, the last ones first: those that differ, and not those of cameras."""
+    """Numbers of the names that may count frames, the last ones first: they differ, and do not count cameras."""
     parts = [NUMBER.split(stem) for stem in stems]  # text and numbers alternate
     last = min(map(len, parts)) - 2
     if last < 0:
@@ -169,7 +169,7 @@ def _missing_numbers(paths: Sequence[str], stems: Sequence[str], numbers: Sequen
     for k, (a, b) in enumerate(pairwise(values)):
         if b <= a:
             return f"the numbers in them do not grow from {_shown(paths[k])} to {_shown(paths[k + 1])}"
-    return "the numbers in them are not those of frames"
+    return "the numbers in them do not count frames"
 
 
 def _shown(path: str) -> str:

@@ -1,4 +1,4 @@
-"""Which names of images are those of cameras that film at the same time, and not of clips that follow each other."""
+"""Which names of images belong to cameras that film at the same time, and not to clips that follow each other."""
 
 import re
 from collections import defaultdict
@@ -19,7 +19,7 @@ MIN_COMMON = 0.8
 
 
 def follows_camera(text: str) -> bool:
-    """Whether the number after a text is that of a camera."""
+    """Whether the number after a text counts cameras."""
     return BEFORE_NUMBER.search(text) is not None
 
 

@@ -39,4 +39,4 @@ def unclear_note(image: Path) -> str:
     """A note on an image that is stored turned, where nothing tells whether its camera is."""
     which = f"images such as {image.name}, with the EXIF orientation {orientation_of(image)},"
     remedy = "turn the files, for example with mogrify -auto-orient"
-    return f"{which} are read as stored; if cameras are those of upright images, {remedy}"
+    return f"{which} are read as stored; if the cameras belong to upright images, {remedy}"

@@ -43,7 +43,7 @@ MAX_TEXT = 64 << 20
 MAX_DIGITS = 9
 """Maximum number of digits of the number of an instance."""
 
-CONVENTIONS = Conventions(depth="depth", depth_unit="that of the poses")
+CONVENTIONS = Conventions(depth="depth", depth_unit="the scale of the poses")
 
 
 class VipeLoader:
