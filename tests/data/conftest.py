@@ -6,6 +6,7 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import write_capture
+from tests.prepare import boards
 
 
 @pytest.fixture
@@ -19,6 +20,14 @@ def written(tmp_path_factory):
     """The folder of each layout, which tests leave as it is."""
     root = tmp_path_factory.mktemp("layouts")
     return {name: write(root / name) for name, write in layouts.ALL.items()}
+
+
+@pytest.fixture(scope="session")
+def with_boards(tmp_path_factory):
+    """A capture of moving boards, which tests leave as it is."""
+    root = boards.write_capture(tmp_path_factory.mktemp("boards") / "capture")
+    shutil.rmtree(root / "frames")
+    return root
 
 
 @pytest.fixture

@@ -24,16 +24,9 @@ from warpgs.data.motion_check import motion_between
 from warpgs.training.stored_views import ViewReader
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    root = boards.write_capture(tmp_path_factory.mktemp("check") / "capture")
-    shutil.rmtree(root / "frames")
-    return root
-
-
 @pytest.fixture
-def root(original, tmp_path):
-    return shutil.copytree(original, tmp_path / "capture")
+def root(with_boards, tmp_path):
+    return shutil.copytree(with_boards, tmp_path / "capture")
 
 
 def texts(report, level):
@@ -290,8 +283,8 @@ def test_flow_between_cameras_that_look_in_different_directions_is_no_evidence(r
     assert "from cameras too far apart" in texts(report, "note")
 
 
-def test_pixels_whose_flow_does_not_lead_back_do_not_count(original):
-    capture = load_capture(original)
+def test_pixels_whose_flow_does_not_lead_back_do_not_count(with_boards):
+    capture = load_capture(with_boards)
     first, second = (capture.frame(name) for name in capture.train[:2])
     other = torch.from_numpy(captures.image_of("other", (256, 192)))
     assert motion_between(first, replace(second, image=other)) is None
@@ -328,9 +321,9 @@ def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_to_be_sta
     assert {f.level for f in findings} == {"warning"}
 
 
-def test_images_too_small_for_optical_flow_are_checked_without_it(original):
+def test_images_too_small_for_optical_flow_are_checked_without_it(with_boards):
     """OpenCV crashes on images that are less than 16 pixels high."""
-    capture = load_capture(original)
+    capture = load_capture(with_boards)
     frames = [capture.frame(name) for name in capture.train[:2]]
     assert motion_between(*frames) is not None
     small = [replace(f, image=f.image[90:102], static_mask=f.static_mask[90:102]) for f in frames]

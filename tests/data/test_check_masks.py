@@ -9,22 +9,14 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, stop_time
-from tests.prepare import boards
 from warpgs.data import check
 from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.loaders import load_capture
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    root = boards.write_capture(tmp_path_factory.mktemp("check") / "capture")
-    shutil.rmtree(root / "frames")
-    return root
-
-
 @pytest.fixture
-def root(original, tmp_path):
-    return shutil.copytree(original, tmp_path / "capture")
+def root(with_boards, tmp_path):
+    return shutil.copytree(with_boards, tmp_path / "capture")
 
 
 def convert_masks(root, convert):

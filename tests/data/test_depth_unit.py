@@ -16,15 +16,8 @@ from warpgs.data.loaders import load_capture
 COUNT = 16
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    root = boards.write_capture(tmp_path_factory.mktemp("unit") / "capture")
-    shutil.rmtree(root / "frames")
-    return root
-
-
 @pytest.fixture
-def write(original, tmp_path):
+def write(with_boards, tmp_path):
     """Writes the boards in nerfstudio's layout with other depth, and with the points if asked for."""
 
     def write_studio(convert, with_points=False, **fields):
@@ -38,14 +31,14 @@ def write(original, tmp_path):
             else:
                 write_array(root / f"depth/{name}.npy", depth)
             (root / "images").mkdir(exist_ok=True)
-            shutil.copy(original / f"rgb/1x/{name}.png", root / f"images/{name}.png")
+            shutil.copy(with_boards / f"rgb/1x/{name}.png", root / f"images/{name}.png")
             pose = np.vstack([view, [0, 0, 0, 1]])
             matrix = np.linalg.inv(pose) @ np.diag([1, -1, -1, 1])
             suffix = "png" if depth.dtype == np.uint16 else "npy"
             files = {"file_path": f"images/{name}.png", "depth_file_path": f"depth/{name}.{suffix}"}
             frames.append({**files, "transform_matrix": matrix.tolist(), "time": k})
         if with_points:
-            points = np.load(original / "points.npy")
+            points = np.load(with_boards / "points.npy")
             rows = "".join(f"{x} {y} {z}\n" for x, y, z in points)
             names = "".join(f"property float {axis}\n" for axis in "xyz")
             header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{names}end_header\n"
@@ -121,8 +114,8 @@ def test_disparities_where_depth_is_expected_are_called_so_where_there_are_point
     assert "it shrinks with distance, as inverse depth and disparities do, but must be depth" in found
 
 
-def test_depth_of_a_wall_is_not_blamed_for_points_that_are_equally_far(tmp_path, original):
-    root = shutil.copytree(original, tmp_path / "capture")
+def test_depth_of_a_wall_is_not_blamed_for_points_that_are_equally_far(tmp_path, with_boards):
+    root = shutil.copytree(with_boards, tmp_path / "capture")
     write_array(root / "depth/1x/shot000.npy", np.full((192, 256), 1 / 6, np.float32))
     view = boards.poses(COUNT)[0]
     x, y = np.random.default_rng(0).uniform(-1, 1, (2, 400))
@@ -134,16 +127,16 @@ def test_depth_of_a_wall_is_not_blamed_for_points_that_are_equally_far(tmp_path,
     assert "points, which are all equally far from the camera" in str(check_capture(root))
 
 
-def test_metric_depth_in_another_unit_is_a_warning_with_the_factor(tmp_path, original):
-    root = shutil.copytree(original, tmp_path / "capture")
+def test_metric_depth_in_another_unit_is_a_warning_with_the_factor(tmp_path, with_boards):
+    root = shutil.copytree(with_boards, tmp_path / "capture")
     for k, view in enumerate(boards.poses(COUNT)):
         write_array(root / f"depth/1x/shot{k:03d}.npy", (1000 * boards.depth(view)).astype(np.float32))
     report = check_capture(root, "iphone", factor=1)
     assert "depth is about 1,000 times as large as the depth of the points: it must be in metres" in str(report)
 
 
-def test_inverse_depth_where_metric_depth_is_expected_is_called_so(tmp_path, original):
-    root = shutil.copytree(original, tmp_path / "capture")
+def test_inverse_depth_where_metric_depth_is_expected_is_called_so(tmp_path, with_boards):
+    root = shutil.copytree(with_boards, tmp_path / "capture")
     for k, view in enumerate(boards.poses(COUNT)):
         write_array(root / f"depth/1x/shot{k:03d}.npy", (1 / boards.depth(view)).astype(np.float32))
     report = check_capture(root, "iphone", factor=1)
