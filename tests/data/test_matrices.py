@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from tests.data import layouts
 from tests.data.captures import edit_json, refused, write_array, write_json
@@ -189,3 +190,10 @@ def test_a_transposed_pose_is_refused(edited):
     root = edited("nerfstudio")
     every_frame(root, lambda e, k: e.update(transform_matrix=np.array(e["transform_matrix"]).T.tolist()))
     refused(root, r"must end with the row 0 0 0 1, got \[.*\]; positions belong into its last column")
+
+
+def test_the_last_row_of_a_pose_may_be_rounded(edited, written):
+    root = edited("nerfstudio")
+    every_frame(root, lambda entry, k: entry["transform_matrix"][3].__setitem__(0, -1e-17))
+    cameras = [load_capture(folder).cameras["frame_00003"] for folder in (root, written["nerfstudio"])]
+    assert torch.equal(cameras[0].viewmat, cameras[1].viewmat)

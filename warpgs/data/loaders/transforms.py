@@ -23,7 +23,15 @@ from warpgs.errors import visible
 from warpgs.files import read_json, read_numbers
 
 from .listed import MAX_PATH, ListedFiles
-from .matrices import FOCAL, contradictions, scale_note, scale_of_rotations, with_intrinsics, without_scale
+from .matrices import (
+    FOCAL,
+    MAX_DIFFERENCE,
+    contradictions,
+    scale_note,
+    scale_of_rotations,
+    with_intrinsics,
+    without_scale,
+)
 from .posed import opencv_from_opengl, world_to_camera
 from .turned import unclear_note
 
@@ -168,7 +176,7 @@ class Transforms:
         given = frame.get("transform_matrix")
         rows = len(given) if isinstance(given, list) else 4
         matrix = read_numbers(self.path, frame, "transform_matrix", (3 if rows == 3 else 4, 4))
-        if np.abs(matrix[3:, :3]).any():
+        if (np.abs(matrix[3:, :3]) > MAX_DIFFERENCE).any():
             raise ValueError(
                 f"{self.path}: transform_matrix of {self._name(frame)} must end with the row 0 0 0 1, got "
                 f"{matrix[3].tolist()}; positions belong into its last column"
