@@ -300,7 +300,8 @@ def test_a_file_whose_size_says_nothing_about_its_content_is_refused(read, tmp_p
         ('{"a":' * 65 + "1" + "}" * 65, "is nested deeper than 64 levels$"),
         ('{"a":' + "[" * 64 + "]" * 64 + "}", "is nested deeper than 64 levels$"),
         ("[" * 100_000, "is not valid JSON: it is nested deeper than 64 levels$"),
-        ('{"a": 1, "b": 2, "a": 1}', "is not valid JSON: one object has 'a' twice$"),
+        ('{"a": 1, "b": 2, "a": 3}', "is not valid JSON: one object has 'a' twice, with different values$"),
+        ('{"a": [1], "b": 2, "a": [1]}', None),
         ('{"a": 18446744073709551616, "b": 1.5}', None),
         ('{"a": NaN, "b": 1e999}', None),  # whoever reads a number checks that it is finite
         ("\ufeff{}", None),
@@ -318,7 +319,7 @@ def test_json_that_no_reader_expects_is_refused_by_name(path, text, message):
 
 
 def test_the_last_of_many_names_that_is_there_twice_is_found_at_once(path):
-    write_text(path, "{" + ",".join(f'"{k}":0' for k in [*range(200_000), 199_999]) + "}")
+    write_text(path, "{" + ",".join(f'"{k}":0' for k in range(200_000)) + ',"199999":1}')
     start = time.process_time()
     with pytest.raises(ValueError, match="one object has '199999' twice"):
         read_json(path)

@@ -1,4 +1,4 @@
-"""Parsed JSON and TOML, with bounds on what no reader expects: deep nesting, huge integers, a name twice."""
+"""Parsed JSON and TOML, with bounds on what no reader expects: deep nesting, huge integers, two values of one name."""
 
 import json
 import math
@@ -75,11 +75,9 @@ def finite(values: Any) -> Any:
 def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values = dict(pairs)
     if len(values) < len(pairs):
-        seen: set[str] = set()
-        for name, _ in pairs:
-            if name in seen:
-                raise ValueError(f"one object has {reprlib.repr(name)} twice")
-            seen.add(name)
+        for name, value in pairs:
+            if value != values[name]:
+                raise ValueError(f"one object has {reprlib.repr(name)} twice, with different values")
     return values
 
 
