@@ -384,6 +384,16 @@ def test_a_second_click_cancels_the_video(editor, started):
     assert editor.controls.download.disabled
 
 
+def test_a_video_after_one_that_was_cancelled_is_shown_as_complete(editor, started):
+    add(editor, 0.0, 2.0)
+    started.during.append(lambda: editor.click("render"))
+    editor.click("render")
+    editor.click("render")
+    assert note(editor) == "wrote video.mp4"
+    assert editor.controls.progress.value == 100.0
+    assert not editor.controls.download.disabled
+
+
 def test_a_video_ends_with_the_browser(editor, started):
     add(editor, 0.0, 2.0)
     started.during.append(editor.stop)
