@@ -14,7 +14,15 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.point_cloud import color_points, distinct, gaussians_at, scene_box, subsample, unproject
+from warpgs.training.point_cloud import (
+    color_points,
+    distinct,
+    gaussians_at,
+    pixel_size,
+    scene_box,
+    subsample,
+    unproject,
+)
 from warpgs.training.schedule import Protocol
 from warpgs.training.views import Views
 
@@ -120,6 +128,46 @@ def test_points_that_occur_several_times_have_the_size_of_single_ones(copies, ji
     repeated, original = merged(points, copies, jitter)
     single, several = (gaussians_at(p, torch.rand(len(p), 3), model).scales.detach() for p in (points, repeated))
     assert error(several / single[original], torch.ones_like(several)) < 1e-4
+
+
+@pytest.mark.parametrize("spread", [1e-6, 1e-4, 3e-3])
+def test_clusters_closer_than_cameras_resolve_have_the_size_of_single_points(spread):
+    points = 0.5 * random_points(200)
+    repeated, original = merged(points, 6)
+    repeated = repeated + spread * torch.randn(repeated.shape, generator=generator(1))
+    single = gaussians_at(points, torch.rand(200, 3), NETWORK).scales.detach()[original]
+    several = gaussians_at(repeated, torch.rand(1200, 3), NETWORK, resolution=0.02).scales.detach()
+    assert several.min() >= 0.02
+    assert (several / single).median().item() == pytest.approx(1.0, abs=0.15)
+    assert (several / single).min() > 0.3
+
+
+def test_the_resolution_changes_no_sizes_of_points_that_are_farther_apart():
+    points, colors = grid(0.1), torch.rand(27, 3)
+    plain, resolved = (gaussians_at(points, colors, NETWORK, resolution=r).scales for r in (0.0, 0.02))
+    assert torch.equal(plain, resolved)
+
+
+def test_sizes_without_bounds_have_no_resolution():
+    points = random_points(40)
+    model = UNBOUNDED.model
+    plain, resolved = (gaussians_at(points, torch.rand(40, 3), model, resolution=r).scales for r in (0.0, 1.0))
+    assert torch.equal(plain, resolved)
+
+
+def test_cameras_resolve_a_pixel_at_the_median_depth_of_what_they_see():
+    depths = torch.tensor([2.0, 3.0, 7.0])
+    points = torch.cat([points_at([9, 12, 14], [9, 20, 30], depth) for depth in depths])
+    behind = CAMERA.position - (points[:2] - CAMERA.position)
+    assert pixel_size(torch.cat([points, behind]), [CAMERA]) == pytest.approx(3.0 / 45.0, rel=1e-4)
+    assert pixel_size(behind, [CAMERA]) == 0.0
+
+
+def test_static_gaussians_of_a_cloud_of_several_scans_are_visible():
+    points = points_at([9, 12, 14, 20, 25, 30], [9, 20, 30, 7, 40, 25])
+    capture = make_capture(points.repeat(20, 1) + 1e-4 * torch.randn(120, 3, generator=generator()))
+    static = initialize.initial_scene(CONFIG, capture, generator()).static
+    assert static.scales.min() > 0.25 * DEPTH / 46.0
 
 
 def test_a_place_that_holds_most_points_does_not_change_the_sizes_elsewhere():

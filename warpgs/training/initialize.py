@@ -20,7 +20,7 @@ from warpgs.rendering import DEFAULTS, render
 from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
-from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .point_cloud import color_points, gaussians_at, pixel_size, random_points, scene_box, subsample
 from .reseed import gaussians_in_box
 from .schedule import Protocol
 from .tracked_start import start_from_tracks
@@ -29,6 +29,10 @@ from .views import Views
 
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views from which points without colours are coloured."""
+
+RESOLUTION = 0.25
+"""Distance of points, in pixels at their median depth, below which clouds of several scans or models show one place. A
+Gaussian as small as the error between the scans would be culled and pruned."""
 
 MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
 """Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
@@ -44,10 +48,18 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
     degree = config.model.sh_degree
     static = Gaussians.empty(0, degree)
     if capture.assumption != "dynamic":
-        static = gaussians_at(*_colored_points(config, capture, generator), config.model)
+        static = _gaussians_at_points(config, capture, generator)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
+
+
+def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
+    """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
+    points, colors = _colored_points(config, capture, generator)
+    names = capture.train[:: -(-len(capture.train) // MAX_COLOR_VIEWS)]
+    resolution = RESOLUTION * pixel_size(points, (capture.cameras[name] for name in names))
+    return gaussians_at(points, colors, config.model, resolution=resolution)
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -98,7 +110,7 @@ def dynamic_gaussians(
     if isinstance(deformation, SplineDeformation):
         return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
     if capture.assumption == "dynamic" and len(capture.points):
-        return gaussians_at(*_colored_points(config, capture, generator), config.model)
+        return _gaussians_at_points(config, capture, generator)
     count = max(max_count, MAX_POINTS) if protocol.fits_motion else max_count
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:

@@ -1,12 +1,11 @@
 """Gaussians from point clouds, and point clouds from depth."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -42,6 +41,7 @@ def gaussians_at(
     colors: Float[Tensor, "N 3"],
     model: ModelConfig,
     max_scale: float = math.inf,
+    resolution: float = 0.0,
 ) -> Gaussians:
     """Isotropic Gaussians, each as large as the root mean square distance to its three nearest neighbours (3DGS).
 
@@ -52,8 +52,10 @@ def gaussians_at(
         colors: [N, 3] in [0, 1].
         model: Degree of spherical harmonics, and whether sizes are bounded.
         max_scale: Maximum standard deviation, if sizes are bounded [scene units].
+        resolution: What cameras resolve, if sizes are bounded: closer points are at one place, and no Gaussian is
+            smaller [scene units].
     """
-    first, place = distinct(points)
+    first, place = distinct(points, resolution if model.bound_sizes else 0.0)
     if len(first) <= NUM_NEIGHBOURS:
         scales = torch.full((points.shape[0],), min(FEW_POINTS_SCALE, max_scale), dtype=torch.float32)
         return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
@@ -63,28 +65,41 @@ def gaussians_at(
     if model.bound_sizes:
         # Of points that nearly coincide and of a few distant ones, distances are no sizes.
         typical = scales.median().clamp_min(1e-7)
-        scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_max(max_scale)
+        scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_min(resolution).clamp_max(max_scale)
     else:
         scales = scales.clamp_min(MIN_SCALE)
     return Gaussians.from_points(points, colors, scales[place], INITIAL_OPACITY, model.sh_degree)
 
 
-def distinct(points: Float[Tensor, "N 3"]) -> tuple[Int64[Tensor, " D"], Int64[Tensor, " N"]]:
-    """Sorted indices of the first point at each place, and the number of each point's place among them."""
+def distinct(points: Float[Tensor, "N 3"], resolution: float = 0.0) -> tuple[Int64[Tensor, " D"], Int64[Tensor, " N"]]:
+    """Sorted indices of one point at each place, and the number of each point's place among them.
+
+    Args:
+        points: [N, 3] positions.
+        resolution: Distance below which points are at one place [scene units].
+    """
     values = points.detach().cpu().numpy().astype(np.float64)
     sizes = np.abs(values).max(1, initial=0.0)
-    tolerance = COINCIDENT * float(np.median(sizes[sizes > 0.0])) if sizes.any() else 1.0
-    cells = np.rint(values / tolerance).clip(-MAX_CELL, MAX_CELL).astype(np.int64)
-    # Cells that share a hash would only share a size, and of a million cells two do with a probability of 1e-7.
-    _, first, cell = np.unique((cells * CELL_HASH).sum(1), return_index=True, return_inverse=True)
-    # A place may lie on the border of cells.
-    pairs = cKDTree(values[first]).query_pairs(tolerance, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(first), len(first)))
-    _, place = connected_components(links, directed=False)
-    place = place[cell]
-    _, first, place = np.unique(place, return_index=True, return_inverse=True)
-    order = first.argsort()
-    return torch.from_numpy(first[order]), torch.from_numpy(order.argsort()[place])
+    radius = max(resolution, COINCIDENT * float(np.median(sizes[sizes > 0.0])) if sizes.any() else 1.0)
+    cells = np.rint(values / radius).clip(-MAX_CELL, MAX_CELL).astype(np.int64)
+    # Of a million cells, two share a hash with a probability of 1e-7; their points would share a size.
+    _, first = np.unique((cells * CELL_HASH).sum(1), return_index=True)
+    first.sort()
+    # A place may lie on the border of cells. Chains of close points do not become one place.
+    pairs = cKDTree(values[first]).query_pairs(radius, output_type="ndarray")
+    first = np.delete(first, np.unique(pairs.max(1)))
+    place = cKDTree(values[first]).query(values, workers=-1)[1] if len(first) < len(values) else first
+    return torch.from_numpy(first), torch.from_numpy(place)
+
+
+def pixel_size(points: Float[Tensor, "P 3"], cameras: Iterable[Camera]) -> float:
+    """Median size of a pixel at the points that cameras see [scene units]; 0 if they see none."""
+    sizes = []
+    for camera in cameras:
+        _, _, depth, inside = camera.project(points)
+        sizes.append(depth[inside] / camera.K[0, 0])
+    seen = torch.cat(sizes)
+    return float(seen.median()) if len(seen) else 0.0
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
