@@ -128,6 +128,42 @@ def test_a_capture_of_another_system_is_read_as_before_and_says_so(edited, writt
     )
 
 
+def spaced(name):
+    """Frame 10 of a long name is "my frame 10"."""
+    return name.replace("frame_", "my frame ").replace(" 0000", " ")
+
+
+LISTED_AS = [
+    lambda name: name.replace(" ", "%20"),
+    lambda name: f"C:\\scans 2031\\one\\images\\{name}".replace(" ", "%20"),
+    lambda name: name.replace("my", "MY").replace(" ", "\u202f"),
+]
+
+
+@pytest.mark.parametrize("listed_as", LISTED_AS, ids=["escapes", "Windows", "capitals"])
+@pytest.mark.parametrize("dataset", ["nerfstudio", "colmap as text"])
+def test_times_ids_and_order_are_those_of_the_files_that_were_found(edited, dataset, listed_as):
+    root = edited(dataset)
+    index = root / ("transforms.json" if dataset == "nerfstudio" else "sparse/0/images.txt")
+    text = index.read_text()
+    for k, name in enumerate(layouts.NAMES):
+        file = spaced(name) if k else "my frame 20"
+        (root / f"images/{name}.png").rename(root / f"images/{file}.png")
+        listed = listed_as(f"{file}.png")
+        if dataset == "nerfstudio":
+            listed = json.dumps(listed if "\\" in listed else f"images/{listed}")[1:-1]
+            text = text.replace(f"images/{name}.png", listed)
+        else:
+            text = text.replace(f"{name}.png", listed)
+    index.write_text(text)
+    capture = load_capture(root)
+    times = {name: camera.time for name, camera in capture.cameras.items()}
+    numbers = {name: int(name.removeprefix("my frame ")) for name in times}
+    assert max(numbers.values()) == 20
+    assert times == pytest.approx({name: (number - 1) / 19 for name, number in numbers.items()})
+    assert [*capture.train] == sorted(capture.train, key=numbers.__getitem__)
+
+
 def test_names_of_a_colmap_model_made_on_windows_are_found(edited):
     root = edited("colmap as text")
     (root / "images/cam1").mkdir()

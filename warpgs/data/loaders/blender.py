@@ -102,7 +102,7 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
     images = [transforms.image(entry) for entry in transforms.frames]
     names = [image.stem for image in images]
     if len(set(names)) < len(names):
-        names = plain_names([entry["file_path"] for entry in transforms.frames])
+        names = plain_names([transforms.image_name(entry) for entry in transforms.frames])
     for entry, image, name, time in zip(transforms.frames, images, names, times, strict=True):
         if size is None:  # the images of these datasets have one size
             first = transforms.lens(entry, image)

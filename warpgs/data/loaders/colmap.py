@@ -42,10 +42,11 @@ class ColmapLoader:
         if found is None:
             raise ValueError(f"{root} has no folder images/ with a COLMAP model in {PLACES}")
         model = load_model(found.folder, options.undistort)
-        images = sorted(model.images, key=lambda image: natural_order(image.name))
-        names = plain_names([image.name for image in images])
-        times, source, _ = times_of_names([image.name for image in images])
         files = _Files(found.part, options.factor or 1)
+        images = sorted(model.images, key=lambda image: natural_order(files.stored_name(image)))
+        stored_names = [files.stored_name(image) for image in images]
+        names = plain_names(stored_names)
+        times, source, _ = times_of_names(stored_names)
         notes += model.notes
         if found.part != root:
             notes += _unused(root, found.part)
@@ -67,15 +68,24 @@ class _Files:
         self.masks, self.depths = root / MASKS, root / DEPTHS
         self.used: list[Path] = []
 
+    def _path(self, image: ModelImage) -> Path:
+        path = self.images.find(image.name, is_image=True)
+        if path is None:
+            raise ValueError(self.images.missing(image.name, "the COLMAP model has a camera for it"))
+        return path
+
+    def stored_name(self, image: ModelImage) -> str:
+        """The name of an image as the folder spells it; raises as ``frame``."""
+        self._path(image)
+        return self.images.as_stored(image.name)
+
     def frame(self, name: str, image: ModelImage, time: float) -> PosedFrame:
         """A frame of the model.
 
         Raises:
             ValueError: If its image is missing.
         """
-        path = self.images.find(image.name, is_image=True)
-        if path is None:
-            raise ValueError(self.images.missing(image.name, "the COLMAP model has a camera for it"))
+        path = self._path(image)
         self.used.append(path)
         stem = without_image_suffix(image.name)
         mask = _first(self.masks, f"{image.name}.png", f"{stem}.png")

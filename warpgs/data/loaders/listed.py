@@ -84,6 +84,11 @@ class ListedFiles:
             self._respelled.setdefault(name, found)
         return found
 
+    def as_stored(self, name: str) -> str:
+        """A name that was found, as the folder spells it: times and order are those of the file itself."""
+        path = self._respelled.get(name)
+        return name if path is None else Path(os.path.relpath(path, self.folder)).as_posix()
+
     @property
     def found(self) -> Collection[Path]:
         """The files that were found so far."""

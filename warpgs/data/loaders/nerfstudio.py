@@ -43,9 +43,9 @@ class NerfstudioLoader:
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_capture``."""
         transforms = Transforms(root / INDEX, options.undistort)
-        entries = sorted(transforms.frames, key=lambda entry: natural_order(str(entry.get("file_path"))))
+        entries = sorted(transforms.frames, key=lambda entry: natural_order(transforms.image_name(entry)))
         images = [transforms.image(entry) for entry in entries]
-        names = plain_names([entry["file_path"] for entry in entries])
+        names = plain_names([transforms.image_name(entry) for entry in entries])
         times, source = _times(transforms, entries)
         frames = []
         for entry, image, name, time in zip(entries, images, names, times, strict=True):
@@ -76,18 +76,19 @@ class NerfstudioLoader:
 
 def _times(transforms: Transforms, entries: Sequence[dict[str, Any]]) -> tuple[list[float], TimeSource]:
     """Times of sorted frames, from the first on: their field ``time`` or ``timestamp``, else those of their names."""
-    times, source, are_read = times_of_names([entry["file_path"] for entry in entries])
+    names = [transforms.image_name(entry) for entry in entries]
+    times, source, are_read = times_of_names(names)
     given = transforms.times(entries, "time", "timestamp")
     if given is None:
         return times, source
     field, stated = given
     first = min(stated)
     text = with_steps(f"times from the field {field} of {INDEX}", [float(time - first) for time in stated])
-    by_name = sorted(zip(times, stated, entries, strict=True), key=lambda item: item[:2])
+    by_name = sorted(zip(times, stated, names, strict=True), key=lambda item: item[:2])
     reversed_ = next(((a, b) for a, b in pairwise(by_name) if are_read and b[1] < a[1]), None)
     problem = ""
     if reversed_ is not None:
-        before, after = (visible(item[2]["file_path"]) for item in reversed_)
+        before, after = (visible(item[2]) for item in reversed_)
         problem = f"the numbers in the names have another order: {after} is earlier than {before}"
     return [float(time - first) for time in stated], TimeSource(text, problem)
 

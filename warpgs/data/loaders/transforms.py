@@ -131,6 +131,11 @@ class Transforms:
             raise ValueError(f"{self.path}: a frame has no file_path")
         return path
 
+    def image_name(self, frame: dict[str, Any]) -> str:
+        """The file_path of a frame as the folder spells it, which may differ from the index; raises as ``file``."""
+        self.image(frame)
+        return self._files.as_stored(frame["file_path"])
+
     def times(self, frames: Sequence[dict[str, Any]], *fields: str) -> tuple[str, list[int | float]] | None:
         """The first of some fields that all frames have, and the time of each frame in it; None if no frame has any.
 
