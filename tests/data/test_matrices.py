@@ -197,3 +197,10 @@ def test_the_last_row_of_a_pose_may_be_rounded(edited, written):
     every_frame(root, lambda entry, k: entry["transform_matrix"][3].__setitem__(0, -1e-17))
     cameras = [load_capture(folder).cameras["frame_00003"] for folder in (root, written["nerfstudio"])]
     assert torch.equal(cameras[0].viewmat, cameras[1].viewmat)
+
+
+def test_the_first_frame_without_a_matrix_that_others_have_is_named(edited):
+    root = edited("nerfstudio")
+    every_frame(root, lambda entry, k: (without_fields(entry), entry.update(K=K)))
+    layouts.edit_transforms(root / "transforms.json", K=None)
+    refused(root, r"images/frame_00011\.png has no fl_x .* matrix K, which 11 of 12 frames have: give every frame one")

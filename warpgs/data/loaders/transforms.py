@@ -199,8 +199,7 @@ class Transforms:
         else:
             width, height = self._size(frame, image)
         if (focal := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
-            found = ", ".join(sorted(map(visible, frame)))
-            raise ValueError(f"{self.path} has no fl_x or camera_angle_x, nor a matrix K; a frame has {found:.200}")
+            raise ValueError(self._without_focal(frame))
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
         k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -213,6 +212,15 @@ class Transforms:
             return lens.checked(self._undistort)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
+
+    def _without_focal(self, frame: dict[str, Any]) -> str:
+        """Message that a frame has no focal length, and whether other frames have one."""
+        found, fields = ", ".join(sorted(map(visible, frame))), "fl_x or camera_angle_x, nor a matrix K"
+        count = sum(any(key in other for key in FOCAL) for other in self.frames)
+        if not count:
+            return f"{self.path} has no {fields}; a frame has {found:.200}"
+        others = f"which {count} of {len(self.frames)} frames have: give every frame one"
+        return f"{self.path}: {self._name(frame)} has no {fields}, {others}; it has {found:.200}"
 
     def _size(self, frame: dict[str, Any], image: Path) -> tuple[int, int]:
         """The size of an image where a frame does not give it: upright if only then the principal point is central."""
