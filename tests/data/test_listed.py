@@ -183,6 +183,22 @@ def test_names_of_a_colmap_model_may_begin_with_the_folder_of_images(edited):
     assert np.array_equal(load_capture(root).frame("frame_00003").image, layouts.image(3))
 
 
+@pytest.mark.parametrize(
+    ("listed", "stored", "said"),
+    [
+        ("frame_ü.png", unicodedata.normalize("NFD", "frame_ü.png"), "letters with accents are stored differently"),
+        ("frame_1\u202f0.png", "frame_1 0.png", "blanks or other characters are of another kind"),
+        ("frame_10.png ", "frame_10.png", "without the blanks around it"),
+    ],
+)
+def test_names_that_look_the_same_are_said_to_differ(edited, listed, stored, said):
+    root = edited("nerfstudio")
+    (root / "images/frame_00011.png").rename(root / "images" / stored)
+    layouts.edit_transforms(root / "transforms.json", file_path=f"images/{listed}")
+    (note,) = [note for note in load_capture(root).notes if "differ" in note]
+    assert said in note
+
+
 @pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
 def test_ids_of_a_dataset_find_decomposed_names(tmp_path, dataset):
     root, before = (write_capture(tmp_path / name, dataset) for name in ("capture", "original"))

@@ -107,8 +107,19 @@ class ListedFiles:
         count, shown = len(self._respelled), os.path.relpath(path, self.folder)
         names = "a file name" if count == 1 else f"{count} file names"
         return (
-            f"{names} in {self._index} differ from the files in spelling or place, such as {name}, read as {shown}",
+            f"{names} in {self._index} differ from the files in spelling or place, such as {name}, read as {shown}"
+            f"{_unseen_difference(name, shown)}",
         )
+
+
+def _unseen_difference(name: str, shown: str) -> str:
+    """How two names differ that look the same, as the end of a sentence; empty if they do not look the same."""
+    if name.strip() == shown:
+        return " without the blanks around it"
+    if unicodedata.normalize("NFC", name) == unicodedata.normalize("NFC", shown):
+        return ", in which letters with accents are stored differently (Unicode NFC or NFD)"
+    same = unicodedata.normalize("NFKC", name) == unicodedata.normalize("NFKC", shown)
+    return ", in which blanks or other characters are of another kind" if same else ""
 
 
 def _spellings(name: str) -> Iterator[Parts]:
