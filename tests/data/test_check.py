@@ -310,7 +310,7 @@ def test_depth_that_must_be_aligned_is_said_to_be_unused_without_points(root):
 
 def test_one_time_for_all_frames_is_an_error(root):
     stop_time(root)
-    assert "one time" in texts(check_capture(root), "error")
+    assert "one time, but every moment needs its own (times from time_id in" in texts(check_capture(root), "error")
     assert "one time" in " ".join(f.text for f in quick_findings(load_capture(root)) if f.level == "error")
 
 

@@ -21,7 +21,7 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
     is_guessed = capture.time_source.problem and capture.assumption != "static"
     yield Finding("warning" if is_guessed else "note", "time", str(capture.time_source))
     if distinct == 1 and len(times) > 1:
-        text = "all training frames have one time: time_id in metadata.json, or what the layout has for it, is wrong"
+        text = f"all training frames have one time, but every moment needs its own ({capture.time_source.text})"
         if capture.assumption == "static":
             yield Finding("warning", "time", text)
         else:
