@@ -8,6 +8,8 @@ import torch
 
 from .capture import Capture, Frame
 from .depth_alignment import (
+    MAX_ERROR,
+    MAX_ERROR_OF_CONSTANT,
     DepthProblem,
     PointSamples,
     align_to_points,
@@ -86,7 +88,10 @@ def _compare_with_points(samples: Sequence[PointSamples], capture: Capture, of: 
     if bool(known.any()):
         median = float(np.median(errors[known, 0]))
         kind = "metric" if capture.metric_depth else "aligned"
-        yield Finding("note", "depth", f"{kind} depth is {median:.1%} off at the points (median)")
+        text, constant = f"{kind} depth is {median:.1%} off at the points (median)", float(np.median(errors[known, 1]))
+        if median <= MAX_ERROR and median >= MAX_ERROR_OF_CONSTANT * constant:
+            text += f", but a constant is {constant:.1%} off: the points do not tell whether depth is right"
+        yield Finding("note", "depth", text)
         if capture.metric_depth and "inverted" not in problems:
             yield from _metric_factor([s for s, is_known in zip(samples, known.tolist(), strict=True) if is_known])
     if unusable := int(is_unusable(errors).sum()):
