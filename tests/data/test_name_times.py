@@ -70,6 +70,26 @@ def test_dates_are_read_across_minutes(pattern):
     assert times == [0.0, 4.0, 8.0, 12.0, 16.0]
 
 
+@pytest.mark.parametrize(
+    "pattern", ["{:02d}-{:02d}-{:02d}.png", "frame_{:02d}{:02d}{:02d}.png", "{:02d}h{:02d}m{:02d}s"]
+)
+def test_times_of_day_without_a_date_go_on_after_midnight_and_that_is_said(pattern):
+    names = sorted(pattern.format(s // 3600 % 24, s // 60 % 60, s % 60) for s in range(86_390, 86_420, 2))
+    times, source, _ = times_of_names(names)
+    assert times == [*range(10, 30, 2), *range(0, 10, 2)]
+    last, first = (pattern.format(*time) for time in ((23, 59, 58), (0, 0, 0)))
+    assert source.problem == f"they are taken to go on after midnight, from {last} to {first}"
+
+
+def test_times_of_day_with_a_long_pause_stay_on_one_day():
+    """An hour lies between the last one and midnight."""
+    names = [f"{hour:02d}-00-{s:02d}.png" for hour in (0, 23) for s in range(0, 20, 2)]
+    times, source, _ = times_of_names(names)
+    assert max(times) < 86_400
+    assert times == sorted(times)
+    assert "midnight" not in source.problem
+
+
 NUMBERS = {
     "ns-process-data": ([f"./images/frame_{k:05d}.png" for k in (1, 2, 3)], [0, 1, 2]),
     "dropped frames": (["1", "2", "3", "5", "6"], [0, 1, 2, 4, 5]),

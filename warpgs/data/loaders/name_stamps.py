@@ -40,11 +40,26 @@ AFTER_LETTERS = re.compile(r"(?i)(?<![a-z])(t|ts|sec|time|stamp|timestamp)$")
 """Words that a decimal number may follow directly: shot1.0001 is a shot and a frame."""
 
 
+DAY_LENGTH = 86_400 * SECOND
+"""Nanoseconds."""
+
+MIN_TIMES, MAX_STEPS = 4, 10.0
+"""Times of day go on after midnight if there are this many, if most of the day is between two of them, and if those
+are at most this many times the median step apart when they go on."""
+
+
 class Stamps(NamedTuple):
-    """A time stamp of every name: nanoseconds since any time, and the rest of the name, before and after it."""
+    """A time stamp of every name.
+
+    Attributes:
+        nanoseconds: Since any time.
+        rests: The rest of each name, before and after it.
+        midnight: The first time of the next day, if times of day go on after midnight.
+    """
 
     nanoseconds: list[int]
     rests: list[tuple[str, str]]
+    midnight: int | None = None
 
 
 def find_stamps(stems: Sequence[str]) -> Iterator[Stamps]:
@@ -64,6 +79,7 @@ def find_stamps(stems: Sequence[str]) -> Iterator[Stamps]:
             stamps = _stamps(chosen, seconds_of)
             if stamps is None or len(set(stamps.nanoseconds)) == 1:
                 continue
+            stamps = _past_midnight(stamps) if pattern is CLOCK else stamps
             if pattern is not CLOCK or _is_clock([match["clock"] for match in chosen], stamps.nanoseconds):
                 yield stamps
 
@@ -85,6 +101,20 @@ def _stamps(matches: Sequence[re.Match[str]], seconds_of: Callable[[re.Match[str
     values = [SECOND * whole + part for whole, part in zip(seconds, fractions or [0] * len(parts), strict=True)]
     rests = [(match.string[: match.start()], match.string[end:]) for match, end in zip(matches, ends, strict=True)]
     return Stamps(values, rests)
+
+
+def _past_midnight(stamps: Stamps) -> Stamps:
+    """Times of day that go on after midnight, if nearly all of the day is missing otherwise."""
+    times = sorted({*stamps.nanoseconds})
+    if len(times) < MIN_TIMES:
+        return stamps
+    steps = [b - a for a, b in pairwise(times)]
+    k = steps.index(max(steps))
+    over_midnight = times[0] + DAY_LENGTH - times[-1]
+    if steps[k] <= DAY_LENGTH // 2 or over_midnight > MAX_STEPS * statistics.median(steps[:k] + steps[k + 1 :]):
+        return stamps
+    nanoseconds = [time + DAY_LENGTH * (time <= times[k]) for time in stamps.nanoseconds]
+    return Stamps(nanoseconds, stamps.rests, times[0] + DAY_LENGTH)
 
 
 def _are_counted(seconds: Sequence[int], fractions: Sequence[int]) -> bool:

@@ -46,11 +46,15 @@ class NamedTimes(NamedTuple):
 
 
 class _Reading(NamedTuple):
-    """A number of every name that may be its time, and the rest of the name, before and after it."""
+    """A number of every name that may be its time, and the rest of the name, before and after it.
+
+    If it is a time of day, ``midnight`` is the first one of the next day, if there is any.
+    """
 
     values: list[int]
     rests: list[tuple[str, str]]
     is_stamp: bool = False
+    midnight: int | None = None
 
 
 def times_of_names(paths: Sequence[str]) -> NamedTimes:
@@ -66,7 +70,7 @@ def times_of_names(paths: Sequence[str]) -> NamedTimes:
     if not paths:
         return NamedTimes([], TimeSource("no times"), False)
     stems = [_stem(path) for path in paths]
-    stamps = (_Reading(found.nanoseconds, found.rests, True) for found in find_stamps(stems))
+    stamps = (_Reading(found.nanoseconds, found.rests, True, found.midnight) for found in find_stamps(stems))
     numbers = [*_numbers(stems)]
     for reading in (*stamps, *numbers):
         if _tells_times(reading):
@@ -97,7 +101,7 @@ def _numbers(stems: Sequence[str]) -> Iterator[_Reading]:
 
 def _tells_times(reading: _Reading) -> bool:
     """Whether no two frames of a camera have the same number, and numbers follow the order of the names."""
-    values, rests, is_stamp = reading
+    values, rests, is_stamp, _ = reading
     if len({*zip(values, rests, strict=True)}) < len(values):
         return False
     if len({*values}) == len(values):
@@ -116,6 +120,10 @@ def _times(paths: Sequence[str], reading: _Reading) -> NamedTimes:
         if _jump(values) is not None and not reading.is_stamp:
             return _counted(paths, f"the numbers in them jump from {_shown(before)} to {_shown(after)}")
         problem = problem.format(_shown(before), _shown(after))
+    if reading.midnight is not None:
+        last = max(value for value in values if value < reading.midnight)
+        before, after = (_shown(paths[values.index(value)]) for value in (last, reading.midnight))
+        problem = f"they are taken to go on after midnight, from {before} to {after}"
     first, divisor = min(values), SECOND if reading.is_stamp else 1
     times = [(value - first) / divisor for value in values]
     kind, unit = ("time stamps", " s") if reading.is_stamp else ("numbers", "")
