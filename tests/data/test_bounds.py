@@ -100,7 +100,7 @@ def test_depth_of_another_shape_is_refused_before_it_is_decoded(edited, monkeypa
         for k in range(layouts.COUNT):
             archive.writestr(f"{k:05d}.exr", exr(1, 4_000, 16, zeros(1, 4_000)))
     monkeypatch.setattr("warpgs.data.loaders.vipe.read_exr_channel", None)
-    refused(root, r"00000\.exr: the depth is 4000×16, which has not the shape of 40×24")
+    refused(root, r"00000\.exr: the depth is 4000×16, but the images of its camera are 40×24")
 
 
 @pytest.mark.parametrize("method", METHODS)

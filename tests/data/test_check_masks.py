@@ -147,10 +147,36 @@ def test_portrait_and_landscape_frames_that_alternate_fit_their_cameras(root):
     assert "may not match" not in str(report)
 
 
-def test_the_first_unreadable_files_are_named_and_the_others_counted(root, monkeypatch):
-    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 5)
-    for path in (root / "rgb/1x").iterdir():
+def cut_images(root, count):
+    for path in sorted((root / "rgb/1x").iterdir())[:count]:
         path.write_bytes(path.read_bytes()[:100])
-    text = str(check_capture(root))
-    assert text.count("is truncated") == 5
-    assert "error: 11 more frames cannot be read" in text
+
+
+def test_an_error_of_several_frames_is_one_line_with_their_files(root, monkeypatch):
+    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 2)
+    cut_images(root, 4)
+    (text,) = [f.text for f in check_capture(root).findings if f.level == "error"]
+    assert "shot000.png is truncated" in text
+    assert text.endswith("(the same of 3 more files: shot001.png, shot002.png and 1 more)")
+
+
+def test_an_error_of_all_frames_is_one_line_with_their_number(root):
+    cut_images(root, 16)
+    (text,) = [f.text for f in check_capture(root).findings if f.level == "error"]
+    assert "shot000.png is truncated" in text
+    assert text.endswith("(the same of all 16 frames)")
+
+
+def test_frames_with_more_kinds_of_errors_than_are_shown_are_counted(root, monkeypatch):
+    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 1)
+    cut_images(root, 3)
+    (root / "rgb/1x/shot015.png").write_bytes(b"text")
+    errors = [f.text for f in check_capture(root).findings if f.level == "error"]
+    assert errors[1:] == ["1 more frames cannot be read"]
+
+
+def test_masks_in_the_alpha_channel_alone_are_an_error_that_names_it(root):
+    convert_masks(root, lambda mask, k: np.dstack([np.full((*mask.shape, 3), 255, np.uint8), 255 - mask]))
+    (text,) = [f.text for f in check_capture(root).findings if f.level == "error"]
+    assert "differs in its alpha channel only, which is not read" in text
+    assert text.endswith("(the same of all 16 frames)")

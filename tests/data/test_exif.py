@@ -186,7 +186,7 @@ def test_exchanged_sides_are_said_to_be_the_cause(edited, layout):
     root = edited(layout)
     for path in (root / "images").iterdir():
         write_png(path, np.ascontiguousarray(layouts.image(0).swapaxes(0, 1)))
-    refused(root, "24×40, which has not the shape of .*; its sides are exchanged: rotate its pixels by 90°", layout)
+    refused(root, "24×40, but .*; its sides are exchanged: rotate its pixels by 90°", layout)
 
 
 def test_exchanged_sides_of_the_nerfies_layout_are_said_to_be_the_cause(root):
@@ -202,4 +202,4 @@ def test_another_size_is_refused_with_its_orientation(edited):
     path = root / "images/frame_00003.png"
     shutil.copy(path, root / "copy.png")
     Image.fromarray(np.zeros((99, 20, 3), np.uint8)).save(path, exif=exif)
-    refused(root, "the image is 20×99, which has not the shape of 40×24; its EXIF orientation is 6$")
+    refused(root, "the image is 20×99, but the images of its camera are 40×24; its EXIF orientation is 6$")

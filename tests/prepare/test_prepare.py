@@ -323,7 +323,9 @@ def test_masks_of_another_aspect_ratio_are_refused_and_smaller_ones_enlarged(tmp
     double[41, 60] = 0
     cv2.imwrite(str(tmp_path / "double.png"), double)
     assert np.argwhere(read_dynamic(tmp_path / "double.png", boards.SIZE)).tolist() == [[20, 30]]
-    with pytest.raises(ValueError, match=r"upright\.png: the mask is 192×256, which has not the shape of 256×192"):
+    with pytest.raises(
+        ValueError, match=r"upright\.png: the mask is 192×256, but the images of its camera are 256×192"
+    ):
         read_dynamic(tmp_path / "upright.png", boards.SIZE)
 
 

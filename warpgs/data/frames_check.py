@@ -1,13 +1,17 @@
 """Checks the numbers, times and files of the frames of a capture."""
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from .capture import MASKS_REMEDY, Capture
 from .check_sample import Content
 from .findings import Finding
 
 MAX_ERRORS = 20
-"""Maximum number of unreadable frames that are named."""
+"""Maximum number of kinds of errors, and of files of one kind, that are named."""
+
+FILE = re.compile(r"(?i).*?\.(png|jpe?g|exr|npy)(?=[: ])")
 
 
 def check_counts(capture: Capture) -> Iterator[Finding]:
@@ -41,18 +45,40 @@ def check_files(capture: Capture, contents: Mapping[str, Content]) -> Iterator[F
     if num_read < total:
         text = f"{num_read} of {total} frames were read, evenly spread: the check has no time for all"
         yield Finding("note", "files", f"{text}, training reads them all")
-    damaged = {name: content.error for name, content in contents.items() if content.error is not None}
-    for name, error in list(damaged.items())[:MAX_ERRORS]:
-        # The other checks read training frames only.
-        yield Finding("error", "files" if name in capture.train else "evaluation", error)
-    if len(damaged) > MAX_ERRORS:
-        text = f"{len(damaged) - MAX_ERRORS} more frames cannot be read"
-        yield Finding("error", "files" if any(name in capture.train for name in damaged) else "evaluation", text)
+    for topic, split in (("files", capture.train), ("evaluation", capture.val)):  # other checks read the former only
+        read = [contents[name].error for name in split if name in contents]
+        yield from (Finding("error", topic, text) for text in _errors([e for e in read if e is not None], len(read)))
     readable = [content for content in contents.values() if content.error is None]
     num_masks, num_depths = sum(c.dynamic is not None for c in readable), sum(c.has_depth for c in readable)
     frames = "frames" if len(readable) == total else "readable frames" if num_read == total else "frames read"
     yield Finding("note", "files", f"{num_masks} of {len(readable)} {frames} have masks, {num_depths} have depth")
     yield from _missing_masks(capture, contents)
+
+
+def _errors(errors: Sequence[str], num_read: int) -> Iterator[str]:
+    """Errors of frames, one line for each kind of error: that of the first file, and the names of the others.
+
+    Args:
+        errors: One error for each damaged frame.
+        num_read: Number of frames that were read.
+    """
+    kinds: dict[str, list[str]] = {}
+    for error in errors:
+        kinds.setdefault(error.removeprefix(_file_in(error)), []).append(error)
+    for first, *others in list(kinds.values())[:MAX_ERRORS]:
+        names = [Path(_file_in(error)).name for error in others]
+        more = f" and {len(names) - MAX_ERRORS} more" if len(names) > MAX_ERRORS else ""
+        of = f" {len(others)} more files: {', '.join(names[:MAX_ERRORS])}{more}"
+        same = f"all {num_read} frames" if len(others) + 1 == num_read else of.strip()
+        yield f"{first} (the same of {same})" if others else first
+    if len(kinds) > MAX_ERRORS:
+        yield f"{sum(map(len, list(kinds.values())[MAX_ERRORS:]))} more frames cannot be read"
+
+
+def _file_in(error: str) -> str:
+    """The path that an error begins with; empty if there is none."""
+    found = FILE.match(error)
+    return "" if found is None else found[0]
 
 
 def _missing_masks(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:

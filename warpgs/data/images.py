@@ -270,12 +270,21 @@ def read_mask(path: Path, size: tuple[int, int], image: Path | None = None) -> B
     Raises:
         ValueError: If the file is missing, damaged or of another size.
     """
-    return is_bright(decode(path, size=size, what="the mask", image=image))
+    return is_bright(path, decode(path, size=size, what="the mask", image=image))
 
 
-def is_bright(stored: Shaped[np.ndarray, "H W ..."]) -> Bool[np.ndarray, "H W"]:
-    """Where an image is brighter than half of the range that its values suggest: 0 to 1, 255 or 65535."""
+def is_bright(path: Path, stored: Shaped[np.ndarray, "H W ..."]) -> Bool[np.ndarray, "H W"]:
+    """Where the colour of a mask is brighter than half of the range that its values suggest: 0 to 1, 255 or 65535.
+
+    Raises:
+        ValueError: If only its alpha channel, which is not read, tells pixels apart.
+    """
     if stored.ndim == 3:
+        if (stored[..., :3] == stored[0, 0, :3]).all() and (stored[..., 3:] != stored[0, 0, 3:]).any():
+            raise ValueError(
+                f"{path}: the mask has one colour everywhere and differs in its alpha channel only, which is not read: "
+                "store it in black and white"
+            )
         stored = cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY)
     largest = next(value for value in (1, 255, 65535) if stored.max() <= value)
     return stored > largest // 2

@@ -72,7 +72,7 @@ def read_resized_mask(path: Path, size: tuple[int, int], image: Path | None = No
     Raises:
         ValueError: If the file is missing, damaged or of another shape.
     """
-    return resize_mask(is_bright(_fitting(path, "the mask", decode(path), size, image)), size)
+    return resize_mask(is_bright(path, _fitting(path, "the mask", decode(path), size, image)), size)
 
 
 def read_metric_depth(
@@ -163,7 +163,7 @@ def check_shape(path: Path, what: str, stored: tuple[int, int], size: tuple[int,
     """
     if not has_shape(stored, size):
         raise ValueError(
-            f"{path}: {what} is {stored[0]}×{stored[1]}, which has not the shape of {size[0]}×{size[1]}"
+            f"{path}: {what} is {stored[0]}×{stored[1]}, but the images of its camera are {size[0]}×{size[1]}"
             f"{exchanged_sides(path, stored, lambda other: has_shape(other, size))}"
         )
 

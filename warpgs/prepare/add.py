@@ -195,7 +195,7 @@ class _Job:
                 if not completed:
                     self._keep_layout({})
                 completed += 1
-                static = is_bright(decode(found[min(found)])).astype(np.uint8)
+                static = is_bright(found[min(found)], decode(found[min(found)])).astype(np.uint8)
                 lens = self._lens(name)
                 full = cv2.resize(static, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST) > 0
                 writer.write_mask(self.root, name, full, lacking)

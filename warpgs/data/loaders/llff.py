@@ -135,7 +135,7 @@ def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
 
     width, height = stored if orientation_to(path, stored, fits) == 1 else stored[::-1]
     if not fits((width, height)):
-        shape = f"which has not the shape of {full_width:g}×{full_height:g}{exchanged_sides(path, stored, fits)}"
+        shape = f"but its pose is of {full_width:g}×{full_height:g} images{exchanged_sides(path, stored, fits)}"
         raise ValueError(f"{path} is {width}×{height}, {shape}")
     scale = focal / full_width * width
     try:
