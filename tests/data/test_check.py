@@ -17,6 +17,7 @@ from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
 from warpgs.data import loaders
 from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.depth_alignment import sample_points
 from warpgs.data.depth_check import DEPTH_PROBLEMS
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import load_capture
@@ -343,3 +344,18 @@ def test_the_quick_check_raises_on_damaged_frames(root):
     path.write_bytes(path.read_bytes()[:900])
     with pytest.raises(ValueError, match=r"shot000\.png"):
         quick_findings(load_capture(root))
+
+
+def test_depth_that_is_no_nearer_to_the_points_than_a_constant_is_not_praised(root, monkeypatch):
+    """Nearly all points have one depth, so that any depth can be aligned to them by a factor of 0."""
+    write_depth(root, lambda depth: np.random.default_rng(0).uniform(0.1, 1.0, depth.shape))
+
+    def one_depth(*arguments):
+        found = sample_points(*arguments)
+        position = torch.linspace(0.0, 1.0, len(found.depth))
+        depth = torch.where(position < 0.06, 3.0, torch.where(position > 0.94, 5.0, 4.0))
+        return found._replace(depth=depth.to(found.depth))
+
+    monkeypatch.setattr("warpgs.data.depth_check.sample_points", one_depth)
+    said = "0.0% off at the points (median), but a constant is 0.0% off: the points do not tell whether depth is right"
+    assert f"aligned depth is {said}" in texts(check_capture(root), "note")
