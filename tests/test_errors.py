@@ -156,6 +156,12 @@ def test_a_suggestion_is_written_as_it_is_known_whatever_the_case():
     assert suggestion("blender", ["opencv"]) == ""
 
 
+def test_of_names_that_are_as_similar_the_first_is_suggested():
+    frames = [f"right_{k:06}" for k in (50, 10, 0, 1)]
+    assert suggestion("right_00000", frames) == "; did you mean right_000000?"
+    assert suggestion("right_00005", frames) == "; did you mean right_000050?"
+
+
 def test_a_missing_path_is_told_a_similar_one_that_exists(tmp_path, monkeypatch):
     (tmp_path / "hand").mkdir()
     assert missing(tmp_path / "hnd") == f"{tmp_path / 'hnd'} does not exist; did you mean {tmp_path / 'hand'}?"

@@ -65,6 +65,18 @@ def test_gradients_pass_through_the_position_of_a_camera():
         ({"up": [[0.0], [1.0, 2.0]]}, "up must be three numbers"),
         ({"focal": 0}, "focal must be positive and finite, got 0"),
         ({"focal": np.nan}, "focal must be positive and finite, got nan"),
+        ({"focal": (80, 81)}, r"focal must be a number, got \(80, 81\)"),
+        ({"focal": "80"}, "focal must be a number, got '80'"),
+        ({"focal": True}, "focal must be a number, got True"),
+        ({"focal": None}, "focal must be a number, got None"),
+        ({"focal": torch.full((9, 9), 80.0)}, r"focal must be a number, got tensor\(\["),
+        ({"focal": 10**400}, "focal must be a number, got 1000"),
+        ({"size": "96x64"}, r"size must be \(width, height\) \[px\], got '96x64'"),
+        ({"size": "96"}, r"size must be \(width, height\) \[px\], got '96'"),
+        ({"size": 96}, r"size must be \(width, height\) \[px\], got 96"),
+        ({"size": (96, 64, 3)}, r"size must be \(width, height\) \[px\], got \(96, 64, 3\)"),
+        ({"size": ("96", "64")}, "width must be an int, got '96'"),
+        ({"time": "0.5"}, "time must be a number, got '0.5'"),
         ({"size": (96.5, 64)}, "width must be an int, got 96.5"),
         ({"size": (96, -1)}, "height must be between 0 and 32768 pixels, got -1"),
     ],
@@ -91,11 +103,49 @@ def scene(finished_run):
 @pytest.mark.parametrize("time", [float("nan"), float("inf"), -1.0, -0.001, 1.001, 2, np.float64(2.0), np.nan])
 def test_a_time_at_which_nothing_was_trained_is_refused(scene, time):
     camera = Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16), time)
-    message = rf"^time must be in \[0, 1\], from the first frame to the last, got {time}$"
+    message = rf"^time must be in \[0, 1\], from the first frame to the last, got {float(time)}$"
     calls = (lambda: scene.render(camera), lambda: scene.render(camera, time=time), lambda: scene.splats(time))
     for call in (*calls, lambda: scene.play(camera)):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+@pytest.mark.parametrize("time", ["0.5", True, (0.5,), np.array([0.5, 0.6]), torch.zeros(0), 1j])
+def test_a_time_that_is_not_a_number_is_refused_in_one_line(scene, time):
+    camera = Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16))
+    for call in (lambda: scene.render(camera, time=time), lambda: scene.splats(time)):
+        with pytest.raises(ValueError, match=r"^time must be a number, got ") as raised:
+            call()
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("time", [np.array([0.25]), torch.tensor([[0.25]]), torch.tensor(0.25, dtype=torch.float64)])
+def test_a_time_may_be_an_array_or_tensor_of_one_element(scene, time, recwarn):
+    camera = Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16))
+    at = scene.render(camera, time=0.25).joint.image
+    assert torch.equal(scene.render(camera, time=time).joint.image, at)
+    assert torch.equal(scene.render(Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16), time)).joint.image, at)
+    assert not recwarn.list
+
+
+def test_a_scene_is_rendered_through_one_camera(scene):
+    camera = Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16))
+    for call in (scene.render, scene.play):
+        with pytest.raises(TypeError, match=r"^camera must be one Camera, got list"):
+            call([camera])
+
+
+@pytest.mark.parametrize("path", [3, None, 0.5, ["runs"]])
+def test_a_run_and_a_capture_are_opened_by_paths(path):
+    for opened in (warpgs.open_run, warpgs.load_capture):
+        with pytest.raises(ValueError, match=r"^a (run|capture) is opened by the path of its folder, got "):
+            opened(path)
+
+
+def test_a_background_of_plain_numbers_is_told_the_tensor_that_is_expected(scene):
+    camera = Camera.looking_at(POSITION, TARGET, UP, 20.0, (24, 16))
+    with pytest.raises(ValueError, match=r"^background must be a torch tensor of shape \[3\], got tuple$"):
+        warpgs.render(scene.splats(0.5), camera, background=(1, 1, 1))
 
 
 @pytest.mark.parametrize("time", [0, 1, np.float32(0.1) * 10, 1.0 + 1e-9, -1e-9, torch.tensor(1.0), np.int64(1)])

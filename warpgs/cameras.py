@@ -2,16 +2,16 @@
 
 import dataclasses
 import math
-import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
-from .runtime.checks import as_whole_number, check_image_size, check_same_device, check_tensor
+from .runtime.checks import as_number, as_whole_number, check_image_size, check_same_device, check_tensor, one_line_repr
 
 Point = Shaped[Tensor, "3"] | Shaped[np.ndarray, "3"] | Sequence[float]
 """Three numbers."""
@@ -29,7 +29,7 @@ class Camera:
         time: Time in [0, 1].
 
     Raises:
-        ValueError: On a wrong shape, dtype, device or size.
+        ValueError: On a wrong shape, dtype, device or size, or a time that is not a number.
     """
 
     viewmat: Float[Tensor, "4 4"]
@@ -45,6 +45,7 @@ class Camera:
         object.__setattr__(self, "width", as_whole_number(self.width))
         object.__setattr__(self, "height", as_whole_number(self.height))
         check_image_size(self.width, self.height)
+        object.__setattr__(self, "time", as_number("time", self.time))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -113,19 +114,20 @@ class Camera:
                 sequence, of any type of numbers.
             target: [3] point of the world.
             up: [3] direction that is up in the image.
-            focal: Focal length [px], positive.
+            focal: Focal length of both axes [px], positive.
             size: (width, height) of the image [px].
             time: Time in [0, 1].
 
         Raises:
             ValueError: If ``position``, ``target`` or ``up`` is not three finite numbers, ``position`` and ``target``
-                coincide, the view direction is parallel to ``up``, or the focal length is not positive and finite.
+                coincide, the view direction is parallel to ``up``, the focal length is not one positive and finite
+                number, or the size is not two whole numbers.
         """
         device = position.device if isinstance(position, Tensor) else torch.device("cpu")
         position, target, up = (
             _vector(name, value, device) for name, value in (("position", position), ("target", target), ("up", up))
         )
-        focal = float(focal)
+        focal = as_number("focal", focal)
         if not 0.0 < focal < math.inf:
             raise ValueError(f"focal must be positive and finite, got {focal}")
         forward = torch.nn.functional.normalize(target - position, dim=0)
@@ -140,7 +142,7 @@ class Camera:
         viewmat = torch.eye(4, dtype=torch.float32, device=device)
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ position
-        width, height = size
+        width, height = _sides(size)
         K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
         return Camera(viewmat, torch.tensor(K, dtype=torch.float32, device=device), width, height, time)
 
@@ -150,7 +152,19 @@ def _vector(name: str, value: Point, device: torch.device) -> Float[Tensor, "3"]
     try:
         vector = torch.as_tensor(value, dtype=torch.float32, device=device)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{name} must be three numbers, got {reprlib.repr(value)}") from error
+        raise ValueError(f"{name} must be three numbers, got {one_line_repr(value)}") from error
     if vector.shape != (3,) or not bool(vector.isfinite().all()):
-        raise ValueError(f"{name} must be three finite numbers, got {reprlib.repr(vector.tolist())}")
+        raise ValueError(f"{name} must be three finite numbers, got {one_line_repr(vector.tolist())}")
     return vector
+
+
+def _sides(size: tuple[int, int]) -> tuple[Any, Any]:
+    """The width and height of an image, before they are used as numbers."""
+    try:
+        width, height = map(as_whole_number, size)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"size must be (width, height) [px], got {one_line_repr(size)}") from error
+    if isinstance(size, str):
+        raise ValueError(f"size must be (width, height) [px], got {size!r}")
+    check_image_size(width, height)
+    return width, height

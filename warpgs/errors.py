@@ -204,8 +204,19 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
     """
     given = given[:MAX_GIVEN]
     by_lower_case = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(given.lower(), by_lower_case, 1)
-    return f"; did you mean {shown(by_lower_case[close[0]])}?" if close else ""
+    close = difflib.get_close_matches(given.lower(), by_lower_case, max(1, len(by_lower_case)))
+    if not close:
+        return ""
+    # Of frame numbers with a digit too few many are as similar: the first of them is meant rather than the last.
+    matcher = difflib.SequenceMatcher(None, "", given.lower())
+
+    def similarity(name: str) -> float:
+        matcher.set_seq1(name)
+        return matcher.ratio()
+
+    best = similarity(close[0])
+    first = min(name for name in close if similarity(name) == best)
+    return f"; did you mean {shown(by_lower_case[first])}?"
 
 
 def not_one_of(name: str, given: object, known: Iterable[str]) -> str:

@@ -177,11 +177,16 @@ def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Renderi
     return Rendering(layers[0], static, dynamic, outputs[first], contributed, weights, num_intersections)
 
 
+def require_camera(camera: object) -> None:
+    """Raises TypeError for everything but a camera."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera must be one Camera, got {type(camera).__name__}: call render once per camera")
+
+
 def _check_inputs(
     splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings, screen_offsets: Tensor | None
 ) -> None:
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera must be one Camera, got {type(camera).__name__}: call render once per camera")
+    require_camera(camera)
     if background is not None:
         is_per_image = settings.branches and isinstance(background, Tensor) and background.ndim == 2
         C = splats.num_channels

@@ -1,6 +1,8 @@
 """Run folders: config.json, mask_trial.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
 
 import dataclasses
+import os
+import reprlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -212,4 +214,6 @@ def open_run(folder: Path | str, device: Device | None = None) -> TrainedScene:
     Raises:
         ValueError: If the folder is not a run folder, has no checkpoint or is damaged.
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise ValueError(f"a run is opened by the path of its folder, got {reprlib.repr(folder)}")
     return Run.open(Path(folder), device).trained_scene()

@@ -13,7 +13,8 @@ from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture, background_color
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.rendering import Rendering, render
+from warpgs.rendering import Rendering, render, require_camera
+from warpgs.runtime.checks import as_number
 from warpgs.runtime.graphs import GraphCache
 
 from .captures import open_capture
@@ -35,10 +36,12 @@ class _Inputs(NamedTuple):
     time: Float[Tensor, "1"]
 
 
-def require_time(time: float) -> None:
-    """Raises ValueError unless a time is in [0, 1], but for rounding; NaN is not."""
+def require_time(time: float) -> float:
+    """A time as a number of Python; raises ValueError unless it is in [0, 1], but for rounding; NaN is not."""
+    time = as_number("time", time)
     if not -TIME_ROUNDING <= time <= 1.0 + TIME_ROUNDING:
         raise ValueError(f"time must be in [0, 1], from the first frame to the last, got {time}")
+    return time
 
 
 class TrainedScene:
@@ -103,9 +106,7 @@ class TrainedScene:
         return self._splats(self._on_device(time), residual)
 
     def _on_device(self, time: float) -> Float[Tensor, "1"]:
-        require_time(time)
-        # A double of numpy would become a tensor of doubles.
-        return torch.tensor([time], dtype=torch.float32, device=self.device)
+        return torch.tensor([require_time(time)], dtype=torch.float32, device=self.device)
 
     def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
         flags = self.metadata.use_deformation, self.metadata.use_appearance and residual
@@ -126,8 +127,10 @@ class TrainedScene:
                 where alpha is low, it is that of the little that is there.
 
         Raises:
-            ValueError: If the time is not in [0, 1]: nothing was trained there.
+            TypeError: If the camera is something else.
+            ValueError: If the time is not a number in [0, 1]: nothing was trained there.
         """
+        require_camera(camera)
         at = self._on_device(camera.time if time is None else time)
         return self._render(camera.to(self.device), at, branches, depth)
 
@@ -139,6 +142,7 @@ class TrainedScene:
         """
         if not self.uses_graphs:
             return self.render(camera).joint.image
+        require_camera(camera)
         require_time(camera.time)
         if self._inputs is None:
             self._inputs = _Inputs(camera.viewmat.clone(), camera.K.clone(), camera.viewmat.new_zeros(1))

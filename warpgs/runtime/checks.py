@@ -1,9 +1,13 @@
 """Input checks of the public functions, with readable messages."""
 
+import math
 import operator
+import reprlib
 from collections.abc import Mapping
-from typing import SupportsIndex
+from numbers import Real
+from typing import Any, SupportsIndex
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,7 +28,7 @@ def check_tensor(
         dtypes: The allowed types.
     """
     if not isinstance(value, Tensor):
-        raise ValueError(f"{name} must be a torch tensor, got {type(value).__name__}")
+        raise ValueError(f"{name} must be a torch tensor of shape {_text(shape)}, got {type(value).__name__}")
     if value.ndim != len(shape):
         raise ValueError(f"{name} must have shape {_text(shape)}, got {list(value.shape)}")
     for want, got in zip(shape, value.shape, strict=True):
@@ -58,6 +62,26 @@ def check_same_device(tensors: Mapping[str, Tensor | None]) -> None:
                 raise ValueError(f"{first_name} must be on a CPU or CUDA device, got {first}")
         elif device != first:
             raise ValueError(f"all tensors must be on one device: {first_name} is on {first}, {name} on {device}")
+
+
+def as_number(name: str, value: Any) -> float:
+    """A number of Python, NumPy or torch, also as an array or tensor of one element, as one of Python.
+
+    Raises:
+        ValueError: If it is something else, such as a text or a bool.
+    """
+    number = value.item() if isinstance(value, Tensor | np.ndarray) and math.prod(value.shape) == 1 else value
+    if isinstance(number, bool) or not isinstance(number, Real):
+        raise ValueError(f"{name} must be a number, got {one_line_repr(value)}")
+    try:
+        return float(number)
+    except OverflowError as error:  # an integer of hundreds of digits
+        raise ValueError(f"{name} must be a number, got {one_line_repr(value)}") from error
+
+
+def one_line_repr(value: object) -> str:
+    """A short text for any value: those of tensors have several lines."""
+    return " ".join(reprlib.repr(value).split())
 
 
 def as_whole_number(value: object) -> object:

@@ -4,6 +4,8 @@ To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` an
 Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
 """
 
+import os
+import reprlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -99,6 +101,8 @@ def load_capture(
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
     """
+    if not isinstance(root, str | os.PathLike):
+        raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
     options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
     return load_with(root, dataset, options, vrig_factor)
 
