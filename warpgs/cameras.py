@@ -158,8 +158,10 @@ def _vector(name: str, value: Point, device: torch.device) -> Float[Tensor, "3"]
     return vector
 
 
-def _sides(size: tuple[int, int]) -> tuple[Any, Any]:
+def _sides(size: tuple[int, int]) -> tuple[int, int]:
     """The width and height of an image, before they are used as numbers."""
+    width: Any
+    height: Any
     try:
         width, height = map(as_whole_number, size)
     except (TypeError, ValueError) as error:

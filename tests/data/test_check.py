@@ -20,8 +20,10 @@ from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.depth_alignment import sample_points
 from warpgs.data.depth_check import DEPTH_PROBLEMS
 from warpgs.data.dynamic_regions import unknown_depth
+from warpgs.data.frames_check import check_counts
 from warpgs.data.loaders import load_capture
 from warpgs.data.motion_check import motion_between
+from warpgs.data.points_check import check_points
 from warpgs.training.stored_views import ViewReader
 
 
@@ -296,6 +298,24 @@ def test_a_capture_in_which_everything_is_dynamic_is_fit(tmp_path):
     assert report.is_fit
     assert "everything is taken as dynamic" in texts(report, "note")
     assert "read as blender" in texts(report, "note")
+
+
+def test_of_a_built_in_capture_no_files_are_named(root):
+    (root / "points.npy").unlink()
+    capture = load_capture(root)
+    capture.is_builtin = True
+    findings = [*check_counts(capture), *check_points(capture, capture.train)]
+    (points,) = (finding for finding in findings if finding.topic == "points")
+    assert (points.level, points.text) == ("note", "there are no sparse points: Gaussians are randomly initialized")
+    assert not [finding for finding in findings if "metadata.json" in finding.text]
+
+
+def test_one_evaluation_frame_outside_of_the_training_frames_is_one(root):
+    capture = load_capture(root)
+    first, *rest = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+    capture.train, capture.val = tuple(rest), (first,)
+    shown = [finding.text for finding in check_counts(capture)]
+    assert "1 evaluation frame lies before or after all training frames" in shown
 
 
 def test_depth_that_must_be_aligned_is_said_to_be_unused_without_points(root):

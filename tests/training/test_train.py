@@ -321,6 +321,18 @@ def test_without_depth_training_says_so_and_needs_no_pretraining(config, tmp_pat
     assert any("the capture has no depth" in line and ": training without depth" in line for line in lines)
 
 
+@pytest.mark.parametrize("is_builtin", [True, False])
+def test_of_built_in_captures_neither_the_files_nor_advice_on_them_is_said(config, tmp_path, monkeypatch, is_builtin):
+    shutil.copytree(config.data, tmp_path / "flat", ignore=shutil.ignore_patterns("depth"))
+    monkeypatch.setattr("warpgs.runs.captures.builtin_folder", lambda *_: tmp_path / "flat")
+    lines = []
+    data = Path("builtin:balls") if is_builtin else tmp_path / "flat"
+    warpgs.train(dataclasses.replace(config, data=data, out=tmp_path / "run"), log=lines.append)
+    assert any("the capture has no depth" in line for line in lines)
+    assert any("warpgs prepare" in line for line in lines) == (not is_builtin)
+    assert any("metadata.json" in line for line in lines) == (not is_builtin)
+
+
 def test_a_training_says_what_it_does_and_that_a_run_which_is_resumed_is_finished(config):
     lines = []
     warpgs.train(config, log=lines.append)

@@ -144,6 +144,7 @@ class Capture:
         time_source: Where the times of the cameras come from.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
+        is_builtin: Whether the package makes it: then no advice to change its files makes sense.
         notes: Remarks of the loader on files that it left out or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
@@ -167,6 +168,7 @@ class Capture:
     estimated_masks: bool = False
     read_taken: Callable[[str], TakenFrame] | None = None
     background: Background = "black"
+    is_builtin: bool = False
     notes: Sequence[str] = ()
     time_source: TimeSource = AS_GIVEN
     conventions: Conventions = field(default_factory=Conventions)

@@ -23,7 +23,8 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
     times = sorted(capture.cameras[name].time for name in capture.train)
     distinct = len(set(times))
     is_guessed = capture.time_source.problem and capture.assumption != "static"
-    yield Finding("warning" if is_guessed else "note", "time", str(capture.time_source))
+    if not capture.is_builtin:
+        yield Finding("warning" if is_guessed else "note", "time", str(capture.time_source))
     if distinct == 1 and len(times) > 1:
         text = f"all training frames have one time, but every moment needs its own ({capture.time_source.text})"
         if capture.assumption == "static":
@@ -34,9 +35,11 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
         yield Finding("warning", "time", "training frames cover less than half of the time range")
     late = [n for n in capture.val if not times[0] <= capture.cameras[n].time <= times[-1]]
     if late:
-        yield Finding("warning", "time", f"{len(late)} evaluation frames lie before or after all training frames")
+        number = "1 evaluation frame lies" if len(late) == 1 else f"{len(late)} evaluation frames lie"
+        yield Finding("warning", "time", f"{number} before or after all training frames")
     if len(capture.train) < 10:
-        yield Finding("warning", "counts", f"{len(capture.train)} training frames are very few")
+        number = "1 training frame is" if len(capture.train) == 1 else f"{len(capture.train)} training frames are"
+        yield Finding("warning", "counts", f"{number} very few")
 
 
 def check_files(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:

@@ -29,9 +29,9 @@ def check_points(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
     if capture.extent <= MIN_EXTENT:
         yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
     if len(capture.points) == 0:
-        remedy = "warpgs prepare CAPTURE --add points adds some (after warpgs import, if the layout needs it)"
-        text = f"there are no sparse points: Gaussians are randomly initialized; {remedy}"
-        yield Finding("warning", "points", text)
+        remedy = "; warpgs prepare CAPTURE --add points adds some (after warpgs import, if the layout needs it)"
+        text = f"there are no sparse points: Gaussians are randomly initialized{'' if capture.is_builtin else remedy}"
+        yield Finding("note" if capture.is_builtin else "warning", "points", text)
         return
     visible = [float(capture.cameras[n].project(capture.points)[3].float().mean()) for n in names]
     median = float(np.median(visible))

@@ -35,12 +35,12 @@ def with_steps(text: str, times: Sequence[float], unit: str = "") -> str:
     Args:
         text: The clause.
         times: Times of all frames in any unit and order; several may be equal.
-        unit: Their unit, with a space before it.
+        unit: Their unit, with a space before it, such as " s" and " frames".
     """
     steps = np.diff(np.unique(np.asarray(times, np.float64)))
     if not len(steps):
         return f"{text}, all the same" if len(times) > 1 else text
     mean, largest = float(steps.mean()), float(steps.max())
     if largest - float(steps.min()) <= EVEN * mean:
-        return f"{text}, {mean:.3g}{unit} apart"
+        return f"{text}, {mean:.3g}{unit.removesuffix('s') if mean == 1.0 and unit != ' s' else unit} apart"
     return f"{text}, {mean:.3g}{unit} apart on average, largest gap {largest:.3g}{unit}"

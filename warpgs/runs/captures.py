@@ -30,6 +30,7 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     options = LoadOptions(config.factor, config.masks, undistort=config.undistort, depth=config.depth)
     capture = load_with(root, config.dataset, options, config.vrig_factor)
+    capture.is_builtin = config.data is None or is_builtin(config.data)
     if config.background == "capture" or config.background == "mean":
         return capture
     return capture.over(config.background)

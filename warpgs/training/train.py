@@ -185,7 +185,10 @@ def _describe(trainer: Trainer, log: Log) -> None:
     elif num_aligned < num_views - refused:
         reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
         if not num_aligned and trainer.capture.frame(trainer.capture.train[0]).inverse_depth is None:
-            log(f"the capture has no depth, which {command('prepare', config.data, '--add', 'depth')} makes{reason}")
+            made = f", which {command('prepare', config.data, '--add', 'depth')} makes" * (
+                not trainer.capture.is_builtin
+            )
+            log(f"the capture has no depth{made}{reason}")
         else:
             log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
     if trainer.num_with_objects:
@@ -323,7 +326,7 @@ def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     for finding in findings:
         if finding not in errors:
             log(str(finding))
-    if not capture.time_source.problem:  # it is among the warnings
+    if not capture.time_source.problem and not capture.is_builtin:  # problems are among the warnings
         log(capture.time_source.text)
     if errors:
         raise UnfitCaptureError(errors)

@@ -115,7 +115,8 @@ def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_
     if factor is not None and factor < 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
     check_perturbation(options.perturbation)
-    root = builtin_folder(root, factor=factor) if is_builtin(root) else Path(root)
+    is_made = is_builtin(root)
+    root = builtin_folder(root, factor=factor) if is_made else Path(root)
     if dataset is None:
         require_capture(root)
     elif not root.exists():
@@ -126,6 +127,7 @@ def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_
         options = replace(options, factor=vrig_factor)
     capture = loader.load(root, options)
     _require_sides(root, capture)
+    capture.is_builtin = is_made
     return capture
 
 

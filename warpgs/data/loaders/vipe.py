@@ -85,7 +85,7 @@ class VipeLoader:
             )
         val = every_eighth([frame.name for frame in frames])
         text = f"times from the numbers of the frames in rgb/{name}.mp4"
-        source = TimeSource(with_steps(text, [frame.time for frame in frames]))
+        source = TimeSource(with_steps(text, [frame.time for frame in frames], " frames"))
         notes = [*scaled]
         if without := max(0, video.count - len(frames)):
             where = f"pose/{name}.npz has no pose for them"
