@@ -2,6 +2,7 @@
 
 import errno
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -177,6 +178,20 @@ def test_events_follow_a_folder_that_is_moved(tmp_path):
         log.report(status(50))
     assert events(tmp_path / "moved/events")["loss/total"] == [(50, 0.75)]
     assert not (tmp_path / "run").exists()
+
+
+def test_of_a_folder_that_is_moved_no_events_are_said_to_be_deleted(tmp_path, capsys):
+    with TrainingLogger(tmp_path / "run/events", 500, 0) as log:
+        (tmp_path / "run").rename(tmp_path / "moved")
+        log.report(status(50))
+    assert "deleted" not in capsys.readouterr().out
+
+
+def test_a_folder_of_events_that_is_deleted_is_reported(tmp_path, capsys):
+    with TrainingLogger(tmp_path / "run/events", 500, 0) as log:
+        shutil.rmtree(tmp_path / "run/events")
+        log.report(status(50))
+    assert "was deleted: TensorBoard shows nothing" in capsys.readouterr().out
 
 
 def test_deleted_events_are_reported_once(tmp_path, capsys):

@@ -201,6 +201,7 @@ class TrainingLogger:
         if self._events is None:
             return
         self._events.flush()
-        if not self._is_lost and not self._events.path.exists():
+        path = self._events.path
+        if not self._is_lost and not path.exists() and path.parent.parent.is_dir():  # else the run is gone
             self._is_lost = True
-            self.log(f"warning: {self._events.path} was deleted: TensorBoard shows nothing of this training")
+            self.log(f"warning: {path} was deleted: TensorBoard shows nothing of this training")
