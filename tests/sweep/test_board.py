@@ -10,6 +10,7 @@ from tests.terminal import Terminal
 from warpgs.sweep import board as module
 from warpgs.sweep.board import Board
 from warpgs.sweep.cells import plan_cells
+from warpgs.sweep.results import notes_of
 from warpgs.sweep.scheduler import Event
 from warpgs.sweep.spec import read_spec
 from warpgs.training import logger
@@ -67,6 +68,7 @@ def test_running_and_failed_cells_come_first_with_their_host_and_reason(board, t
         monkeypatch.setattr(board, "_live", Mock())
         board.poll()
         shown = text(board.table())
+    assert any(line.endswith("PSNR [dB] host / error") for line in shown)
     assert "1 running, 1 failed, 3 queued" in shown
     rows = [line for line in shown if line.startswith("as-full")]
     assert rows == [
@@ -158,6 +160,15 @@ def test_what_a_killed_sweep_left_running_is_forgotten(board, tmp_path):
     (tmp_path / "running/as-full-seed0").write_text("node1")
     with board:
         assert list((tmp_path / "running").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("seconds", "total"),
+    [(0.4, "1 second"), (20.5, "41 seconds"), (59.0, "2.0 minutes"), (1900.0, "1.06 hours"), (None, "0 seconds")],
+)
+def test_the_time_of_all_trainings_has_a_unit_of_its_size(board, seconds, total):
+    board.metrics = {name: {"train_seconds": seconds} for name in ("as-full-seed0", "as-full-seed1")}
+    assert notes_of(board)[0] == f"2 of 5 trainings finished, {total} of training in total."
 
 
 def test_damaged_results_are_named_and_trained_again(board, tmp_path):

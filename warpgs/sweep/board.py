@@ -35,7 +35,8 @@ MAX_LINES = 30
 FRAME_LINES = 5
 """Lines of a terminal that the live table needs besides its cells: title, heads, rule and cursor."""
 
-HEADS = ("cell", "state", "iterations", "time left", "PSNR [dB]", "")
+NOTE = "host / error"
+HEADS = ("cell", "state", "iterations", "time left", "PSNR [dB]", NOTE)
 
 REFRESH_SECONDS = 2.0
 ORDER = ("running", "failed", "retried", "lost", "queued", "stopped", "finished")
@@ -177,7 +178,7 @@ class Board:
         counts = Counter(states.values())
         title = ", ".join(f"{counts[state]} {state}" for state in ORDER if counts[state])
         # Where the terminal is too narrow, notes are cut first.
-        columns = [Column(Text(head), no_wrap=bool(head), overflow="ellipsis") for head in HEADS]
+        columns = [Column(Text(head, no_wrap=True), no_wrap=head != NOTE, overflow="ellipsis") for head in HEADS]
         table = Table(
             *columns, title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
         )

@@ -27,8 +27,8 @@ def tables_of(board: Board, spec: SweepSpec, peers: Peers) -> list[Table]:
 def notes_of(board: Board) -> list[str]:
     """Paragraphs below the tables: how much has finished, what was compared, and what failed and why."""
     seconds = [metrics.get("train_seconds") for metrics in board.metrics.values()]
-    hours = sum(value for value in seconds if isinstance(value, int | float)) / 3600.0
-    notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {hours:.2f} hours of training in total."]
+    total = _duration(float(sum(value for value in seconds if isinstance(value, int | float))))
+    notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {total} of training in total."]
     if resampled := _resampled(board):
         notes.append(
             f"Frames of {', '.join(resampled)} were undistorted, and so resampled, before they were compared. "
@@ -43,6 +43,12 @@ def notes_of(board: Board) -> list[str]:
         if board.states[name] != "finished":
             reasons.setdefault(error, []).append(name)
     return notes + [f"{', '.join(names)}: {error}" for error, names in reasons.items()]
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60.0:
+        return "1 second" if round(seconds) == 1 else f"{seconds:.0f} seconds"
+    return f"{seconds / 60.0:.1f} minutes" if seconds < 3600.0 else f"{seconds / 3600.0:.2f} hours"
 
 
 def _resampled(board: Board) -> list[str]:
