@@ -239,6 +239,28 @@ def test_options_with_underscores_and_without_values_are_known(capsys):
     assert "capture" in shown(capsys, "train", "--checkpoint_every", "3", "--no-graph", "--help")
 
 
+def test_help_after_an_argument_is_that_of_the_whole_command(capsys):
+    shown = []
+    for arguments in (["sweep", "--help"], ["sweep", "ablation", "--help"], ["sweep", "ablation", "-h"]):
+        with contextlib.suppress(SystemExit):
+            main(arguments)
+        shown.append(capsys.readouterr().out)
+    assert "SWEEP" in shown[0].splitlines()[0]
+    assert shown[1] == shown[2] == shown[0]
+
+
+@pytest.mark.parametrize("columns", range(78, 84))
+def test_help_has_no_empty_rows(columns, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, "utf-8", write_through=True))
+    with contextlib.suppress(SystemExit):
+        main(["sweep", "--help"])
+    rows = [line.strip("│ ") for line in written.getvalue().decode().splitlines() if line.startswith("│")]
+    assert len(rows) > 20
+    assert all(rows)
+
+
 def test_annotations_are_restored_after_help():
     before = dict(TrainConfig.__annotations__)
     with described(TrainConfig, ("data",)):

@@ -40,6 +40,9 @@ def _choices(match: re.Match[str]) -> str:
     return not_one_of(match["option"], given, choices)
 
 
+EMPTY_ROW = re.compile(r"^(?:\x1b\[[0-9;]*m|[│| ])*│(?:\x1b\[[0-9;]*m)*\n", re.MULTILINE)
+"""A row of tyro's boxes without text, which follows one that is full."""
+
 ALWAYS = ("--help", "--help-all", "--version")
 """Options of every command that are not fields of its dataclass."""
 
@@ -69,8 +72,10 @@ def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Option
         ValueError: If an option is wrong.
         SystemExit: After ``--help``.
     """
+    # Help is of the whole command: tyro leaves out the positional arguments that are given.
+    rest = ["--help"] if {"-h", "--help"} & {*arguments} else list(arguments)
     with one_line_errors(options, arguments, prog), described(options):
-        return tyro.cli(options, args=list(arguments), prog=prog)
+        return tyro.cli(options, args=rest, prog=prog)
 
 
 @contextlib.contextmanager
@@ -94,7 +99,8 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
     except SystemExit as end:
         if end.code:
             raise ValueError(_unboxed(box.getvalue())) from None
-        sys.stdout.write(wrapped(text.getvalue()))  # tyro wraps its boxes, but not what precedes them
+        help_text = EMPTY_ROW.sub("", text.getvalue())
+        sys.stdout.write(wrapped(help_text))  # tyro wraps its boxes, but not what precedes them
         raise
     sys.stderr.write(box.getvalue())
 
