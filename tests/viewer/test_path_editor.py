@@ -7,6 +7,7 @@ import re
 import signal
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[v
 from tests.video.test_camera_paths import capture
 from tests.viewer.watched import Scene
 from warpgs.viewer import path_editor, path_video
+from warpgs.viewer.path_controls import PathControls
 from warpgs.viewer.path_editor import PathEditor
 from warpgs.viewer.pose import Pose, camera_of
 from warpgs.viewer.training_cameras import TrainingCameras
@@ -29,7 +31,7 @@ class Control:
     """A control: a value, options, a text, and handlers that are called when the value is set, as viser's are."""
 
     def __init__(self, value=None):
-        self._value, self.options, self.content, self._handlers = value, (), "", []
+        self.visible, self._value, self.options, self.content, self._handlers = True, value, (), "", []
 
     @property
     def value(self):
@@ -363,11 +365,21 @@ def test_the_progress_of_a_video_is_shown_and_the_video_can_be_downloaded(editor
     editor.click("download")
     assert not hasattr(editor.browser, "downloaded")
     add(editor, 0.0, 2.0)
+    started.during.append(lambda: during.append((editor.controls.progress.visible, note(editor))))
+    during = []
     editor.click("render")
+    assert during == [(True, "rendering path, 120 frames …")]
+    assert editor.controls.progress.visible
     assert shown == [0.0, 0.0, 50.0, 100.0]
     assert not editor.controls.download.disabled
     editor.click("download")
     assert editor.browser.downloaded == ("path.mp4", b"film")
+
+
+def test_no_bar_is_shown_before_a_video_is_rendered():
+    gui = MagicMock()
+    PathControls(gui)
+    gui.add_progress_bar.assert_called_once_with(0.0, visible=False)
 
 
 def test_a_second_click_cancels_the_video(editor, started):
@@ -381,6 +393,7 @@ def test_a_second_click_cancels_the_video(editor, started):
     assert editor.controls.render.label == "Render video"
     assert note(editor) == "the video was cancelled"
     assert editor.controls.progress.value == 0.0
+    assert not editor.controls.progress.visible
     assert editor.controls.download.disabled
 
 

@@ -45,7 +45,7 @@ class PathControls:
             self.preview = gui.add_button(PREVIEW, hint="Moves along the path")
             self.save = gui.add_button("Save path")
             self.render = gui.add_button(RENDER, hint="Saves the path and renders it, as warpgs render does")
-            self.progress = gui.add_progress_bar(0.0)
+            self.progress = gui.add_progress_bar(0.0, visible=False)  # until a video is rendered
             self.download = gui.add_button("Download video", disabled=True, hint="The video that was rendered last")
             self.note = gui.add_html(note_html("no keyframes"))
 

@@ -85,7 +85,7 @@ class PathVideo:
                 text=True,
                 env={**os.environ, AS_LINES: "1"},
             )
-        self._show(f"rendering {path.stem} …", rendering=True)
+        self._show(f"rendering {path.stem}, {options.frames} frames …", rendering=True)
         errors = self._follow(child)
         output = child.stdout.read() if child.stdout is not None else ""
         done = child.wait() == 0
@@ -114,6 +114,7 @@ class PathVideo:
         self._controls.download.disabled = rendering or self._video is None
         if rendering or self._is_cancelled:
             set_value(self._controls.progress, 0.0)
+        self._controls.progress.visible = rendering or not self._is_cancelled
 
     def _download(self) -> None:
         video = self._video
