@@ -127,9 +127,7 @@ class Camera:
         position, target, up = (
             _vector(name, value, device) for name, value in (("position", position), ("target", target), ("up", up))
         )
-        focal = as_number("focal", focal)
-        if not 0.0 < focal < math.inf:
-            raise ValueError(f"focal must be positive and finite, got {focal}")
+        focal, (width, height) = _focal(focal), _sides(size)
         forward = torch.nn.functional.normalize(target - position, dim=0)
         sideways = torch.linalg.cross(forward, up)
         if not sideways.norm() > 1e-6 * up.norm():
@@ -142,7 +140,6 @@ class Camera:
         viewmat = torch.eye(4, dtype=torch.float32, device=device)
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ position
-        width, height = _sides(size)
         K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
         return Camera(viewmat, torch.tensor(K, dtype=torch.float32, device=device), width, height, time)
 
@@ -156,6 +153,14 @@ def _vector(name: str, value: Point, device: torch.device) -> Float[Tensor, "3"]
     if vector.shape != (3,) or not bool(vector.isfinite().all()):
         raise ValueError(f"{name} must be three finite numbers, got {one_line_repr(vector.tolist())}")
     return vector
+
+
+def _focal(value: float) -> float:
+    """A focal length [px] as a number of Python."""
+    focal = as_number("focal", value)
+    if not 0.0 < focal < math.inf:
+        raise ValueError(f"focal must be positive and finite, got {focal}")
+    return focal
 
 
 def _sides(size: tuple[int, int]) -> tuple[int, int]:
