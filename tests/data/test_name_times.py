@@ -12,7 +12,7 @@ from warpgs.data.check import check_capture
 from warpgs.data.import_capture import import_capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.loaders.name_times import times_of_names
-from warpgs.data.time_source import TimeSource
+from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.files import natural_order
 from warpgs.training.train import check_capture as check_before_training
 
@@ -299,3 +299,21 @@ def test_guessed_times_are_no_warning_for_a_scene_without_motion(edited):
     root, lines = rename(edited("nerfstudio"), lambda k: "abcdefghijkl"[k]), []
     check_before_training(load_capture(root), TrainConfig(assume="static"), lines.append)
     assert not any("times from" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("times", "unit", "steps"),
+    [
+        ([0.0, 1.0, 2.0], " frames", "1 frame"),
+        ([0.0, 3.0, 6.0], " frames", "3 frames"),
+        ([0.0, 1.0], " s", "1 s"),
+        ([0.0, 2.0], "", "2"),
+    ],
+)
+def test_equal_steps_have_a_unit_where_it_is_known(times, unit, steps):
+    assert with_steps("times", times, unit) == f"times, {steps} apart"
+
+
+def test_steps_of_frame_numbers_are_in_frames(written):
+    assert load_capture(written["vipe"]).time_source.text.endswith(" apart")
+    assert " frame" in load_capture(written["vipe"]).time_source.text.rpartition(".mp4")[2]

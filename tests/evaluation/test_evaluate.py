@@ -411,6 +411,11 @@ def test_metrics_name_the_commit_of_a_checkout(metrics):
         assert head.stdout.startswith(metrics["commit"])
 
 
+@pytest.mark.parametrize(("num_views", "shown"), [(1, "1 view: PSNR"), (3, "3 views: PSNR")])
+def test_the_summary_counts_one_view_in_the_singular(metrics, num_views, shown):
+    assert evaluate_run._summary({**metrics, "num_views": num_views}).startswith(shown)
+
+
 def test_metrics_are_the_means_of_the_views(metrics, run):
     with open(run / "views.csv", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -42,5 +42,6 @@ def with_steps(text: str, times: Sequence[float], unit: str = "") -> str:
         return f"{text}, all the same" if len(times) > 1 else text
     mean, largest = float(steps.mean()), float(steps.max())
     if largest - float(steps.min()) <= EVEN * mean:
-        return f"{text}, {mean:.3g}{unit.removesuffix('s') if mean == 1.0 and unit != ' s' else unit} apart"
+        unit = " frame" if (mean, unit) == (1.0, " frames") else unit
+        return f"{text}, {mean:.3g}{unit} apart"
     return f"{text}, {mean:.3g}{unit} apart on average, largest gap {largest:.3g}{unit}"

@@ -133,7 +133,7 @@ def _summary(values: dict[str, Any]) -> str:
     similarity = f"SSIM {show('ssim', 4)}, MS-SSIM {show('ms_ssim', 4)}"
     if values["ms_ssim"] is None:
         similarity += f" (a side is below {MIN_MS_SSIM_SIDE} px)"
-    views = "1 view" if values["num_views"] == 1 else f"{values['num_views']} views"
+    views = f"{values['num_views']} view{'s' * (values['num_views'] != 1)}"
     lines = [
         f"{views}: PSNR {show('psnr', 2, ' dB')}, {similarity}, {lpips}",
         f"static region {show('psnr_static', 2, ' dB')}, dynamic region {show('psnr_dynamic', 2, ' dB')}, {motion}",

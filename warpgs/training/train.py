@@ -164,7 +164,8 @@ def _describe(trainer: Trainer, log: Log) -> None:
     layout = "" if config.data is None else f" (read as {describe_layout(config.data, config.dataset)})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
-    log(f"{name}{layout}: {num_views} views, on {config.device}{together}, into {trainer.run}{resumed}")
+    views = f"{num_views} view{'s' * (num_views != 1)}"
+    log(f"{name}{layout}: {views}, on {config.device}{together}, into {trainer.run}{resumed}")
     if (cache := trainer.views.cache) is not None:
         read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
         log(
