@@ -33,7 +33,7 @@ def test_the_largest_model_is_read_and_the_others_are_named(tmp_path, binary):
     capture = load_capture(root)
     assert is_whole(capture)
     assert capture.notes == (
-        "the COLMAP model in sparse/2 (12 images) is read as the largest; left out: sparse/0 (3 images), "
+        "the COLMAP model in sparse/2 (12 images) is read as the largest; skipped: sparse/0 (3 images), "
         "sparse/10 (5 images)",
     )
 
@@ -53,7 +53,7 @@ def test_a_model_that_lacks_a_file_is_not_read_if_another_is_whole(edited):
     (root / "sparse/0/images.bin").unlink()
     capture = load_capture(root)
     assert is_whole(capture)
-    assert "left out: sparse/0 (0 images)" in capture.notes[0]
+    assert "skipped: sparse/0 (0 images)" in capture.notes[0]
 
 
 def test_a_damaged_count_does_not_hide_a_model(edited):
@@ -97,14 +97,14 @@ def test_masks_of_the_images_before_undistortion_are_not_taken_for_those_after(e
         shutil.move(root / name, root / "dense" / name)
     capture = load_capture(root)
     assert capture.frame("frame_00003").static_mask is None
-    assert capture.notes[0] == "masks is left out: dense/images is read with dense/masks"
+    assert capture.notes[0] == "masks is skipped: dense/images is read with dense/masks"
 
 
 def test_an_undistorted_copy_is_not_preferred_to_the_images(edited):
     root = edited("colmap")
     shutil.copytree(root / "sparse/0", root / "dense/sparse")
     write_png(root / "dense/images/frame_00000.png", layouts.image(0))
-    assert load_capture(root).notes[0].endswith("left out: dense/sparse (12 images)")
+    assert load_capture(root).notes[0].endswith("skipped: dense/sparse (12 images)")
 
 
 def test_a_model_without_images_is_refused(edited):

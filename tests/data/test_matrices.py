@@ -156,7 +156,7 @@ def test_one_scale_of_all_rotations_is_left_out_and_noted(edited, written, layou
     for name, camera in expected.cameras.items():
         assert np.allclose(capture.cameras[name].viewmat, camera.viewmat, atol=1e-5)
         assert np.allclose(capture.cameras[name].K, camera.K)
-    assert f" are scaled by {factor:.6g}, which is left out" in capture.notes[0]
+    assert f" are scaled by {factor:.6g}, divided out" in capture.notes[0]
     assert capture.notes[0].startswith("the rotations in ")
 
 

@@ -145,7 +145,7 @@ class Capture:
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
         is_builtin: Whether the package makes it: then no advice to change its files makes sense.
-        notes: Remarks of the loader on files that it left out or had to interpret, one sentence each.
+        notes: Remarks of the loader on files that it skipped or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
         extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the

@@ -49,7 +49,7 @@ def read_model(folder: Path, note: Callable[[str], None] = lambda text: None) ->
 
     Args:
         folder: Folder of the files.
-        note: Receives what had to be left out or interpreted, one sentence each.
+        note: Receives what had to be skipped or interpreted, one sentence each.
 
     Raises:
         ValueError: If a file is missing, too large or damaged, or refers to what is not there; the message names it.

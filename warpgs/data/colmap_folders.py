@@ -68,7 +68,7 @@ def largest_model(root: Path) -> tuple[ModelFolder | None, list[str]]:
     used = shown.pop(best)
     few, more = ", ".join(shown[:4]), f" and {len(shown) - 4} more" if len(shown) > 4 else ""
     rank = "the largest" if counts.count(max(counts)) == 1 else "the first of the largest"
-    return found[best], [f"the COLMAP model in {used} is read as {rank}; left out: {few}{more}"]
+    return found[best], [f"the COLMAP model in {used} is read as {rank}; skipped: {few}{more}"]
 
 
 def _subfolders(folder: Path) -> list[Path]:

@@ -30,7 +30,7 @@ DRAG_LIMIT = 1.5
 """How far outside the mouse can move a view."""
 
 SPACING = 0.25
-"""Cameras that are less outside than this of another one are left out."""
+"""Cameras that are less outside than this of another one are skipped."""
 
 MAX_CAMERAS, MAX_POINTS = 400, 5_000
 """Maximum number of cameras that are looked at, and of points that their depths are measured from."""

@@ -13,9 +13,9 @@ from warpgs.data.resized import read_metric_depth, read_resized_mask, read_resiz
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits
 
-from .left_out import images_left_out
 from .options import LoadOptions
 from .posed import PosedFrame, World, plain_names, posed_capture
+from .skipped import skipped_images
 from .transforms import Transforms
 from .turned import turning_notes
 
@@ -62,7 +62,7 @@ class BlenderLoader:
             notes=[
                 *chain(*(index.notes for index in indices)),
                 *turning_notes([*chain(*images)], sizes),
-                *images_left_out(root, chain(*images), listed, others=[*chain(*(index.found for index in indices))]),
+                *skipped_images(root, chain(*images), listed, others=[*chain(*(index.found for index in indices))]),
             ],
         )
         return posed_capture(root, frames, {frame.name for frame in val}, world, options)

@@ -10,7 +10,6 @@ from warpgs.data.images import read_depth
 from warpgs.data.resized import read_resized_image, read_resized_mask
 from warpgs.files import natural_order
 
-from .left_out import images_left_out
 from .listed import ListedFiles, find_file, without_image_suffix
 from .name_times import times_of_names
 from .options import LoadOptions
@@ -21,6 +20,7 @@ from .posed import (
     plain_names,
     posed_capture,
 )
+from .skipped import skipped_images
 from .turned import turning_notes
 
 MASKS, DEPTHS = "masks", "depths"
@@ -53,7 +53,7 @@ class ColmapLoader:
         frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
         reason = f"the model in {found.shown(root)} has no pose for them"
         notes += turning_notes(files.used, [(image.lens.width, image.lens.height) for image in images])
-        notes += [*files.images.notes, *images_left_out(root, files.used, reason, files.folder)]
+        notes += [*files.images.notes, *skipped_images(root, files.used, reason, files.folder)]
         world = World(model.points, model.colors, time_source=source, notes=notes)
         return posed_capture(root, frames, every_eighth(names), world, options)
 
@@ -105,7 +105,7 @@ def _unused(root: Path, part: Path) -> list[str]:
     """Notes on masks and depth of the original images, where undistorted ones are read."""
     names = [name for name in (MASKS, DEPTHS) if (root / name).is_dir() and not (part / name).is_dir()]
     place = part.relative_to(root)
-    return [f"{name} is left out: {place}/images is read with {place}/{name}" for name in names]
+    return [f"{name} is skipped: {place}/images is read with {place}/{name}" for name in names]
 
 
 def _first(folder: Path, *names: str) -> Path | None:

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 
 from warpgs.files import first_file
 
-from .left_out import IMAGE_SUFFIXES
+from .skipped import IMAGE_SUFFIXES
 
 MAX_PATH = 1024
 """Maximum length of a name that an index lists."""

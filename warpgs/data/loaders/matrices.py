@@ -111,5 +111,5 @@ def without_scale(pose: Float[np.ndarray, "3 4"], scale: float) -> Float[np.ndar
 
 def scale_note(name: str, scale: float) -> tuple[str, ...]:
     """A note on rotations of a file that are scaled; none for a scale of 1."""
-    text = f"the rotations in {name} are scaled by {scale:.6g}, which is left out; positions and depth keep their units"
+    text = f"the rotations in {name} are scaled by {scale:.6g}, divided out; positions and depth keep their units"
     return (text,) if scale != 1.0 else ()

@@ -32,9 +32,9 @@ from warpgs.data.writer import ESTIMATED, GIVEN, is_plain_id
 from warpgs.errors import command
 from warpgs.files import read_json
 
-from .left_out import images_left_out
 from .listed import ListedFiles, find_file
 from .options import LoadOptions
+from .skipped import skipped_images
 from .turned import turning_notes
 
 LAYOUT = "a capture has dataset.json, metadata.json, scene.json, camera/<id>.json and rgb/<factor>x/<id>.png"
@@ -115,7 +115,7 @@ class NerfiesLoader(ABC):
             time_source=time_source,
             notes=[
                 *turning_notes([files[name].image for name in cameras], [camera.size for camera in cameras.values()]),
-                *images_left_out(root, (file.image for file in files.values()), listed),
+                *skipped_images(root, (file.image for file in files.values()), listed),
             ],
         )
 

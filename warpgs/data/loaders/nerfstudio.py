@@ -14,7 +14,6 @@ from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.errors import visible
 from warpgs.files import natural_order, read_numbers
 
-from .left_out import images_left_out
 from .name_times import times_of_names
 from .options import LoadOptions
 from .posed import (
@@ -24,6 +23,7 @@ from .posed import (
     plain_names,
     posed_capture,
 )
+from .skipped import skipped_images
 from .transforms import Transforms
 from .turned import turning_notes
 
@@ -66,10 +66,10 @@ class NerfstudioLoader:
         val, ignored = _evaluated(transforms, by_image)
         kept = [frame for frame in frames if frame.name not in ignored]
         notes = turning_notes(images, [(frame.lens.width, frame.lens.height) for frame in frames])
-        notes += images_left_out(root, images, f"not listed in {INDEX}", others=transforms.found)
+        notes += skipped_images(root, images, f"not listed in {INDEX}", others=transforms.found)
         if ignored:
             lists = "its lists train_filenames, val_filenames and test_filenames do not name them"
-            notes.append(f"{len(ignored)} of {len(frames)} frames of {INDEX} are left out: {lists}")
+            notes.append(f"{len(ignored)} of {len(frames)} frames of {INDEX} are skipped: {lists}")
         world = replace(_world(transforms), time_source=source, notes=(*transforms.notes, *notes))
         return posed_capture(root, kept, val, world, options)
 

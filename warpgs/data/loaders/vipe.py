@@ -89,7 +89,7 @@ class VipeLoader:
         notes = [*scaled]
         if without := max(0, video.count - len(frames)):
             where = f"pose/{name}.npz has no pose for them"
-            notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are left out: {where}")
+            notes.append(f"{without} of {video.count} frames of rgb/{name}.mp4 are skipped: {where}")
         world = World(points=None, time_source=source, notes=notes, conventions=CONVENTIONS)
         return posed_capture(root, frames, val, world, options)
 

@@ -27,7 +27,7 @@ def test_images_without_a_pose_in_the_model_are_counted(edited):
         path.parent.mkdir(exist_ok=True)
         shutil.copy(root / "images/frame_00001.png", path)
     assert load_capture(root).notes == (
-        "3 of 15 images in images are left out, such as blurred_1.jpg: the model in sparse/0 has no pose for them",
+        "3 of 15 images in images are skipped, such as blurred_1.jpg: the model in sparse/0 has no pose for them",
     )
 
 
@@ -36,14 +36,14 @@ def test_images_that_transforms_json_does_not_list_are_counted(edited):
     values = json.loads((root / "transforms.json").read_text())
     write_json(root / "transforms.json", {**values, "frames": values["frames"][:10]})
     (note,) = load_capture(root).notes
-    assert note == "2 of 12 images in images are left out, such as frame_00000.png: not listed in transforms.json"
+    assert note == "2 of 12 images in images are skipped, such as frame_00000.png: not listed in transforms.json"
 
 
 def test_frames_that_the_lists_of_a_split_do_not_name_are_counted(edited):
     root = edited("nerfstudio")
     edit_json(root / "transforms.json", train_filenames=[f"images/{name}.png" for name in layouts.NAMES[:9]])
     (note,) = load_capture(root).notes
-    assert note.startswith("3 of 12 frames of transforms.json are left out: its lists train_filenames, ")
+    assert note.startswith("3 of 12 frames of transforms.json are skipped: its lists train_filenames, ")
 
 
 def test_depth_beside_images_of_blender_is_not_counted_as_images(edited):
@@ -52,7 +52,7 @@ def test_depth_beside_images_of_blender_is_not_counted_as_images(edited):
     assert load_capture(root).notes == ()
     write_png(root / "train/r_777.png", layouts.image(0))
     (note,) = load_capture(root).notes
-    assert "1 of 13 images in the capture are left out, such as train/r_777.png: not listed in" in note
+    assert "1 of 13 images in the capture are skipped, such as train/r_777.png: not listed in" in note
 
 
 def test_masks_beside_the_images_are_not_counted_as_images(edited):
@@ -71,7 +71,7 @@ def test_frames_of_a_video_without_a_pose_are_counted(edited):
     kept = np.array([0, 3, 7])
     np.savez(root / "pose/clip.npz", inds=kept, data=np.stack([layouts.opencv(k) for k in kept]))
     (note,) = load_capture(root).notes
-    assert note == "9 of 12 frames of rgb/clip.mp4 are left out: pose/clip.npz has no pose for them"
+    assert note == "9 of 12 frames of rgb/clip.mp4 are skipped: pose/clip.npz has no pose for them"
 
 
 @pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
@@ -81,7 +81,7 @@ def test_images_outside_of_the_split_are_counted(tmp_path, dataset):
     folder = next((root / "rgb").iterdir())
     shutil.copy(next(folder.iterdir()), folder / "another.png")
     (note,) = load_capture(root).notes
-    assert note.startswith(f"1 of 7 images in rgb/{folder.name} are left out, such as another.png: the split of ")
+    assert note.startswith(f"1 of 7 images in rgb/{folder.name} are skipped, such as another.png: the split of ")
 
 
 def test_check_training_and_import_say_what_is_left_out(edited, tmp_path):

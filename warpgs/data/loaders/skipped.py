@@ -12,10 +12,10 @@ MAX_LISTED = 1_000_000
 """Maximum number of files that are looked at; a folder with more is not counted."""
 
 
-def images_left_out(
+def skipped_images(
     root: Path, used: Iterable[Path], reason: str, folder: Path | None = None, others: Collection[Path] = ()
 ) -> tuple[str, ...]:
-    """A note on the images that are left out, if there are any.
+    """A note on the images that are skipped, if there are any.
 
     Files whose names extend that of a used image, such as r_000_depth.png next to r_000.png, are not images of their
     own.
@@ -23,7 +23,7 @@ def images_left_out(
     Args:
         root: Folder of the capture, for the note.
         used: The images of the frames.
-        reason: Why the others are left out, for the end of the note.
+        reason: Why the others are skipped, for the end of the note.
         folder: Folder that is searched with the folders in it; those that the used images are in if None.
         others: Files that are used as something else, such as masks.
     """
@@ -44,7 +44,7 @@ def images_left_out(
         return ()
     shown = os.path.relpath(common, os.path.abspath(root))
     which = f"{len(unused)} of {len(used) + len(unused)} images in {'the capture' if shown == '.' else shown}"
-    return (f"{which} are left out, such as {min(unused).relative_to(common)}: {reason}",)
+    return (f"{which} are skipped, such as {min(unused).relative_to(common)}: {reason}",)
 
 
 def _images(folders: Iterable[Path], within: bool) -> Iterator[Path]:
