@@ -303,7 +303,7 @@ def test_a_file_whose_size_says_nothing_about_its_content_is_refused(read, tmp_p
         ('{"a": 1, "b": 2, "a": 3}', "is not valid JSON: one object has 'a' twice, with different values$"),
         ('{"a": [1], "b": 2, "a": [1]}', None),
         ('{"a": 18446744073709551616, "b": 1.5}', None),
-        ('{"a": NaN, "b": 1e999}', None),  # whoever reads a number checks that it is finite
+        ('{"a": NaN, "b": 1e999}', None),  # readers of a number check that it is finite
         ("\ufeff{}", None),
         ("[1]", "must hold a JSON object, got list$"),
     ],

@@ -39,7 +39,7 @@ def make_camera() -> Camera:
     return Camera(viewmat, K, WIDTH, HEIGHT)
 
 
-def smooth_cotangent() -> torch.Tensor:
+def smooth_gradient() -> torch.Tensor:
     """[H, W, 3] gradient of the image that changes slowly, as the error of a blurred region does."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) / HEIGHT, torch.arange(WIDTH) / WIDTH, indexing="ij")
     waves = [torch.sin(2.1 * x + 1.3 * y), torch.cos(3.7 * x - 0.8 * y), torch.sin(1.1 * x * y + 2.9 * x)]
@@ -48,7 +48,7 @@ def smooth_cotangent() -> torch.Tensor:
 
 def gradients_of_needle(elongation: float, angle: float, antialias: bool) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Gradients of scales and quaternion: of the kernels, and of the reference in double precision."""
-    splats, camera, v_image = make_needle(elongation, angle), make_camera(), smooth_cotangent()
+    splats, camera, v_image = make_needle(elongation, angle), make_camera(), smooth_gradient()
     splats.scales.requires_grad_()
     splats.quats.requires_grad_()
     rendering = render(splats, camera, torch.zeros(3), RenderSettings(antialias=antialias))

@@ -91,12 +91,17 @@ def test_images_are_upright_if_their_cameras_are(edited, layout, orientation):
     ]
 
 
-def test_images_are_read_as_stored_if_their_cameras_are(edited):
-    root = edited("nerfstudio")
+def tag_as_turned(root):
+    """Writes the images of a capture as they were, but with an orientation of EXIF that turns them."""
     for k, name in enumerate(layouts.NAMES):
         exif = Image.Exif()
         exif[0x0112] = 6
         Image.fromarray(smooth(k)).save(root / f"images/{name}.png", exif=exif)
+
+
+def test_images_are_read_as_stored_if_their_cameras_are(edited):
+    root = edited("nerfstudio")
+    tag_as_turned(root)
     capture = load_capture(root)
     assert np.array_equal(capture.frame("frame_00002").image, smooth(2))
     assert capture.notes == ()
@@ -124,10 +129,8 @@ def test_masks_and_depth_of_the_stored_pixels_are_turned_with_their_image(edited
 
 def test_masks_of_the_upright_image_are_turned_back_if_its_camera_is_that_of_the_stored_pixels(edited):
     root = edited("nerfstudio")
+    tag_as_turned(root)
     for k, name in enumerate(layouts.NAMES):
-        exif = Image.Exif()
-        exif[0x0112] = 6
-        Image.fromarray(smooth(k)).save(root / f"images/{name}.png", exif=exif)
         write_png(root / f"masks/{name}.png", upright(layouts.white(layouts.static_mask(k)), 6))
     assert np.array_equal(load_capture(root).frame("frame_00002").static_mask, layouts.static_mask(2))
 

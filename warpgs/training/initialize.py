@@ -1,7 +1,7 @@
 """The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,8 +27,8 @@ from .tracked_start import start_from_tracks
 from .tracks import find_tracks
 from .views import Views
 
-MAX_COLOR_VIEWS = 12
-"""Maximum number of training views from which points without colours are coloured."""
+MAX_SPREAD_VIEWS = 12
+"""Maximum number of training views that tell the colours of points without colours, and the size of a pixel."""
 
 RESOLUTION = 0.25
 """Distance of points, in pixels at their median depth, below which clouds of several scans or models show one place. A
@@ -57,9 +57,13 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
 def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
     """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
     points, colors = _colored_points(config, capture, generator)
-    names = capture.train[:: -(-len(capture.train) // MAX_COLOR_VIEWS)]
-    resolution = RESOLUTION * pixel_size(points, (capture.cameras[name] for name in names))
+    resolution = RESOLUTION * pixel_size(points, (capture.cameras[name] for name in _spread_views(capture)))
     return gaussians_at(points, colors, config.model, resolution=resolution)
+
+
+def _spread_views(capture: Capture) -> Sequence[str]:
+    """At most ``MAX_SPREAD_VIEWS`` training views, evenly spaced."""
+    return capture.train[:: -(-len(capture.train) // MAX_SPREAD_VIEWS)]
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -74,7 +78,7 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     if colors is not None:
         return points, colors[chosen].float() / 255.0
     views = []
-    for name in capture.train[:: -(-len(capture.train) // MAX_COLOR_VIEWS)]:
+    for name in _spread_views(capture):
         frame = capture.frame(name)
         mask = frame.static_mask
         if mask is None or capture.assumption == "dynamic":
