@@ -42,7 +42,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
-from .rows import GEOMETRY_PARTS, NUM_MOMENTS, NUM_OFFSET_SUMS, row_load
+from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE_SUMS, NUM_MOMENTS, row_load
 from .tiles import DYNAMIC
 
 
@@ -67,13 +67,13 @@ def read_gradient(
 
 @functools.cache
 def make_composite_bwd(
-    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], imagegrad: bool
+    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], absgrad: bool
 ) -> wp.Kernel:
     """Backward kernel, launched with as many threads as the forward kernel.
 
     Args:
         num_features, with_depth, images, pixels: As in ``make_composite_fwd``.
-        imagegrad: Whether the gradient of the means on screen is also accumulated without depth.
+        absgrad: Whether the absolute values of each pixel's gradient of the means on screen are summed, too.
 
     The kernel adds to ``gradients`` [N, gradient_stride], which is initially zero. Each image has its own arrays of
     gradients; a missing array stands for zeros, and bit m of ``images_with_gradient`` is set if image m has any
@@ -83,15 +83,15 @@ def make_composite_bwd(
 
         depth = D / alpha,      v_D = v_depth / alpha,      v_alpha += -v_depth D / alpha².
 
-    v_alpha_i is linear in the gradients: that of the images alone has the same form, without the channel of depth and
-    with an R of its own.
+    A pixel's gradient of a mean on screen is -s conic (dx, dy). Absolute values are those of the pixels of each image,
+    so that they do not depend on which blocks of two images are equal.
     """
     C = num_features + int(with_depth)
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     scalars, integers, colors, features_vector = state_types(C, P)
     vectorized = is_vectorized(pixels)
-    num_sums = C + NUM_MOMENTS + (NUM_OFFSET_SUMS if imagegrad else 0)
+    num_sums = C + NUM_MOMENTS + (NUM_ABSOLUTE_SUMS if absgrad else 0)
     sums_vector, lane_add = make_lane_add(num_sums, columns if vectorized else 1)
 
     # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
@@ -136,19 +136,23 @@ def make_composite_bwd(
         corner = block_corner(block, width, block_width, block_height)
         if corner[1] >= width or corner[2] >= height:
             return  # this block of an edge tile is outside the image; its whole lane group returns
+        list_image = own_image  # the image whose list is traversed
         image_bits = 1 << own_image  # the images whose gradients are propagated, as bits
         if wp.static(images > 1):
             for m in range(1, wp.static(images)):
                 if equals_joint(m, joint_state[block]):
-                    # One traversal serves both images, because their gradients add up.
-                    if own_image == 0:
-                        image_bits = image_bits | (1 << m)
-                    if own_image == m:
-                        return
+                    # One traversal serves both images, because their gradients add up; absolute values do not.
+                    if wp.static(not absgrad):
+                        if own_image == 0:
+                            image_bits = image_bits | (1 << m)
+                        if own_image == m:
+                            return
+                    elif own_image == m:
+                        list_image = 0
         image_bits = image_bits & images_with_gradient
         if image_bits == 0:
             return
-        isects = tile_list(own_image, corner[0], tile_ranges, branch_lengths, half)
+        isects = tile_list(list_image, corner[0], tile_ranges, branch_lengths, half)
         box = block_box(corner, block_width, block_height, width, height)
         pixel_x = corner[1] + lane % lane_columns()
         pixel_y = corner[2] + lane / lane_columns()
@@ -157,7 +161,6 @@ def make_composite_bwd(
 
         T = scalars()
         R = scalars()
-        R_images = scalars()
         n = integers()
         v_color = colors()
         n_max = int(0)
@@ -168,8 +171,8 @@ def make_composite_bwd(
                 if x < width and y < height:
                     k = j * wp.static(columns) + i
                     pixel = y * width + x
-                    T[k] = transmittance[own_image * height * width + pixel]
-                    n[k] = last[own_image * height * width + pixel]
+                    T[k] = transmittance[list_image * height * width + pixel]
+                    n[k] = last[list_image * height * width + pixel]
                     n_max = wp.max(n_max, n[k])
                     for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
                         if (image_bits & (1 << m)) != 0:
@@ -183,8 +186,6 @@ def make_composite_bwd(
                                 v_color[c * wp.static(P) + k] += v
                                 if background.shape[0] > 0:
                                     v_transmittance += background[m * background_stride + c] * v
-                            if wp.static(imagegrad):
-                                R_images[k] += T[k] * v_transmittance
                             if wp.static(with_depth):
                                 v_depth = read_gradient(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
                                 v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
@@ -252,15 +253,11 @@ def make_composite_bwd(
                             sums[wp.static((C + 3) * columns) + i] += s * dx * dx
                             sums[wp.static((C + 4) * columns) + i] += s * dx * dy
                             sums[wp.static((C + 5) * columns) + i] += s * dy * dy
-                            if wp.static(imagegrad):
-                                v_weight_images = float(0.0)
-                                for c in range(wp.static(num_features)):
-                                    v_weight_images += features[c] * v_color[c * wp.static(P) + k]
-                                v_alpha_images = t * v_weight_images - R_images[k] * scale
-                                R_images[k] = R_images[k] + w * v_weight_images
-                                s = wp.where(unclamped <= max_alpha, LN_2 * alpha * v_alpha_images, 0.0)
-                                sums[wp.static((C + 6) * columns) + i] += s * (2.0 * row0[2] * dx + row0[3] * dy)
-                                sums[wp.static((C + 7) * columns) + i] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
+                            if wp.static(absgrad):
+                                v_x = wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
+                                v_y = wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
+                                sums[wp.static((C + 6) * columns) + i] += LN_2 * v_x
+                                sums[wp.static((C + 7) * columns) + i] += LN_2 * v_y
                     else:
                         span = ellipse_span(row0[2], row0[3], row1[0], threshold, dy)
                         for i in range(
@@ -274,7 +271,6 @@ def make_composite_bwd(
                                 alpha = wp.min(max_alpha, unclamped)
                                 scale = 1.0 / (1.0 - alpha)
                                 v_alpha = float(0.0)
-                                v_alpha_images = float(0.0)
                                 k = j * wp.static(columns) + i
                                 if position <= n[k]:
                                     contributes = 1
@@ -285,12 +281,6 @@ def make_composite_bwd(
                                         v = v_color[c * wp.static(P) + k]
                                         v_weight += features[c] * v
                                         sums[c] += w * v
-                                    if wp.static(imagegrad):
-                                        v_weight_images = float(0.0)
-                                        for c in range(wp.static(num_features)):
-                                            v_weight_images += features[c] * v_color[c * wp.static(P) + k]
-                                        v_alpha_images = t * v_weight_images - R_images[k] * scale
-                                        R_images[k] = R_images[k] + w * v_weight_images
                                     v_alpha = t * v_weight - R[k] * scale
                                     R[k] = R[k] + w * v_weight
                                     T[k] = t
@@ -302,10 +292,9 @@ def make_composite_bwd(
                                     sums[wp.static(C + 3)] += s * dx * dx
                                     sums[wp.static(C + 4)] += s * dx * dy
                                     sums[wp.static(C + 5)] += s * dy * dy
-                                    if wp.static(imagegrad):
-                                        s = LN_2 * alpha * v_alpha_images
-                                        sums[wp.static(C + 6)] += s * (2.0 * row0[2] * dx + row0[3] * dy)
-                                        sums[wp.static(C + 7)] += s * (row0[3] * dx + 2.0 * row1[0] * dy)
+                                    if wp.static(absgrad):
+                                        sums[wp.static(C + 6)] += LN_2 * wp.abs(s * (2.0 * row0[2] * dx + row0[3] * dy))
+                                        sums[wp.static(C + 7)] += LN_2 * wp.abs(s * (row0[3] * dx + 2.0 * row1[0] * dy))
                 if lane_any(contributes) != 0:
                     lane_add(sums, gradients, g)
             lane_sync()

@@ -221,7 +221,7 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         compensate: int,
         rows: wp.array2d[wp.vec4],
         gradients: wp.array2d[wp.vec4],
-        imagegrad: int,
+        absgrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],
         v_means: wp.array[wp.vec3],
@@ -231,7 +231,7 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         v_cameras: wp.array2d[float],
     ):
         i = first + wp.tid()
-        v_splat = unpack_splat(i, rows, gradients, width, height, imagegrad, v_features, v_screen_offsets)
+        v_splat = unpack_splat(i, rows, gradients, width, height, absgrad, v_features, v_screen_offsets)
         if is_culled(rows, i):
             for part in range(v_cameras.shape[1]):
                 v_cameras[i, part] = 0.0

@@ -27,8 +27,8 @@ GEOMETRY_PARTS = wp.constant(2)
 NUM_MOMENTS = 6
 """Σ s, Σ s dx, Σ s dy, Σ s dx², Σ s dx dy, Σ s dy²."""
 
-NUM_OFFSET_SUMS = 2
-"""Σ s' (conic d)_x and Σ s' (conic d)_y, with s' of the images alone, without depth."""
+NUM_ABSOLUTE_SUMS = 2
+"""Σ |s (conic d)_x| and Σ |s (conic d)_y|."""
 
 
 @wp.struct
@@ -72,8 +72,8 @@ def row_parts(num_channels: int) -> int:
 
 
 def gradient_stride(num_channels: int) -> int:
-    """Number of floats in a Gaussian's gradient row: features, moments, ``NUM_OFFSET_SUMS``, padded to 16 bytes."""
-    return (num_channels + NUM_MOMENTS + NUM_OFFSET_SUMS + 3) // 4 * 4
+    """Number of floats in a Gaussian's gradient row: features, moments, ``NUM_ABSOLUTE_SUMS``, padded to 16 bytes."""
+    return (num_channels + NUM_MOMENTS + NUM_ABSOLUTE_SUMS + 3) // 4 * 4
 
 
 @functools.cache
@@ -130,7 +130,7 @@ def make_pack_splat(num_features: int, with_depth: bool) -> wp.Function:
     return pack_splat
 
 
-sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_OFFSET_SUMS, dtype=float)
+sums_vector = wp.types.vector(length=NUM_MOMENTS + NUM_ABSOLUTE_SUMS, dtype=float)
 
 
 @functools.cache
@@ -138,7 +138,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
     """Function that turns a gradient row into the gradients of a splat, features and ``screen_offsets``.
 
     ``gradients`` has the rows of all splats once for each CPU shard; on CUDA, once. ``v_screen_offsets``, which may be
-    missing, is the gradient of the mean in halves of the image size; that of the images alone if ``imagegrad`` is 1.
+    missing, is the gradient of the mean in halves of the image size; the sum of absolute values if ``absgrad`` is 1.
     """
     num_channels = num_features + int(with_depth)
 
@@ -149,7 +149,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
         gradients: wp.array2d[wp.vec4],
         width: int,
         height: int,
-        imagegrad: int,
+        absgrad: int,
         v_features: wp.array2d[float],
         v_screen_offsets: wp.array[wp.vec2],
     ) -> Splat:
@@ -164,7 +164,7 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
                     v_features[i, part * 4 + k] = total[k]
                 elif part * 4 + k < wp.static(num_channels):
                     v_splat.depth = total[k]
-                elif part * 4 + k < wp.static(num_channels + NUM_MOMENTS + NUM_OFFSET_SUMS):
+                elif part * 4 + k < wp.static(num_channels + NUM_MOMENTS + NUM_ABSOLUTE_SUMS):
                     s[part * 4 + k - wp.static(num_channels)] = total[k]
         v_offset = wp.vec2(0.0)
         if not is_culled(rows, i):
@@ -175,8 +175,8 @@ def make_unpack_splat(num_features: int, with_depth: bool) -> wp.Function:
             v_splat.conic = -wp.vec3(0.5 * s[3], s[4], 0.5 * s[5])
             v_splat.opacity = s[0] / exp2(row1[1])
             v_offset = v_splat.mean
-            if imagegrad != 0:
-                v_offset = -wp.vec2(s[6], s[7])
+            if absgrad != 0:
+                v_offset = wp.vec2(s[6], s[7])
         if v_screen_offsets.shape[0] > 0:
             v_screen_offsets[i] = wp.vec2(v_offset[0] * 0.5 * float(width), v_offset[1] * 0.5 * float(height))
         return v_splat

@@ -155,7 +155,7 @@ def test_without_inputs_that_require_gradients_nothing_is_recorded():
 
 @pytest.mark.parametrize("use_reentrant", [False, True])
 def test_a_checkpointed_render_has_the_same_gradients(use_reentrant):
-    settings = RenderSettings(branches=True, depth=True, imagegrad=True)
+    settings = RenderSettings(branches=True, depth=True, absgrad=True)
 
     def loss(means, sh, background, offsets):
         splats = dataclasses.replace(make_splats(), means=means, sh=sh)

@@ -215,7 +215,7 @@ def test_radii_of_gaussians_that_are_skipped_are_zero(values, antialias):
     assert torch.equal(radii[~ODD], expected.radii)
 
 
-@pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings(imagegrad=True, branches=True, depth=True)])
+@pytest.mark.parametrize("settings", [RenderSettings(), RenderSettings(absgrad=True, branches=True, depth=True)])
 def test_gradients_are_finite_at_very_large_colours(settings):
     splats, offsets = as_leaves(odd(make_splats(channels=3), colors=1e19)), torch.zeros(60, 2, requires_grad=True)
     render(splats, CAMERA, settings=settings, screen_offsets=offsets).joint.image.sum().backward()

@@ -40,7 +40,7 @@ SETTINGS = [
     RenderSettings(),
     RenderSettings(branches=True, statistics=True),
     RenderSettings(depth=True, antialias=True),
-    RenderSettings(depth=True, branches=True, imagegrad=True),
+    RenderSettings(depth=True, branches=True, absgrad=True),
 ]
 
 

@@ -83,7 +83,6 @@ PAPER = {
     "3DGS: adaptive density control": {
         "densify.every": 100,
         "densify.gradient": 2e-4,
-        "densify.depth_gradients": False,
         "densify.dense_fraction": 0.01,
         "densify.min_opacity": 0.005,
         "densify.max_size": 0.1,

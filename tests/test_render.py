@@ -211,25 +211,29 @@ def test_offsets_of_another_number_of_gaussians_are_refused():
 
 
 @pytest.mark.parametrize("depth", [True, False])
-@pytest.mark.parametrize("dynamic", ["some", "none"])  # with none, one traversal serves the joint and the static image
-def test_gradients_of_the_images_alone_are_those_without_a_loss_of_depth(dynamic, depth):
-    def v_offsets(imagegrad, with_depth_loss):
+@pytest.mark.parametrize(
+    "dynamic", ["some", "none"]
+)  # with none, all blocks of the joint and the static image are equal
+def test_absolute_gradients_of_the_offsets_are_the_sums_of_the_lengths_of_single_pixels(dynamic, depth):
+    def render_with_offsets(absgrad):
         splats, offsets = make_splats(), torch.zeros(60, 2, requires_grad=True)
         if dynamic == "none":
             splats = dataclasses.replace(splats, is_dynamic=torch.zeros(60, dtype=torch.bool))
-        settings = RenderSettings(branches=True, depth=depth, imagegrad=imagegrad)
-        result = render(as_leaves(splats), CAMERA, background(), settings, offsets)
+        settings = RenderSettings(branches=True, depth=depth, absgrad=absgrad)
+        result = render(splats, CAMERA, background(), settings, offsets)
+        values = [o if o.ndim == 2 else o.sum(-1) for o in outputs(result)]
         layers = (result.joint, result.static, result.dynamic)
-        depths = [layer.depth * layer.alpha.detach() for layer in layers if depth]
-        loss = weighted_sum(outputs(result), random_like(outputs(result)))
-        (loss + with_depth_loss * weighted_sum(depths, random_like(depths))).backward()
-        return offsets.grad
+        values += [layer.depth * layer.alpha.detach() for layer in layers if depth]
+        images = torch.stack(values).unflatten(0, (-1, 3)).sum(0)  # joint, static, dynamic
+        weights = torch.randn(3, HEIGHT, WIDTH, generator=generator())
+        return (images * weights)[:, ::7, ::9].flatten(), offsets
 
-    expected = v_offsets(imagegrad=False, with_depth_loss=0.0)
+    values, offsets = render_with_offsets(absgrad=False)
+    expected = sum(torch.autograd.grad(value, offsets, retain_graph=True)[0].abs() for value in values)
+    values, offsets = render_with_offsets(absgrad=True)
+    values.sum().backward()
     assert expected.count_nonzero() > 60
-    assert relative_error(v_offsets(imagegrad=True, with_depth_loss=1.0), expected) < 1e-6
-    assert relative_error(v_offsets(imagegrad=True, with_depth_loss=0.0), expected) < 1e-6
-    assert (relative_error(v_offsets(imagegrad=False, with_depth_loss=1.0), expected) > 0.1) == depth
+    assert relative_error(offsets.grad, expected) < 1e-5
 
 
 @pytest.mark.parametrize("max_intersections", [1, 100_000])

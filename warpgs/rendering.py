@@ -248,7 +248,7 @@ class _Backward:
     Attributes:
         request: Of the render.
         with_offsets: Whether ``screen_offsets`` get a gradient.
-        imagegrad: Whether it is that of the images alone.
+        absgrad: Whether it is the sum of absolute values over pixels.
         lock: Held during the backward pass: threads may run it on one graph at once.
         traversal: Of the forward pass.
         saved: What autograd saved; during the backward pass only, as all that follows.
@@ -263,11 +263,11 @@ class _Backward:
 
     def __init__(self, request: _Request, with_offsets: bool) -> None:
         self.request, self.with_offsets, self.lock = request, with_offsets, threading.Lock()
-        self.imagegrad = request.settings.imagegrad and with_offsets
+        self.absgrad = request.settings.absgrad and with_offsets
 
     def composite(self) -> None:
         saved, traversal, v = self.saved, self.traversal, self.v
-        v["rows"] = composite_bwd(self._rows(), saved.background, traversal, v["layers"], self.imagegrad)
+        v["rows"] = composite_bwd(self._rows(), saved.background, traversal, v["layers"], self.absgrad)
         if _has_gradient(saved.background):
             alphas = self.layers[-traversal.num_images :]
             v["background"] = background_bwd(saved.background, alphas, v["layers"][: traversal.num_images])
@@ -276,7 +276,7 @@ class _Backward:
         saved, v = self.saved, self.v
         geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *self.request.size)
         inputs = (geometry, view, self.request.settings.antialias, self._rows())
-        splats = project_bwd(*inputs, v["rows"], self.with_offsets, self.imagegrad)
+        splats = project_bwd(*inputs, v["rows"], self.with_offsets, self.absgrad)
         v |= splats.geometry._asdict()
         v["appearance"], v["viewmat"], v["K"] = splats.features, splats.viewmat, splats.K
         v["screen_offsets"] = splats.screen_offsets

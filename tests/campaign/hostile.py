@@ -22,8 +22,8 @@ COUNTS = (0, 1, 2, 7, 60, 60, 300)
 SETTINGS = (
     RenderSettings(),
     RenderSettings(antialias=True, near=1e-30),
-    RenderSettings(branches=True, depth=True, statistics=True, imagegrad=True),
-    RenderSettings(branches=True, depth=True, statistics=True, imagegrad=True, antialias=True, near=4.0),
+    RenderSettings(branches=True, depth=True, statistics=True, absgrad=True),
+    RenderSettings(branches=True, depth=True, statistics=True, absgrad=True, antialias=True, near=4.0),
 )
 
 

@@ -2,13 +2,15 @@
 
 import pytest
 import torch
+from torch.nn.functional import pad
 
 from tests.ops.alone import composite, pack
+from tests.reference.compositing import absolute_gradients
 from tests.reference.compositing import composite as reference
 from tests.reference.projection import Projection
 from tests.reference.rows import splat_gradients
 from tests.scenes import assert_same_gradients, error, generator, random_like, relative_error, weighted_sum
-from warpgs.kernels.rows import NUM_MOMENTS, NUM_OFFSET_SUMS
+from warpgs.kernels.rows import NUM_ABSOLUTE_SUMS, NUM_MOMENTS
 from warpgs.ops import compositing
 from warpgs.ops.compositing import composite_bwd, composite_fwd
 from warpgs.ops.tiles import bin_splats
@@ -259,29 +261,53 @@ FEW = make_inputs(8, size=(20, 17))
         (make_walled_inputs(16, (20, 17)), torch.arange(16) >= 12),
     ],
 )
-def test_gradients_on_screen_are_those_of_the_images_with_or_without_depth(inputs, dynamic):
+def test_absolute_gradients_on_screen_sum_absolute_values_over_the_pixels_of_all_images(inputs, dynamic):
     size = (20, 17)
     means2d, conics, opacities, features, background, depths = leaves(inputs, torch.float64)
     with_depth = torch.cat([features, depths[:, None]], 1), torch.cat([background, torch.zeros(1, dtype=torch.float64)])
-    images, inner = [], []
+    layers = []
     for selected in [depths > 0] if dynamic is None else [depths > 0, ~dynamic, dynamic]:
         image, alpha, _ = reference((means2d, conics, depths, opacities), with_depth[0], selected, size, with_depth[1])
-        images.append(image[..., :-1])
-        inner.append(torch.where(alpha > 0, image[..., -1] / torch.where(alpha > 0, alpha, 1.0), 0.0))
-    v_images, v_depths = random_like(images), random_like(inner)
-    (of_images,) = torch.autograd.grad(images, means2d, v_images, retain_graph=True)
-    (of_depths,) = torch.autograd.grad(inner, means2d, v_depths)
+        depth = torch.where(alpha > 0, image[..., -1] / torch.where(alpha > 0, alpha, 1.0), 0.0)
+        layers.append((image[..., :-1], alpha, depth))
+    v_layers = [random_like(image, seed) for seed, image in enumerate(layers)]
+    for (_, alpha, _), v in zip(layers, v_layers, strict=True):
+        v[2] *= alpha.detach().float()  # depth is not smooth where alpha is near 0
+    pairs = list(zip(layers, v_layers, strict=True))
+    absolute = sum(absolute_gradients(*pair, means2d) for pair in pairs)
+    (plain,) = torch.autograd.grad(sum(weighted_sum(*pair) for pair in pairs), means2d)
+    for absgrad in (False, True):
+        sums = gradient_sums(inputs, dynamic, v_layers, absgrad, size)
+        assert relative_error(splat_gradients(*inputs[1:3], sums)[0], plain) < 1e-5
+    assert relative_error(sums[:, NUM_MOMENTS:][:, :NUM_ABSOLUTE_SUMS], absolute) < 1e-5
 
+
+def gradient_sums(inputs, dynamic, v_layers, absgrad, size):
+    """The sums of each splat that follow its channels; ``v_layers`` are those of image, alpha and depth by image."""
     means2d, conics, opacities, features, background, depths = inputs
     radii = torch.full(means2d.shape, 1000, dtype=torch.int32)
     rows, order = pack(Projection(means2d, conics, depths, opacities, radii), features, with_depth=True)
     tiles = bin_splats(rows, order, size, None if dynamic is None else dynamic.view(torch.uint8))
     _, traversal = composite_fwd(rows, tiles, size, background, statistics=False, max_alpha=0.999)
-    v_layers = [*v_images, *[None] * len(images), *v_depths]
-    for imagegrad in (False, True):
-        sums = composite_bwd(rows, background, traversal, v_layers, imagegrad)[..., rows.num_channels :].sum(0)
-        assert relative_error(splat_gradients(conics, opacities, sums)[0], of_images + of_depths) < 1e-5
-    assert relative_error(-sums[:, NUM_MOMENTS:][:, :NUM_OFFSET_SUMS], of_images) < 1e-5
+    v_layers = [v for kind in zip(*v_layers, strict=True) for v in kind]
+    return composite_bwd(rows, background, traversal, v_layers, absgrad)[..., rows.num_channels :].sum(0)
+
+
+@pytest.mark.parametrize("num", [0, 1, 8])
+def test_absolute_gradients_do_not_depend_on_the_tiles_that_the_splats_lie_in(num):
+    """Shifts change which splats share a tile, and so which blocks of the three images are equal."""
+    inputs, dynamic, size = make_inputs(num, size=(20, 17)), torch.arange(num) % 2 == 0, (60, 60)
+    inputs[0][dynamic, 0] *= 0.3
+    found = []
+    for x, y in ((10, 10), (21, 17)):
+        border = (x, size[0] - 20 - x, y, size[1] - 17 - y)
+        v_layers = [[pad(v, border) for v in random_like(torch.zeros(5, 17, 20).split([3, 1, 1]), k)] for k in range(3)]
+        v_layers = [[image.permute(1, 2, 0).contiguous(), alpha[0], depth[0]] for image, alpha, depth in v_layers]
+        shifted = [inputs[0] + torch.tensor([x, y]), *inputs[1:]]
+        sums = gradient_sums(shifted, dynamic, v_layers, True, size)
+        found.append(sums[:, NUM_MOMENTS:][:, :NUM_ABSOLUTE_SUMS])
+    assert torch.allclose(*found, rtol=1e-4)
+    assert (found[0] > 0).all()
 
 
 def test_the_default_background_is_black():

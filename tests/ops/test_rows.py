@@ -124,12 +124,12 @@ def test_gradients_equal_the_reference(with_depth):
     assert v.viewmat is v.K is None
 
 
-def test_offsets_on_screen_get_the_gradient_of_the_images_alone_on_request():
+def test_offsets_on_screen_get_the_sums_of_absolute_values_on_request():
     geometry, view = geometry_and_view()
     rows, radii, _ = pack(random_features())
     v_rows = torch.randn(1, NUM, gradient_stride(CHANNELS), generator=generator())
-    v = project_bwd(geometry, view, False, rows, v_rows, with_offsets=True, imagegrad=True)
-    expected = -v_rows[0, :, CHANNELS + NUM_MOMENTS :][:, :2] * torch.tensor(SIZE) / 2
+    v = project_bwd(geometry, view, False, rows, v_rows, with_offsets=True, absgrad=True)
+    expected = v_rows[0, :, CHANNELS + NUM_MOMENTS :][:, :2] * torch.tensor(SIZE) / 2
     assert relative_error(v.screen_offsets, torch.where(radii > 0, expected, 0.0)) < 1e-6
 
 

@@ -1,6 +1,6 @@
 """Alpha compositing in plain torch, any dtype: every pixel evaluates every Gaussian, and autograd differentiates it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -46,3 +46,13 @@ def composite(
         image = image + weight[..., None] * features[g]
         T = torch.where(seen, T_next, T)
     return image + T[..., None] * background, 1 - T, weights
+
+
+def absolute_gradients(outputs: Iterable[Tensor], v_outputs: Iterable[Tensor], means2d: Tensor) -> Tensor:
+    """[N, 2] Σ_p |∂(output_p · v_p) / ∂means2d|, over the pixels p of layers [H, W] or [H, W, C] of one image."""
+    pairs = zip(outputs, v_outputs, strict=True)
+    of_pixels = sum((output * v).flatten(2).sum(-1) if output.ndim > 2 else output * v for output, v in pairs).flatten()
+    of_pixels = of_pixels + 0.0 * means2d.sum()  # on which an image without splats does not depend
+    one_hot = torch.eye(len(of_pixels), dtype=of_pixels.dtype)
+    options = {"retain_graph": True, "is_grads_batched": True}
+    return sum(torch.autograd.grad(of_pixels, means2d, part, **options)[0].abs().sum(0) for part in one_hot.split(64))

@@ -154,7 +154,13 @@ def test_whether_stage_2_compares_branches_was_a_yes_or_no(run, before, now):
 
 
 @pytest.mark.parametrize(
-    ("part", "name"), [("schedule", "half_size_until"), ("schedule", "mask_trial"), ("loss", "mask_tolerance")]
+    ("part", "name"),
+    [
+        ("schedule", "half_size_until"),
+        ("schedule", "mask_trial"),
+        ("loss", "mask_tolerance"),
+        ("densify", "depth_gradients"),
+    ],
 )
 def test_runs_with_an_option_that_is_gone_open(run, part, name):
     before = read_config(run)

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from tests import tiny
-from tests.scenes import relative_error
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.training import ranks
 from warpgs.training.optimizer import GROUPS
@@ -167,23 +166,6 @@ def test_each_iteration_and_each_rank_omits_other_gaussians(monkeypatch):
         seeds += [sampler(k, 0, 0.0).dropout_seed for k in range(10)]
     assert len(set(seeds)) == 20
     assert all(0 <= seed < MAX_SEED for seed in seeds)
-
-
-@pytest.mark.parametrize("depth_gradients", [True, False])
-def test_densification_looks_at_the_terms_of_depth_only_if_asked_to(data, tmp_path, depth_gradients):
-    densify = dataclasses.replace(tiny.CONFIG.densify, depth_gradients=depth_gradients)
-    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify))
-    plan = trainer.protocol.at(0)
-    assert plan.phase.with_depth
-    sample, state, totals = trainer._sample(plan), copy.deepcopy(trainer.scene.state_dict()), []
-    for depth_weight in (0.0, 1.0):
-        trainer.scene.load_state_dict(state)
-        trainer.step.reset_statistics()
-        trainer.step(dataclasses.replace(plan, depth_weight=depth_weight), sample)
-        totals.append(trainer.step.statistics.total)
-    without, with_depth = totals
-    assert without.any()
-    assert (relative_error(with_depth, without) < 1e-6) == (not depth_gradients)
 
 
 @pytest.mark.parametrize("hidden_appearance", [True, False])

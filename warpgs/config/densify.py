@@ -14,8 +14,6 @@ class DensifyConfig:
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
-    depth_gradients: bool = True
-    """Whether that gradient includes the terms of depth, or those of images alone (paper)."""
     dense_fraction: float = 0.01
     """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
     min_opacity: float = 0.005

@@ -17,7 +17,8 @@ class RenderSettings:
         branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
         depth: Also render depth, as one more channel.
         statistics: Also compute whether and how much each Gaussian contributed to the joint image.
-        imagegrad: The gradient of ``screen_offsets`` is that of the images alone, without depth.
+        absgrad: The gradient of ``screen_offsets`` is the sum over the pixels of all images of the absolute values of
+            each pixel's contribution, per axis (AbsGS, Ye et al. 2024; gsplat's ``absgrad``).
         antialias: Compensate opacities for the low-pass filter (Mip-Splatting).
         max_alpha: Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS.
         near: Near plane [scene units].
@@ -27,7 +28,7 @@ class RenderSettings:
     branches: bool = False
     depth: bool = False
     statistics: bool = False
-    imagegrad: bool = False
+    absgrad: bool = False
     antialias: bool = False
     max_alpha: float = 0.999
     near: float = 0.01

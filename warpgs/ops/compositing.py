@@ -171,7 +171,7 @@ def composite_bwd(
     background: Tensor | None,
     traversal: Traversal,
     v_layers: Gradients,
-    imagegrad: bool = False,
+    absgrad: bool = False,
 ) -> Tensor:
     """Sums for ``project_bwd``, [shards, N, gradient_stride].
 
@@ -179,7 +179,7 @@ def composite_bwd(
         rows, background: As in ``composite_fwd``.
         traversal: Its second result.
         v_layers: Gradients of ``Composite.layers``; None for zeros.
-        imagegrad: Whether to sum the gradient of the means on screen without depth, too.
+        absgrad: Whether to sum the absolute values of each pixel's gradient of the means on screen, too.
     """
     num_images, images_with_gradient = traversal.num_images, 0  # a bit for each image
     v_arrays: list[Tensor | None] = [None] * (3 * NUM_BRANCH_IMAGES)  # images, alphas, depths
@@ -189,7 +189,7 @@ def composite_bwd(
             images_with_gradient |= 1 << (k % num_images)
     packed, num_features, with_depth = rows
     v_rows = packed.new_zeros(num_shards(packed), packed.shape[0], gradient_stride(rows.num_channels))
-    kernel = make_composite_bwd(num_features, with_depth, num_images, traversal.pixels, imagegrad)
+    kernel = make_composite_bwd(num_features, with_depth, num_images, traversal.pixels, absgrad)
     inputs = (*traversal.lists, packed, background, *traversal.view, *traversal.state, *v_arrays, images_with_gradient)
     launch(kernel, traversal.num_threads, *inputs, per_shard=(v_rows,), block_dim=BLOCK_DIM, work=WORK)
     return v_rows

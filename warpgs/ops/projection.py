@@ -95,7 +95,7 @@ def project_bwd(
     rows: Rows,
     v_rows: Tensor,
     with_offsets: bool = False,
-    imagegrad: bool = False,
+    absgrad: bool = False,
 ) -> SplatGradients:
     """The backward pass of ``project_fwd``.
 
@@ -104,14 +104,14 @@ def project_bwd(
         rows: Its first result.
         v_rows: [shards, N, gradient_stride] sums from ``composite_bwd``.
         with_offsets: Whether to return the gradient of ``screen_offsets``.
-        imagegrad: As in ``composite_bwd``.
+        absgrad: As in ``composite_bwd``.
     """
     new, N = geometry.means.new_empty, geometry.means.shape[0]
     v_geometry = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))  # torch.empty_like takes the host longer
     v_features, v_offsets = new(N, rows.num_features), new(N, 2) if with_offsets else None
     v_cameras = new(N, kernels.CAMERA_GRADIENTS) if view.viewmat.requires_grad or view.K.requires_grad else None
     v_parts = v_rows.view(*v_rows.shape[:2], v_rows.shape[2] // 4, 4)  # pieces of 16 bytes
-    inputs = (*geometry, *view, int(antialias), rows.packed, v_parts, int(imagegrad))
+    inputs = (*geometry, *view, int(antialias), rows.packed, v_parts, int(absgrad))
     kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras)
     v_viewmat, v_K = (None, None) if v_cameras is None else _sum_over_gaussians(view, v_cameras)

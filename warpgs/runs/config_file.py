@@ -18,7 +18,11 @@ MAX_BYTES = 1 << 20
 """Size of config.json [bytes]."""
 
 REMOVED_PRESETS = ("fast",)
-REMOVED = {"schedule": ("half_size_until", "mask_trial"), "loss": ("mask_tolerance",)}
+REMOVED = {
+    "densify": ("depth_gradients",),
+    "loss": ("mask_tolerance",),
+    "schedule": ("half_size_until", "mask_trial"),
+}
 
 RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""

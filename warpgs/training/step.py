@@ -199,10 +199,8 @@ class Step:
         return alignment, DepthTrust(*trust)
 
     def _settings(self, phase: Phase) -> RenderSettings:
-        """What is rendered in a phase; without depth all gradients are those of images."""
-        imagegrad = phase.with_depth and not self.config.densify.depth_gradients
-        settings = self.config.render_settings
-        return replace(settings, branches=True, depth=phase.with_depth, imagegrad=imagegrad)
+        """What is rendered in a phase."""
+        return replace(self.config.render_settings, branches=True, depth=phase.with_depth)
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""
