@@ -26,7 +26,8 @@ from tests.scenes import (
     weighted_sum,
 )
 from warpgs.config import RenderSettings
-from warpgs.rendering import render
+from warpgs.ops.projection import Geometry, View
+from warpgs.rendering import opacities_on_screen, render
 
 CAMERA = make_camera()
 EVERYTHING = RenderSettings(branches=True, statistics=True)
@@ -234,6 +235,18 @@ def test_absolute_gradients_of_the_offsets_are_the_sums_of_the_lengths_of_single
     values.sum().backward()
     assert expected.count_nonzero() > 60
     assert relative_error(offsets.grad, expected) < 1e-5
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_opacities_on_screen_are_those_that_are_composited(antialias):
+    splats = make_splats()
+    splats.means[::7, 2] = -5.0
+    geometry = Geometry(*(getattr(splats, name).double() for name in GEOMETRY))
+    view = View(CAMERA.viewmat.double(), CAMERA.K.double(), WIDTH, HEIGHT)
+    *_, expected, visible = reference_projection.project(geometry, view, antialias=antialias)
+    assert 20 < visible.sum() < 52
+    found = opacities_on_screen(splats, CAMERA, RenderSettings(antialias=antialias))
+    assert error(found, torch.where(visible, expected, 0.0)) < 1e-6
 
 
 @pytest.mark.parametrize("max_intersections", [1, 100_000])

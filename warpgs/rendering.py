@@ -150,6 +150,15 @@ def render(
     return _rendering(outputs, settings)
 
 
+@torch.no_grad()
+def opacities_on_screen(splats: Splats, camera: Camera, settings: RenderSettings = DEFAULTS) -> Float[Tensor, " N"]:
+    """[N] opacities with which ``render`` composites splats: with ``antialias`` compensated, of culled ones 0."""
+    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
+    view = View(camera.viewmat, camera.K, *camera.size)
+    rows, *_ = project_fwd(geometry, splats.means, view, settings.near, settings.antialias, with_depth=False)
+    return rows.opacities
+
+
 def _request(splats: Splats, camera: Camera, settings: RenderSettings) -> _Request:
     degree = None
     if splats.sh is not None:

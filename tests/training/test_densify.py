@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, remove, reset opacities, shorten needles."""
+"""Adaptive density control: clone, split, remove, shorten needles."""
 
 import copy
 import dataclasses
@@ -14,7 +14,7 @@ from tests.scenes import error, generator, relative_error
 from warpgs.config import DensifyConfig, ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
-from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, reset_opacities, shorten_needles
+from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, shorten_needles
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 
@@ -234,26 +234,6 @@ def test_gradients_of_culled_gaussians_do_not_count_even_if_not_finite():
 
 def test_mean_gradients_without_any_view_are_zero():
     assert not GradientStatistics(4, torch.device("cpu")).mean().any()
-
-
-def test_a_reset_clamps_opacities_to_a_hundredth():
-    given = torch.tensor([0.9, 0.011, 0.009, 0.0001])
-    gaussians = make_gaussians([SMALL] * 4, given)
-    _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    reset_opacities(gaussians, optimizer)
-    assert error(gaussians.opacities.detach(), given.clamp(max=0.01)) < 1e-7
-
-
-def test_a_reset_changes_opacities_and_clears_their_moments_only():
-    gaussians = make_gaussians([SMALL, LARGE])
-    before = copies(gaussians)
-    _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    reset_opacities(gaussians, optimizer)
-    for name, value in copies(gaussians).items():
-        assert torch.equal(value, before[name]) == (name != "logit_opacities")
-        state = optimizer.state[getattr(gaussians, name)]
-        for part in ("exp_avg", "exp_avg_sq"):
-            assert state[part].any() == (name != "logit_opacities")
 
 
 def shortened(scales, max_elongation=10.0):

@@ -31,6 +31,11 @@ class Rows(NamedTuple):
         """Number of features, plus one with depth."""
         return self.num_features + int(self.with_depth)
 
+    @property
+    def opacities(self) -> Tensor:
+        """[N] opacities; that of a culled splat is 0."""
+        return self.packed[:, 1, 1].exp2()
+
 
 class DepthOrder(NamedTuple):
     """Input of binning, which uses it up.

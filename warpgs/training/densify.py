@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, remove, reset opacities (3DGS, section 5), and shorten needles."""
+"""Adaptive density control: clone, split, remove (3DGS, section 5), and shorten needles."""
 
 import math
 from typing import NamedTuple
@@ -13,9 +13,6 @@ from warpgs.ops.adam import Adam
 
 from . import optimizer as optim
 from . import ranks
-
-RESET_OPACITY = 0.01
-"""Maximum opacity after a reset (3DGS)."""
 
 SPLIT_SHRINK = 1.6
 """Factor by which the children of a split are smaller than their parent (3DGS: 0.8 · 2)."""
@@ -140,11 +137,3 @@ def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) 
     second = gaussians.log_scales.median(1, keepdim=True).values
     longest = (second + math.log(max(config.max_elongation, 1.0))).clamp_min(math.log(config.max_size * extent))
     gaussians.log_scales.clamp_(max=longest)
-
-
-@torch.no_grad()
-def reset_opacities(gaussians: Gaussians, optimizer: Adam) -> None:
-    """Lowers all opacities to at most 0.01, so that Gaussians that are not needed become removable (3DGS)."""
-    highest = torch.logit(torch.tensor(RESET_OPACITY, dtype=torch.float32)).item()
-    gaussians.logit_opacities.clamp_(max=highest)
-    optim.reset_moments(optimizer, gaussians.logit_opacities)

@@ -19,11 +19,12 @@ from warpgs.runs.trained import TrainedScene
 from . import initialize, ranks
 from . import optimizer as optim
 from .callbacks import Callback, Progress
-from .densify import DensifyLimits, densify, reset_opacities, shorten_needles
+from .densify import DensifyLimits, densify, shorten_needles
 from .dynamic_points import unproject_pixels
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .object_depth import fill_object_depth
+from .opacity_reset import reset_opacities
 from .prune import blend_weights, prune_invisible, prune_weakest
 from .reseed import gaussians_in_box, gaussians_that_show, lost_fraction, lost_pixels, require_branches
 from .sampling import Sampler, random_numbers
@@ -201,8 +202,7 @@ class Trainer:
         if plan.shorten:
             shorten_needles(scene.static, self.config.densify, self.capture.extent)
         if plan.reset:
-            for gaussians in (scene.static, scene.dynamic):
-                reset_opacities(gaussians, self.step.optimizer)
+            reset_opacities(scene, self.step.optimizer, self.views.cameras(), plan.phase, settings)
 
     def _densify(self, remove_large: bool) -> None:
         """Densifies both branches, which divide the remaining capacity in proportion to how many want to grow."""
