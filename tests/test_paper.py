@@ -81,6 +81,7 @@ PAPER = {
     },
     # It densifies after iterations that are multiples of 100, more than 500 and less than 15,000.
     "3DGS: adaptive density control": {
+        "densify.strategy": "3dgs",
         "densify.every": 100,
         "densify.gradient": 2e-4,
         "densify.dense_fraction": 0.01,

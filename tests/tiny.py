@@ -21,7 +21,7 @@ from warpgs.runs.run import Run
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import GROUPS
-from warpgs.training.schedule import IterationPlan
+from warpgs.training.schedule import Action, IterationPlan
 from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
@@ -85,11 +85,9 @@ def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:
         return trainer.train(logger, interrupt)
 
 
-def plan_to(trainer: Trainer, action: str) -> IterationPlan:
+def plan_to(trainer: Trainer, action: Action) -> IterationPlan:
     """The plan of the first iteration, after which only this is done."""
-    plan = trainer.protocol.at(0)
-    nothing = {field.name: False for field in dataclasses.fields(plan) if field.type is bool}
-    return dataclasses.replace(plan, **{**nothing, action: True})
+    return dataclasses.replace(trainer.protocol.at(0), actions=(action,))
 
 
 def finished(folder: Path) -> Path:

@@ -132,8 +132,8 @@ def one_step(folder: Path, config: TrainConfig) -> None:
         sample = trainer._sample(plan)
         trainer.step(plan, sample)
         torch.save(tuple(sample), folder / f"sample{ranks.rank()}.pt")
-        trainer.step.statistics.merge()
-        counts = trainer.step.statistics.count.clone()
+        trainer.step.density.merge()
+        counts = trainer.step.density.statistics.count.clone()
         trainer.iteration = 1
         trainer.save()
         assert ranks.is_first() or not counts.any()

@@ -20,8 +20,8 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
 from warpgs.runtime.profiling import profile
 from warpgs.training import motion_fit
-from warpgs.training.prune import blend_weights
-from warpgs.training.reseed import lost_fraction, lost_pixels
+from warpgs.training.density.prune import blend_weights
+from warpgs.training.density.reseed import lost_fraction, lost_pixels
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 STEPS = 50
@@ -116,7 +116,7 @@ def test_graphs_that_are_captured_again_reuse_the_memory(data, tmp_path):
     plan = trainer.protocol.at(trainer.protocol.stage2.start)
     reserved = []
     for _ in range(8):
-        trainer.step.reset_statistics()
+        trainer.step.begin_density()
         for _ in range(WARM_UPS + 2):
             trainer.step(plan, trainer._sample(plan))
         torch.cuda.synchronize()

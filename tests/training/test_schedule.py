@@ -2,13 +2,14 @@
 
 import dataclasses
 from fractions import Fraction
+from typing import get_args
 
 import pytest
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.training.loss_terms import TERMS
-from warpgs.training.schedule import Phase, Protocol
+from warpgs.training.schedule import Action, Phase, Protocol
 
 SHORT = Schedule(
     pretrain=20,
@@ -48,6 +49,11 @@ def plans(*arguments, **changes):
 def iterations_where(name, **changes):
     """The iterations whose plan, or its phase, has a true attribute of this name."""
     return [i for i, value in enumerate(values_of(name, **changes)) if value]
+
+
+def iterations_that(action, **changes):
+    """The iterations after which this is done."""
+    return [i for i, plan in enumerate(plans(**changes)) if action in plan.actions]
 
 
 def values_of(name, **changes):
@@ -189,7 +195,7 @@ def last(first):
     return list(range(first, END))
 
 
-ACTIONS = {
+FLAGS = {
     "appearance: from its iteration of stage 1 on": ("use_appearance", {}, last(STAGE1 + 35)),
     "appearance: likewise without stage 2": ("use_appearance", {"stage2": False}, last(STAGE1 + 35)),
     "appearance: at the latest from stage 2 on": ("use_appearance", LATE, last(STAGE2)),
@@ -211,6 +217,15 @@ ACTIONS = {
     "depth: not rendered if there is none": ("with_depth", {"has_depth": False}, []),
     "depth: not rendered without depth and pretraining": ("with_depth", {"has_depth": False, "dap": False}, []),
     "depth: not rendered if its weight is zero": ("with_depth", NO_DEPTH, []),
+}
+
+
+@pytest.mark.parametrize(("name", "changes", "expected"), FLAGS.values(), ids=FLAGS)
+def test_parts_of_a_step_are_in_use_when_the_schedule_says(name, changes, expected):
+    assert iterations_where(name, **changes) == expected
+
+
+ACTIONS = {
     "densify: at intervals in a range of stage 1": ("densify", {}, after(20, 30, 40, 50, 60)),
     "densify: never in stage 2": ("densify", {"schedule": {"densify_until": 1000}}, after(*range(20, 101, 10))),
     "reset: at intervals before the last densification": ("reset", {}, after(20, 40)),
@@ -225,19 +240,33 @@ ACTIONS = {
     "shorten: not unless asked to": ("shorten", {}, []),
     "reseed: while densifying, once the deformation has warmed up": ("reseed", RESEED, after(50)),
     "reseed: not unless asked to": ("reseed", OFTEN, []),
-    "remove_large: only after the first reset": ("remove_large", {}, last(STAGE1 + 20)),
     "realign: once in the pretraining": ("realign", {}, [9]),
     "realign: at the end of a shorter pretraining": ("realign", {"schedule": {"realign_at": 500}}, [19]),
     "realign: never without pretraining": ("realign", {"dap": False}, []),
 }
 
 
-@pytest.mark.parametrize(("name", "changes", "expected"), ACTIONS.values(), ids=ACTIONS)
-def test_iterations_do_what_the_schedule_says(name, changes, expected):
-    assert iterations_where(name, **changes) == expected
+@pytest.mark.parametrize(("action", "changes", "expected"), ACTIONS.values(), ids=ACTIONS)
+def test_actions_follow_the_iterations_that_the_schedule_says(action, changes, expected):
+    assert iterations_that(action, **changes) == expected
 
 
-@pytest.mark.parametrize("changes", [changes for name, changes, _ in ACTIONS.values() if name == "use_appearance"])
+def test_actions_are_done_in_the_order_of_their_type():
+    made = protocol(**WEAKEST, schedule={"prune_every": 10, "reset_every": 10}).at(after(30)[0])
+    assert made.actions == tuple(action for action in get_args(Action) if action in ("densify", "prune", "reset"))
+
+
+@pytest.mark.parametrize("action", get_args(Action))
+def test_statistics_start_anew_after_actions_that_add_or_remove_gaussians(action):
+    plan = dataclasses.replace(protocol().at(0), actions=(action,))
+    assert plan.replaces_gaussians == (action not in ("realign", "shorten", "reset"))
+
+
+def test_iterations_that_are_done_count_from_the_start_of_stage_1():
+    assert values_of("done") == list(range(1 - STAGE1, END - STAGE1 + 1))
+
+
+@pytest.mark.parametrize("changes", [changes for name, changes, _ in FLAGS.values() if name == "use_appearance"])
 def test_iterations_with_the_appearance_network_cost_twice_as_much_as_others(changes):
     costs, doubled = protocol(**changes).remaining_cost, iterations_where("use_appearance", **changes)
     assert [costs(k) - costs(k + 1) for k in range(END)] == [2 if k in doubled else 1 for k in range(END)]
@@ -287,7 +316,7 @@ def test_values_follow_the_schedule(name, changes, expected):
 
 def test_the_paper_preset_resets_opacities_every_3000_iterations_before_15000():
     made = Protocol(PRESETS["paper"], has_depth=True)
-    resets = [k for k in range(1, 30_001, 100) if made.at(2_000 + k + 98).reset]
+    resets = [k for k in range(1, 30_001, 100) if "reset" in made.at(2_000 + k + 98).actions]
     assert [k + 99 for k in resets] == [3_000, 6_000, 9_000, 12_000]
 
 

@@ -152,9 +152,9 @@ def test_gaussians_are_omitted_at_random_once_both_branches_are_trained(data, tm
     sample, state, totals = trainer._sample(plan), copy.deepcopy(trainer.scene.state_dict()), []
     for seed in (1, 2):
         trainer.scene.load_state_dict(state)
-        trainer.step.reset_statistics()
+        trainer.step.begin_density()
         trainer.step(plan, sample._replace(dropout_seed=seed))
-        totals.append(trainer.step.statistics.total)
+        totals.append(trainer.step.density.statistics.total)
     assert totals[0].any()
     assert torch.equal(*totals) == (not omits)
 

@@ -10,6 +10,8 @@ from .bounds import Bounds
 class DensifyConfig:
     """When Gaussians are cloned, split and removed (3DGS, section 5)."""
 
+    strategy: str = "3dgs"
+    """Density strategy, a key of DENSITY in warpgs/training/density/__init__.py."""
     every: Annotated[int, Bounds(min=1)] = 100
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4

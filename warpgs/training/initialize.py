@@ -17,11 +17,11 @@ from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import DEFAULTS, render
 
+from .density.reseed import gaussians_in_box
 from .dynamic_points import is_depth_known, max_scale, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, pixel_size, random_points, scene_box, subsample
-from .reseed import gaussians_in_box
 from .schedule import Protocol
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks

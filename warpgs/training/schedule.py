@@ -12,6 +12,13 @@ NOISE = 0.1
 
 StageName = Literal["pretrain", "stage1", "stage2"]
 
+Action = Literal["realign", "densify", "prune", "reseed", "prune_weakest", "shorten", "reset"]
+"""Done after an iteration: align depth again, densify, prune by visibility, start new dynamic Gaussians where none
+shows what moves, prune what contributes least, shorten needles, reset opacities."""
+
+REPLACING = frozenset[Action](("densify", "prune", "reseed", "prune_weakest"))
+"""Actions that add or remove Gaussians."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -65,33 +72,20 @@ class IterationPlan(RatePlan):
         phase: Everything that the training step branches on.
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
-        densify, reset, prune, prune_weakest, reseed, realign, shorten: What to do after the iteration: densify, reset
-            opacities, prune by visibility, prune the Gaussians that contribute least, start new dynamic Gaussians where
-            none shows what moves, align depth again, shorten needles.
-        remove_large: Whether densification removes oversized Gaussians.
+        done: Iterations of stage I and later that are done after this one; at most 0 before.
+        actions: What to do after the iteration, in this order.
     """
 
     phase: Phase
     depth_weight: float
     time_noise: float
-    densify: bool
-    reset: bool
-    prune: bool
-    prune_weakest: bool
-    reseed: bool
-    realign: bool
-    shorten: bool
-    remove_large: bool
+    done: int
+    actions: tuple[Action, ...]
 
     @property
     def replaces_gaussians(self) -> bool:
         """Whether Gaussians are added or removed after the iteration."""
-        return self.densify or self.prune or self.prune_weakest or self.reseed
-
-    @property
-    def adapts(self) -> bool:
-        """Whether anything is done after the iteration."""
-        return self.replaces_gaussians or self.reset or self.realign or self.shorten
+        return not REPLACING.isdisjoint(self.actions)
 
 
 def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
@@ -176,14 +170,9 @@ class Protocol:
 
     def at(self, iteration: int) -> IterationPlan:
         """The plan of an iteration."""
-        schedule = self.config.schedule
-        stage, phase = self.stage_at(iteration), self.phase_at(iteration)
-        in_stage1 = iteration - self.stage1.start
-        done = in_stage1 + 1
-        is_growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
+        phase, in_stage1 = self.phase_at(iteration), iteration - self.stage1.start
         progress = iteration / self.num_iterations
-        decay = max(0.0, 1.0 - in_stage1 / max(1, schedule.noise_until))
-        prunes = self._prunes(iteration)
+        decay = max(0.0, 1.0 - in_stage1 / max(1, self.config.schedule.noise_until))
         return IterationPlan(
             phase=phase,
             progress=progress,
@@ -193,18 +182,28 @@ class Protocol:
             warmup_factors={name: self._warmup_factor(in_stage1 - k) for name, k in self._network_starts.items()},
             depth_weight=self._depth_weight(progress) if phase.with_depth else 0.0,
             time_noise=NOISE * decay if in_stage1 >= 0 else 0.0,
-            densify=is_growing and done % self.config.densify.every == 0,
-            reset=is_growing and done % schedule.reset_every == 0 and done < schedule.densify_until,
-            prune=self.config.vdp and prunes,
-            prune_weakest=self.config.densify.weakest > 0.0
-            and prunes
-            and schedule.densify_until <= done <= 2 * schedule.densify_until,
-            reseed=self.config.densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
-            realign=stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
-            shorten=self.config.densify.max_elongation > 0.0
-            and (done % self.config.densify.every == 0 or iteration + 1 == self.num_iterations),
-            remove_large=done > schedule.reset_every,
+            done=in_stage1 + 1,
+            actions=self._actions(iteration),
         )
+
+    def _actions(self, iteration: int) -> tuple[Action, ...]:
+        """What to do after an iteration."""
+        schedule, densify, stage = self.config.schedule, self.config.densify, self.stage_at(iteration)
+        done, prunes = iteration + 1 - self.stage1.start, self._prunes(iteration)
+        is_last, is_end_of_interval = iteration + 1 == self.num_iterations, done % densify.every == 0
+        is_growing = stage.name == "stage1" and schedule.densify_from <= done <= schedule.densify_until
+        is_grown = schedule.densify_until <= done <= 2 * schedule.densify_until
+        is_reset = done % schedule.reset_every == 0 and done < schedule.densify_until
+        is_due: dict[Action, bool] = {
+            "realign": stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
+            "densify": is_growing and is_end_of_interval,
+            "prune": self.config.vdp and prunes,
+            "reseed": densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
+            "prune_weakest": densify.weakest > 0.0 and prunes and is_grown,
+            "shorten": densify.max_elongation > 0.0 and (is_end_of_interval or is_last),
+            "reset": is_growing and is_reset,
+        }
+        return tuple(action for action, due in is_due.items() if due)
 
     def _means_progress(self, iteration: int) -> dict[str, float]:
         """By branch, fraction done of the iterations over which the rate of its positions decays."""

@@ -20,7 +20,7 @@ from warpgs.runtime.graphs import GraphCache
 
 from . import optimizer as optim
 from . import ranks
-from .densify import GradientStatistics
+from .density import make_strategy
 from .loss_terms import TERMS
 from .losses import DepthTrust, LossInputs
 from .schedule import IterationPlan, Phase
@@ -82,8 +82,7 @@ class Step:
     Attributes:
         scene: What is trained.
         optimizer: Its Adam.
-        statistics: Screen-space gradients since the last densification; on rank 0 those of all ranks until the last
-            ``merge``, too.
+        density: Strategy of density control.
     """
 
     def __init__(
@@ -110,16 +109,16 @@ class Step:
         self._graphs: GraphCache[Phase] | None = None
         if views.uses_graphs:
             self._graphs = GraphCache(max_graphs=1, repeatable=False, shared_memory=device)
-        self.reset_statistics()
+        self.density = make_strategy(config.densify)
+        self.begin_density()
 
     def parameters(self) -> dict[str, nn.Parameter]:
         """Everything that is trained, by name: the scene and the corrections of the views' cameras."""
         return optim.trained_parameters(self.scene, self.views.poses)
 
-    def reset_statistics(self) -> None:
-        """Clears the gradient statistics and invalidates the graph; call it after the Gaussians were replaced."""
-        num = len(self.scene.static) + len(self.scene.dynamic)
-        self.statistics = GradientStatistics(num, self.views.device)
+    def begin_density(self) -> None:
+        """Lets density control start anew and invalidates the graph; call it after the Gaussians were replaced."""
+        self.density.begin(len(self.scene.static) + len(self.scene.dynamic), self.views.device)
         if self._graphs is not None:
             self._graphs.invalidate()
 
@@ -167,7 +166,7 @@ class Step:
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
-        backgrounds, offsets = self._inputs.backgrounds, self.statistics.screen_offsets
+        backgrounds, offsets = self._inputs.backgrounds, self.density.screen_offsets
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
@@ -178,7 +177,7 @@ class Step:
         optim.average_gradients(self.optimizer)
         self.optimizer.step()
         self.optimizer.zero_grad()
-        self.statistics.observe(rendering.radii)
+        self.density.observe(splats, view.camera, rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
 
@@ -200,7 +199,8 @@ class Step:
 
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase."""
-        return replace(self.config.render_settings, branches=True, depth=phase.with_depth)
+        settings = replace(self.config.render_settings, branches=True, depth=phase.with_depth)
+        return self.density.settings(settings)
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""

@@ -19,14 +19,10 @@ from warpgs.runs.trained import TrainedScene
 from . import initialize, ranks
 from . import optimizer as optim
 from .callbacks import Callback, Progress
-from .densify import DensifyLimits, densify, shorten_needles
-from .dynamic_points import unproject_pixels
+from .density.adaptation import Adaptation
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
 from .object_depth import fill_object_depth
-from .opacity_reset import reset_opacities
-from .prune import blend_weights, prune_invisible, prune_weakest
-from .reseed import gaussians_in_box, gaussians_that_show, lost_fraction, lost_pixels, require_branches
 from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
@@ -136,8 +132,8 @@ class Trainer:
             plan = self.protocol.at(self.iteration)
             self.views.announce(self._sampler.views(self.iteration, self.rollbacks))
             self.step(plan, self._sample(plan))
-            if plan.adapts:
-                self._adapt_all_ranks(plan, logger)
+            if plan.actions:
+                self._adapt(plan, logger)
             self.iteration += 1
             at_checkpoint = self.iteration % self.config.checkpoint_every == 0
             at_checkpoint |= self.iteration == self.protocol.num_iterations
@@ -164,84 +160,40 @@ class Trainer:
             return requested
         return (is_check or self.iteration % AGREE_EVERY == 0) and ranks.any_rank(requested)
 
-    def _adapt_all_ranks(self, plan: IterationPlan, logger: TrainingLogger) -> None:
-        """Lets rank 0 change the scene as planned and sends it to the others."""
+    def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
+        """Lets rank 0 do what is planned after an iteration, and sends the result to the others."""
         ranks.any_rank(False)  # finds a lost rank
-        self.step.statistics.merge()
+        self.step.density.merge()
         if ranks.is_first():
-            before = len(self.scene.static), len(self.scene.dynamic)
-            self._adapt(plan, logger)
-            if before[1] > 0 == len(self.scene.dynamic):
-                self._reseed(plan.phase, logger)
-            if lost := require_branches(before, self.scene, self.views):
-                logger.log(f"warning: iteration {self.iteration + 1}: {lost}")
+            if "realign" in plan.actions:
+                self._realign(plan.phase)
+            self.step.density.adapt(self._adaptation(plan, logger))
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
         ranks.copy_first_(self.alignments)
         if plan.replaces_gaussians:
-            self.step.reset_statistics()
+            self.step.begin_density()
 
-    def _adapt(self, plan: IterationPlan, logger: TrainingLogger) -> None:
-        """Changes the alignment of depth and the sets of Gaussians as planned."""
-        scene, sh_degree, settings = self.scene, plan.phase.sh_degree, self.config.render_settings
-        if plan.realign and not self.capture.metric_depth:
-            # In place, because CUDA graphs read them.
-            aligned = initialize.align_to_rendering(self.alignments, self.views, scene, sh_degree, settings)
-            self.alignments.copy_(torch.where(self.depth_trust.weight[:, None] > 0, aligned, torch.nan))
-        if plan.densify:
-            self._densify(plan.remove_large)
-        if plan.prune:
-            cameras, threshold = self.views.cameras(), self.config.densify.visibility
-            if any(removed := prune_invisible(scene, self.step.optimizer, cameras, sh_degree, threshold, settings)):
-                logger.log(f"iteration {self.iteration + 1}: {removed}")
-        if plan.reseed:
-            self._reseed(plan.phase, logger)
-        if plan.prune_weakest:
-            weights = blend_weights(scene, self.views, plan.phase, settings)
-            number = prune_weakest(scene, self.step.optimizer, weights, self.config.densify.weakest)
-            logger.log(f"iteration {self.iteration + 1}: {number:,} Gaussians pruned that contribute least")
-        if plan.shorten:
-            shorten_needles(scene.static, self.config.densify, self.capture.extent)
-        if plan.reset:
-            reset_opacities(scene, self.step.optimizer, self.views.cameras(), plan.phase, settings)
+    def _realign(self, phase: Phase) -> None:
+        """Aligns the depth of the views to the rendered depth, in place, because CUDA graphs read it."""
+        if not self.capture.metric_depth:
+            settings = self.config.render_settings
+            found = initialize.align_to_rendering(self.alignments, self.views, self.scene, phase.sh_degree, settings)
+            self.alignments.copy_(torch.where(self.depth_trust.weight[:, None] > 0, found, torch.nan))
 
-    def _densify(self, remove_large: bool) -> None:
-        """Densifies both branches, which divide the remaining capacity in proportion to how many want to grow."""
-        config, branches = self.config.densify, (self.scene.static, self.scene.dynamic)
-        means = self.step.statistics.mean().split([len(gaussians) for gaussians in branches])
-        generator, capacity = self._generator("densify"), self._capacity()
-        candidates = [int((gradients > config.gradient).sum()) for gradients in means]
-        for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
-            part = capacity * count // max(1, sum(candidates))
-            limits = DensifyLimits(self.capture.extent, part, remove_large)
-            densify(gaussians, self.step.optimizer, gradients, config, limits, generator)
-
-    def _capacity(self) -> int:
-        """Number of Gaussians that may be added."""
-        config, most = self.config.densify, self.config.densify.max_gaussians
-        if config.min_pixels:
-            most = min(most, self.views.num_pixels // config.min_pixels)
-        return most - len(self.scene.static) - len(self.scene.dynamic)
-
-    def _reseed(self, phase: Phase, logger: TrainingLogger) -> None:
-        """Adds dynamic Gaussians where none shows what moves."""
-        if self.capture.assumption == "dynamic":
-            return  # the masks do not say what moves then: they mark all that is seen
-        config, scene, views, capacity = self.config, self.scene, self.views, self._capacity()
-        mask_of = lost_pixels(scene, phase, config.render_settings)
-        fraction = lost_fraction(views, mask_of)
-        count = min(capacity, round(fraction * config.model.dynamic_points))
-        if fraction < config.densify.reseed or count <= 0:
-            return
-        generator = self._generator("reseed")
-        found = unproject_pixels(self.capture, views, self.alignments, mask_of, count, generator)
-        if found is not None:
-            added = gaussians_that_show(found, scene, views, config, self.capture.extent)
-            if not len(added) + len(scene.dynamic):
-                added = gaussians_in_box(self.capture, count, config, generator)
-            optim.append(self.step.optimizer, scene.dynamic, added)
-            lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
-            limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
-            logger.log(f"iteration {self.iteration + 1}: {lost}; {len(added):,} added there{limit}")
+    def _adaptation(self, plan: IterationPlan, logger: TrainingLogger) -> Adaptation:
+        """All that density control changes and depends on after the current iteration."""
+        number = self.iteration + 1
+        return Adaptation(
+            scene=self.scene,
+            optimizer=self.step.optimizer,
+            plan=plan,
+            config=self.config,
+            capture=self.capture,
+            views=self.views,
+            alignments=self.alignments,
+            generator=self._generator,
+            log=lambda text: logger.log(f"iteration {number}: {text}"),
+        )
 
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None, logger: TrainingLogger | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
@@ -319,7 +271,7 @@ class Trainer:
 
     def save(self) -> None:
         """Writes a checkpoint of the whole state of training, on rank 0; the others only hand over what they have."""
-        self.step.statistics.merge()
+        self.step.density.merge()
         if not ranks.is_first():
             return
         tensors = {f"scene.{name}": tensor for name, tensor in self.scene.state_dict().items()}
@@ -328,7 +280,7 @@ class Trainer:
         for name, parameter in self.step.parameters().items():
             for part, value in self.step.optimizer.state.get(parameter, {}).items():
                 tensors[f"adam.{part}.{name}"] = value
-        tensors["gradients.total"], tensors["gradients.count"] = self.step.statistics.total, self.step.statistics.count
+        tensors |= {f"gradients.{name}": tensor for name, tensor in self.step.density.state().items()}
         tensors["alignments"] = self.alignments
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
         checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
@@ -375,10 +327,9 @@ class Trainer:
                 self.step.optimizer.state[parameter] = {
                     part: loaded.tensor(f"adam.{part}.{name}", shape).to(self.device) for part, shape in shapes.items()
                 }
-        statistics = self.step.statistics
         if ranks.is_first():
-            statistics.total = loaded.tensor("gradients.total", statistics.total.shape).to(self.device)
-            statistics.count = loaded.tensor("gradients.count", statistics.count.shape).to(self.device)
+            for name, tensor in self.step.density.state().items():
+                tensor.copy_(loaded.tensor(f"gradients.{name}", tensor.shape))
         metadata = loaded.metadata
         self.iteration, self.rollbacks = metadata.iteration, metadata.rollbacks
         self.seconds, self._started = metadata.train_seconds, time.monotonic()

@@ -17,8 +17,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.ops.projection import Geometry, View
 from warpgs.rendering import opacities_on_screen, render
+from warpgs.training.density.opacity_reset import reset_opacities
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.opacity_reset import reset_opacities
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.schedule import Phase
 
@@ -190,8 +190,6 @@ def test_training_resets_opacities_as_its_own_views_show_them(data, tmp_path):
     for settings in (RenderSettings(), trainer.config.render_settings):
         reset[settings.antialias] = copy.deepcopy(trainer.scene)
         reset_opacities(reset[settings.antialias], trainer.step.optimizer, trainer.views.cameras(), phase, settings)
-    trainer._adapt_all_ranks(
-        dataclasses.replace(tiny.plan_to(trainer, "reset"), phase=phase), Mock(spec=TrainingLogger)
-    )
+    trainer._adapt(dataclasses.replace(tiny.plan_to(trainer, "reset"), phase=phase), Mock(spec=TrainingLogger))
     assert torch.equal(logits(trainer.scene), logits(reset[True]))
     assert not torch.equal(logits(trainer.scene), logits(reset[False]))

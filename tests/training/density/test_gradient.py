@@ -1,6 +1,5 @@
-"""Adaptive density control: clone, split, remove, shorten needles."""
+"""Density control by screen-space gradients: clone, split and remove."""
 
-import copy
 import dataclasses
 import math
 from unittest.mock import Mock
@@ -11,49 +10,19 @@ import torch
 from tests import tiny
 from tests.reference.covariance import covariance
 from tests.scenes import error, generator, relative_error
-from warpgs.config import DensifyConfig, ModelConfig
+from tests.training.density.sets import copies, equal, make_gaussians, make_scene, trained
+from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
-from warpgs.model.scene import SplitScene
-from warpgs.training.densify import DensifyLimits, GradientStatistics, densify, shorten_needles
+from warpgs.training.density.gradient import GradientStatistics, Limits, densify
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.optimizer import make_optimizer
 
 EXTENT = 2.0
 CONFIG = DensifyConfig(gradient=0.5, dense_fraction=0.05, min_opacity=0.1, max_size=0.5)
 SMALL, LARGE = 0.09, 0.11  # around EXTENT · dense_fraction = 0.1
 HUGE, OVERSIZED = 0.9, 1.1  # around EXTENT · max_size = 1
 SMALL_GRADIENT, LARGE_GRADIENT = 0.4, 0.6  # around the threshold
-LIMITS = DensifyLimits(EXTENT, capacity=1000, remove_large=False)
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
+LIMITS = Limits(EXTENT, capacity=1000, remove_large=False)
 BRANCHES = ("static", "dynamic")
-
-
-def make_gaussians(sizes, opacities=0.8):
-    """Gaussians of the given sizes, each twice as long as thick."""
-    g, num = generator(), len(sizes)
-    scales = torch.tensor(sizes).reshape(-1, 1) * torch.tensor([[0.5, 1.0, 0.5]])
-    return Gaussians(
-        torch.randn(num, 3, generator=g),
-        torch.randn(num, 4, generator=g),
-        scales.log(),
-        torch.logit(torch.as_tensor(opacities, dtype=torch.float32).expand(num)).clone(),
-        torch.randn(num, 1, 3, generator=g),
-        torch.randn(num, 15, 3, generator=g),
-    )
-
-
-def make_scene(static, dynamic):
-    """A scene, and its optimizer after one step at rate 0 that left every moment at 1 or more."""
-    scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
-    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
-    for parameter in scene.parameters():
-        parameter.grad = torch.full_like(parameter, 100.0)
-    optimizer.step()
-    return scene, optimizer
-
-
-def copies(gaussians):
-    return {name: getattr(gaussians, name).detach().clone() for name in PARAMETERS}
 
 
 def densified(sizes, gradients, opacities=0.8, capacity=1000, remove_large=False, seed=5, extent=EXTENT):
@@ -61,7 +30,7 @@ def densified(sizes, gradients, opacities=0.8, capacity=1000, remove_large=False
     gaussians = make_gaussians(sizes, opacities)
     before = copies(gaussians)
     _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    limits = DensifyLimits(extent, capacity, remove_large)
+    limits = Limits(extent, capacity, remove_large)
     densify(gaussians, optimizer, torch.tensor(gradients), CONFIG, limits, generator(seed))
     return before, copies(gaussians)
 
@@ -69,10 +38,6 @@ def densified(sizes, gradients, opacities=0.8, capacity=1000, remove_large=False
 def rows_in(tensors, num):
     assert {len(t) for t in tensors.values()} == {num}
     return tensors
-
-
-def equal(a, b):
-    return all(torch.equal(a[name], b[name]) for name in PARAMETERS)
 
 
 def chosen(tensors, index):
@@ -236,74 +201,6 @@ def test_mean_gradients_without_any_view_are_zero():
     assert not GradientStatistics(4, torch.device("cpu")).mean().any()
 
 
-def shortened(scales, max_elongation=10.0):
-    """Scales after shortening, in scene units; ``max_size`` is 1 there."""
-    gaussians = make_gaussians([SMALL] * len(scales))
-    gaussians.log_scales.data = torch.tensor(scales).log()
-    before = copies(gaussians)
-    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=max_elongation), EXTENT)
-    changed = [name for name, value in copies(gaussians).items() if not torch.equal(value, before[name])]
-    assert changed in ([], ["log_scales"])
-    return gaussians.scales.detach()
-
-
-def test_needles_are_shortened_to_a_multiple_of_their_second_longest_axis():
-    expected = torch.tensor([[0.2, 2.0, 0.1], [3.0, 0.3, 0.3], [1.5, 0.01, 15.0]])
-    assert relative_error(shortened([[0.2, 50.0, 0.1], [9.0, 0.3, 0.3], [1.5, 0.01, 15.1]]), expected) < 1e-6
-
-
-def test_needles_are_not_shortened_below_the_maximum_size():
-    expected = torch.tensor([[1.0, 0.001, 0.002], [0.9, 0.001, 0.002]])
-    assert relative_error(shortened([[50.0, 0.001, 0.002], [0.9, 0.001, 0.002]]), expected) < 1e-6
-
-
-@pytest.mark.parametrize("max_elongation", [1.0, 0.5])
-def test_flat_gaussians_and_balls_keep_their_shape_at_any_limit(max_elongation):
-    scales = [[30.0, 0.001, 30.0], [5.0, 5.0, 5.0]]
-    assert relative_error(shortened(scales, max_elongation), torch.tensor(scales)) < 1e-6
-
-
-def test_shortening_no_gaussians_gives_none():
-    gaussians = Gaussians.empty(0)
-    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=10.0), EXTENT)
-    assert len(gaussians) == 0
-
-
-def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_alone(data, tmp_path):
-    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5)
-    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
-    needles, extent = make_gaussians([SMALL]), trainer.capture.extent
-    needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
-    trainer._set_scene(SplitScene(needles, copy.deepcopy(needles), NETWORK, torch.zeros(3), torch.ones(3)))
-    trainer._adapt(tiny.plan_to(trainer, "shorten"), Mock(spec=TrainingLogger))
-    assert abs(extent - 1.0) > 0.1
-    assert trainer.scene.static.scales.max().item() == pytest.approx(0.5 * extent, rel=1e-5)
-    assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
-
-
-def trained(data, folder, config):
-    """A scene after a training with a config."""
-    trainer = tiny.trainer(data, folder, config)
-    with tiny.in_haste():
-        tiny.train(trainer)
-    return trainer.scene
-
-
-@pytest.mark.parametrize("static_geometry", [True, False])
-def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, static_geometry):
-    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, max_size=1e-6)
-    schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
-    config = dataclasses.replace(tiny.CONFIG, static_geometry=static_geometry, schedule=schedule)
-    elongations = []
-    for densify_config in (config.densify, limit):
-        folder = tmp_path / str(densify_config.max_elongation)
-        scene = trained(data, folder, dataclasses.replace(config, densify=densify_config))
-        axes = scene.static.scales.detach().sort(1).values
-        elongations.append((axes[:, 2] / axes[:, 1]).max())
-    assert elongations[0] > 1.1
-    assert elongations[1] <= 1.05 * (1 + 1e-5)
-
-
 @pytest.mark.parametrize(("min_pixels", "most"), [(0, 120), (8, 120), (46, 100), (60, 76), (500, 70)])
 def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(data, tmp_path, min_pixels, most):
     """The capture has 6 views of 32×24 pixels; training starts with 70 Gaussians, and the config allows 120."""
@@ -311,3 +208,14 @@ def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(data, tm
     schedule = dataclasses.replace(tiny.SCHEDULE, densify_until=10, prune_every=100, reset_every=100)
     scene = trained(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config, schedule=schedule))
     assert most - 10 < len(scene.static) + len(scene.dynamic) <= most
+
+
+@pytest.mark.parametrize(("done", "removed"), [(tiny.SCHEDULE.reset_every, 0), (tiny.SCHEDULE.reset_every + 1, 1)])
+def test_oversized_gaussians_are_removed_once_opacities_have_been_reset(data, tmp_path, done, removed):
+    trainer = tiny.trainer(data, tmp_path)
+    static = trainer.scene.static
+    num, plan = len(static), dataclasses.replace(tiny.plan_to(trainer, "densify"), done=done)
+    static.log_scales.data[:] = -5.0
+    static.log_scales.data[3] = 5.0
+    trainer._adapt(plan, Mock(spec=TrainingLogger))
+    assert num - len(static) == removed

@@ -13,10 +13,11 @@ from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import DEFAULTS, render
+from warpgs.training.schedule import Phase
+from warpgs.training.views import View, Views
 
-from . import optimizer as optim
-from .schedule import Phase
-from .views import View, Views
+from .adaptation import Adaptation
+from .operations import remove
 
 MAX_ALPHA = 0.99
 """Maximum of α in Eq. 15, so that an opaque Gaussian that is visible in all views keeps a score of 0.01."""
@@ -83,9 +84,16 @@ def prune_invisible(
     unseen = pruned & (scores == 0)  # 1 − α is at least 1 − MAX_ALPHA
     opaque = pruned & ~unseen & is_opaque
     removed = Pruned(*(int(kind.sum()) for kind in (unseen, opaque, pruned & ~unseen & ~opaque)))
-    kept = (~pruned).nonzero()[:, 0]
-    optim.gather(optimizer, scene.static, kept, num_kept=len(kept))
+    remove(scene.static, optimizer, pruned.nonzero()[:, 0])
     return removed
+
+
+def prune(at: Adaptation) -> None:
+    """Prunes the static branch by visibility; says so if any Gaussian is removed."""
+    cameras, degree, threshold = at.views.cameras(), at.plan.phase.sh_degree, at.config.densify.visibility
+    removed = prune_invisible(at.scene, at.optimizer, cameras, degree, threshold, at.config.render_settings)
+    if any(removed):
+        at.log(str(removed))
 
 
 @torch.no_grad()
@@ -115,7 +123,7 @@ def blend_weights(
 
 
 @torch.no_grad()
-def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], fraction: float) -> int:
+def remove_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], fraction: float) -> int:
     """Removes the Gaussians with the smallest weights, which hold at most a fraction of all; returns their number.
 
     If none has any weight, all stay: what no view shows may still be shown later.
@@ -127,11 +135,17 @@ def prune_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N
         fraction: In [0, 1).
     """
     ascending, order = weights.double().sort()
-    kept = torch.ones_like(weights, dtype=torch.bool)
+    is_weak = torch.zeros_like(weights, dtype=torch.bool)
     total = ascending.sum()
-    kept[order[(ascending.cumsum(0) <= fraction * total) & (total > 0)]] = False
+    is_weak[order[(ascending.cumsum(0) <= fraction * total) & (total > 0)]] = True
     branches = (scene.static, scene.dynamic)
-    for gaussians, keeps in zip(branches, kept.split([len(gaussians) for gaussians in branches]), strict=True):
-        indices = keeps.nonzero()[:, 0]
-        optim.gather(optimizer, gaussians, indices, num_kept=len(indices))
-    return int((~kept).sum())
+    for gaussians, weak in zip(branches, is_weak.split([len(gaussians) for gaussians in branches]), strict=True):
+        remove(gaussians, optimizer, weak.nonzero()[:, 0])
+    return int(is_weak.sum())
+
+
+def prune_weakest(at: Adaptation) -> None:
+    """Removes what contributes least to the images of the training views."""
+    weights = blend_weights(at.scene, at.views, at.plan.phase, at.config.render_settings)
+    number = remove_weakest(at.scene, at.optimizer, weights, at.config.densify.weakest)
+    at.log(f"{number:,} Gaussians pruned that contribute least")

@@ -13,10 +13,10 @@ from tests.scenes import error, select
 from warpgs.config import RenderSettings
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training import optimizer as optim
+from warpgs.training.density.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches, reseed
 from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.point_cloud import scene_box
-from warpgs.training.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches
 from warpgs.training.schedule import Phase
 
 PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False)
@@ -118,13 +118,13 @@ def test_appended_gaussians_start_without_moments_and_the_others_keep_theirs(tra
 def test_an_object_whose_gaussians_are_lost_gets_new_ones(trainer, capsys, lost):
     trainer.iteration = 11
     plan = trainer.protocol.at(11)
-    assert plan.reseed
-    assert not trainer.protocol.at(12).reseed
+    assert "reseed" in plan.actions
+    assert "reseed" not in trainer.protocol.at(12).actions
     if lost:
         lose_half(trainer)
     num, mask_of = len(trainer.scene.dynamic), lost_pixels(trainer.scene, PHASE, RenderSettings())
     with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
-        trainer._reseed(plan.phase, logger)
+        reseed(trainer._adaptation(plan, logger))
     added = len(trainer.scene.dynamic) - num
     assert (added > 0) == lost
     assert (f"{added:,} added there" in capsys.readouterr().out) == lost
@@ -137,7 +137,7 @@ def test_an_empty_background_is_not_filled_if_everything_is_assumed_to_be_dynami
     lose_half(trainer)
     num = len(trainer.scene.dynamic)
     with TrainingLogger(trainer.run / "events", trainer.protocol.num_iterations, 11) as logger:
-        trainer._reseed(PHASE, logger)
+        reseed(trainer._adaptation(trainer.protocol.at(11), logger))
     assert len(trainer.scene.dynamic) == num
 
 
@@ -149,7 +149,7 @@ def test_a_run_ends_when_it_has_lost_the_last_static_gaussian(trainer):
     make_transparent(trainer.scene.static)
     message = r"the last static Gaussian was removed.* but 9\d\.\d% of the training pixels are static: warpgs check"
     with pytest.raises(ValueError, match=message):
-        trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+        trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
 
 
 def test_dynamic_gaussians_that_are_all_lost_are_added_again_at_once(data, tmp_path):
@@ -158,7 +158,7 @@ def test_dynamic_gaussians_that_are_all_lost_are_added_again_at_once(data, tmp_p
     make_transparent(trainer.scene.dynamic)
     logger = Mock(spec=TrainingLogger)
     assert trainer.config.densify.reseed == 0.0
-    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), logger)
+    trainer._adapt(tiny.plan_to(trainer, "densify"), logger)
     assert len(trainer.scene.dynamic) > 10
     assert "100% of the dynamic pixels show no dynamic Gaussian" in logger.log.call_args.args[0]
 
@@ -173,7 +173,7 @@ def test_an_empty_branch_is_filled_where_thin_objects_have_nothing_but_borders_o
     trainer._add_dynamic_gaussians()
     assert all((view.static_mask | view.mask_border).all() for view in trainer.views)
     make_transparent(trainer.scene.dynamic)
-    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+    trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
     assert len(trainer.scene.dynamic) > 10
 
 
@@ -181,7 +181,7 @@ def test_an_empty_branch_is_filled_at_random_where_the_deformation_has_no_invers
     make_transparent(trainer.scene.dynamic)
     deform(trainer.scene, 1e4)
     logger = Mock(spec=TrainingLogger)
-    trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), logger)
+    trainer._adapt(tiny.plan_to(trainer, "densify"), logger)
     center, half_size = scene_box(trainer.capture.points)
     assert len(trainer.scene.dynamic) > 100
     assert ((trainer.scene.dynamic.means - center).abs() <= half_size).all()
@@ -195,7 +195,7 @@ def test_a_run_ends_when_lost_dynamic_gaussians_cannot_be_added_again(trainer):
     )
     message = r"the last dynamic Gaussian was removed.* but \d\.\d% of the training pixels are dynamic.*--assume static"
     with pytest.raises(ValueError, match=message):
-        trainer._adapt_all_ranks(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+        trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
 
 
 @pytest.mark.parametrize("is_needed", [False, True])

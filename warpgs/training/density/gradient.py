@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, remove (3DGS, section 5), and shorten needles."""
+"""Density control by screen-space gradients (3DGS, section 5): clone, split and remove."""
 
 import math
 from typing import NamedTuple
@@ -7,15 +7,16 @@ import torch
 from jaxtyping import Float, Int32
 from torch import Tensor
 
+from warpgs.cameras import Camera
 from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import Gaussians
+from warpgs.model.splats import Splats
 from warpgs.ops.adam import Adam
+from warpgs.training import ranks
 
-from . import optimizer as optim
-from . import ranks
-
-SPLIT_SHRINK = 1.6
-"""Factor by which the children of a split are smaller than their parent (3DGS: 0.8 · 2)."""
+from .adaptation import Adaptation
+from .operations import SPLIT_SHRINK, clone, remove, split
+from .strategy import Strategy
 
 
 class GradientStatistics:
@@ -46,19 +47,11 @@ class GradientStatistics:
         self.total += torch.where(visible, norms, 0.0)
         self.count += visible
 
-    @torch.no_grad()
-    def merge(self) -> None:
-        """Moves what all ranks have observed to rank 0; the others are left with zeros."""
-        for tensor in (self.total, self.count):
-            ranks.add_(tensor)
-            if not ranks.is_first():
-                tensor.zero_()
-
     def mean(self) -> Float[Tensor, " N"]:
         return self.total / self.count.clamp_min(1.0)
 
 
-class DensifyLimits(NamedTuple):
+class Limits(NamedTuple):
     """Limits of one densification.
 
     Attributes:
@@ -79,7 +72,7 @@ def densify(
     optimizer: Adam,
     gradients: Float[Tensor, " N"],
     config: DensifyConfig,
-    limits: DensifyLimits,
+    limits: Limits,
     generator: torch.Generator,
 ) -> None:
     """Clones small and splits large Gaussians with large gradients, then removes transparent and oversized ones.
@@ -101,39 +94,47 @@ def densify(
     if int(grows.sum()) > limits.capacity:
         order = torch.where(grows, gradients, -1.0).argsort(descending=True)
         grows[order[max(limits.capacity, 0) :]] = False
-    alive &= sizes <= max_size
-    kept = (alive & ~(grows & is_large)).nonzero()[:, 0]
-    cloned = (grows & ~is_large).nonzero()[:, 0]
-    split = (grows & is_large).nonzero()[:, 0].repeat(2)
-    optim.gather(optimizer, gaussians, torch.cat([kept, cloned, split]), num_kept=len(kept))
-    if len(split):
-        _scatter_children(gaussians, len(kept) + len(cloned), generator)
+    stays = grows | (alive & (sizes <= max_size))
+    remove(gaussians, optimizer, (~stays).nonzero()[:, 0])
+    grows, is_large = grows[stays], is_large[stays]
+    clone(gaussians, optimizer, (grows & ~is_large).nonzero()[:, 0])
+    split(gaussians, optimizer, (grows & is_large).nonzero()[:, 0], generator)
 
 
-def _scatter_children(gaussians: Gaussians, first: int, generator: torch.Generator) -> None:
-    """Samples the positions of the children of splits, from ``first`` on, from their parents' density; shrinks them."""
-    scales = gaussians.scales[first:]
-    noise = torch.randn(scales.shape, dtype=torch.float32, generator=generator).to(scales.device) * scales
-    quats = torch.nn.functional.normalize(gaussians.quats[first:], dim=1)
-    w, axis = quats[:, :1], quats[:, 1:]
-    # Rotation of v by a unit quaternion (w, u): v + 2 u × (u × v + w v).
-    rotated = noise + 2.0 * torch.linalg.cross(axis, torch.linalg.cross(axis, noise) + w * noise)
-    gaussians.means[first:] += rotated
-    gaussians.log_scales[first:] = (scales / SPLIT_SHRINK).log()
+class GradientStrategy(Strategy):
+    """3DGS: Gaussians grow where the mean gradient of their position on screen is large."""
 
+    def begin(self, num: int, device: torch.device) -> None:
+        """Starts with gradients of 0."""
+        self.statistics = GradientStatistics(num, device)
+        self.screen_offsets = self.statistics.screen_offsets
 
-@torch.no_grad()
-def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) -> None:
-    """Shortens the longest axis of large Gaussians to at most ``config.max_elongation`` times the second longest.
+    def observe(self, splats: Splats, camera: Camera, radii: Int32[Tensor, "N 2"]) -> None:
+        """Adds the gradients of one view."""
+        self.statistics.observe(radii)
 
-    Needles at the border of what the training views show are streaks in views of what lies beyond
-    (docs/design/needles.md). Flat Gaussians stay: surfaces need them.
+    def state(self) -> dict[str, Float[Tensor, " N"]]:
+        """Sums of the gradients, and over how many views."""
+        return {"total": self.statistics.total, "count": self.statistics.count}
 
-    Args:
-        gaussians: Changed in place.
-        config: ``max_elongation``, and ``max_size``, up to which a Gaussian may have any shape.
-        extent: Extent of the capture [scene units].
-    """
-    second = gaussians.log_scales.median(1, keepdim=True).values
-    longest = (second + math.log(max(config.max_elongation, 1.0))).clamp_min(math.log(config.max_size * extent))
-    gaussians.log_scales.clamp_(max=longest)
+    def merge(self) -> None:
+        """Adds the sums of all ranks."""
+        for tensor in self.state().values():
+            ranks.add_(tensor)
+            if not ranks.is_first():
+                tensor.zero_()
+
+    def densify(self, at: Adaptation) -> None:
+        """Both branches divide the remaining capacity in proportion to how many Gaussians want to grow.
+
+        Oversized Gaussians are removed once opacities have been reset, as in 3DGS.
+        """
+        config, branches = at.config.densify, (at.scene.static, at.scene.dynamic)
+        means = self.statistics.mean().split([len(gaussians) for gaussians in branches])
+        generator, capacity = at.generator("densify"), at.capacity
+        remove_large = at.plan.done > at.config.schedule.reset_every
+        candidates = [int((gradients > config.gradient).sum()) for gradients in means]
+        for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
+            part = capacity * count // max(1, sum(candidates))
+            limits = Limits(at.capture.extent, part, remove_large)
+            densify(gaussians, at.optimizer, gradients, config, limits, generator)

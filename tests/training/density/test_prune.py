@@ -13,9 +13,9 @@ from tests.scenes import as_gaussians, error, make_camera, make_splats
 from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.training.density.prune import Pruned, blend_weights, prune_invisible, remove_weakest, visibility
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
-from warpgs.training.prune import Pruned, blend_weights, prune_invisible, prune_weakest, visibility
 from warpgs.training.schedule import Phase
 
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
@@ -211,7 +211,7 @@ def test_the_weakest_are_those_that_together_hold_the_fraction():
     weights[[3, 7, 61]] = torch.tensor([1.0, 0.5, 0.0])
     before = scene.static.means.detach().clone(), scene.dynamic.means.detach().clone()
     fraction = 1.6 / weights.sum().item()  # 0 + 0.5 + 1.0 fit, 2.0 more do not
-    assert prune_weakest(scene, optimizer, weights, fraction) == 3
+    assert remove_weakest(scene, optimizer, weights, fraction) == 3
     kept = [index for index in range(60) if index not in (3, 7)]
     assert torch.equal(scene.static.means, before[0][kept])
     assert torch.equal(scene.dynamic.means, before[1][[0, 2, 3]])
@@ -221,20 +221,20 @@ def test_a_fraction_of_zero_removes_what_contributes_nothing():
     scene, optimizer = make_scene_and_optimizer(random_gaussians())
     weights = torch.ones(60)
     weights[5] = 0.0
-    assert prune_weakest(scene, optimizer, weights, 0.0) == 1
+    assert remove_weakest(scene, optimizer, weights, 0.0) == 1
     assert len(scene.static) == 59
 
 
 def test_if_no_gaussian_contributes_all_stay():
     scene, optimizer = make_scene_and_optimizer(random_gaussians())
-    assert prune_weakest(scene, optimizer, torch.zeros(60), 0.02) == 0
+    assert remove_weakest(scene, optimizer, torch.zeros(60), 0.02) == 0
     assert len(scene.static) == 60
 
 
 @pytest.mark.parametrize(("removed", "lines"), [(Pruned(0, 0, 0), 0), (Pruned(1, 0, 0), 1)])
 def test_only_a_pruning_that_removes_something_is_logged(data, tmp_path, monkeypatch, removed, lines):
     trainer = tiny.trainer(data, tmp_path)
-    monkeypatch.setattr("warpgs.training.trainer.prune_invisible", lambda *_: removed)
+    monkeypatch.setattr("warpgs.training.density.prune.prune_invisible", lambda *_: removed)
     logger = Mock(spec=TrainingLogger)
     trainer._adapt(tiny.plan_to(trainer, "prune"), logger)
     assert logger.log.call_count == lines

@@ -11,9 +11,10 @@ from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import opacities_on_screen
+from warpgs.training import optimizer as optim
+from warpgs.training.schedule import Phase
 
-from . import optimizer as optim
-from .schedule import Phase
+from .adaptation import Adaptation
 
 RESET_OPACITY = 0.01
 """Maximum opacity on screen after a reset (3DGS)."""
@@ -46,6 +47,11 @@ def reset_opacities(
     for gaussians, limits in zip(branches, highest.split([len(gaussians) for gaussians in branches]), strict=True):
         gaussians.logit_opacities.clamp_(max=limits)
         optim.reset_moments(optimizer, gaussians.logit_opacities)
+
+
+def reset(at: Adaptation) -> None:
+    """Resets the opacities of both branches."""
+    reset_opacities(at.scene, at.optimizer, at.views.cameras(), at.plan.phase, at.config.render_settings)
 
 
 def _compensations(

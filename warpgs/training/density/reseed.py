@@ -16,11 +16,13 @@ from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
+from warpgs.training import optimizer as optim
+from warpgs.training.dynamic_points import DynamicPoints, max_scale, to_canonical, unproject_pixels
+from warpgs.training.point_cloud import gaussians_at, random_points
+from warpgs.training.schedule import Phase
+from warpgs.training.views import View, Views
 
-from .dynamic_points import DynamicPoints, max_scale, to_canonical
-from .point_cloud import gaussians_at, random_points
-from .schedule import Phase
-from .views import View, Views
+from .adaptation import Adaptation
 
 MAX_LOST_ALPHA = 0.1
 """Alpha of the dynamic image below which a dynamic pixel counts as lost; opacities that were just reset are above it
@@ -28,7 +30,6 @@ where Gaussians overlap."""
 
 MAX_INVERSION_ERROR = 0.01
 """Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
-
 
 MIN_REGION = 1e-3
 """Fraction of the training pixels above which a run does not go on without the Gaussians that show them."""
@@ -114,3 +115,25 @@ def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generato
     """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
     positions = random_points(capture.points, count, generator)
     return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, max_scale(config, capture.extent))
+
+
+def reseed(at: Adaptation) -> None:
+    """Adds dynamic Gaussians where none shows what moves."""
+    if at.capture.assumption == "dynamic":
+        return  # the masks do not say what moves then: they mark all that is seen
+    config, scene, views, capacity = at.config, at.scene, at.views, at.capacity
+    mask_of = lost_pixels(scene, at.plan.phase, config.render_settings)
+    fraction = lost_fraction(views, mask_of)
+    count = min(capacity, round(fraction * config.model.dynamic_points))
+    if fraction < config.densify.reseed or count <= 0:
+        return
+    generator = at.generator("reseed")
+    found = unproject_pixels(at.capture, views, at.alignments, mask_of, count, generator)
+    if found is not None:
+        added = gaussians_that_show(found, scene, views, config, at.capture.extent)
+        if not len(added) + len(scene.dynamic):
+            added = gaussians_in_box(at.capture, count, config, generator)
+        optim.append(at.optimizer, scene.dynamic, added)
+        lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
+        limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
+        at.log(f"{lost}; {len(added):,} added there{limit}")

@@ -1,0 +1,50 @@
+"""The scene that density control changes after an iteration, and everything that this may depend on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.model.scene import SplitScene
+from warpgs.ops.adam import Adam
+from warpgs.training.schedule import IterationPlan
+from warpgs.training.views import Views
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """A change of the scene after an iteration.
+
+    Attributes:
+        scene: Changed in place, together with the moments of the optimizer.
+        optimizer: From ``optimizer.make_optimizer``.
+        plan: Of the iteration.
+        config: Config of the run.
+        capture: Its capture.
+        views: Training views.
+        alignments: [T, 2] scale and offset of each view's inverse depth.
+        generator: The CPU generator of random numbers for a purpose at this iteration.
+        log: Receives lines for the user.
+    """
+
+    scene: SplitScene
+    optimizer: Adam
+    plan: IterationPlan
+    config: TrainConfig
+    capture: Capture
+    views: Views
+    alignments: Float[Tensor, "T 2"]
+    generator: Callable[[str], torch.Generator]
+    log: Callable[[str], None]
+
+    @property
+    def capacity(self) -> int:
+        """Number of Gaussians that may be added to both branches together; negative if there are too many."""
+        config, most = self.config.densify, self.config.densify.max_gaussians
+        if config.min_pixels:
+            most = min(most, self.views.num_pixels // config.min_pixels)
+        return most - len(self.scene.static) - len(self.scene.dynamic)

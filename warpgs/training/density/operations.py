@@ -1,0 +1,86 @@
+"""Changes of a set of Gaussians that strategies share; the optimizer's moments follow them."""
+
+import math
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from warpgs.config import DensifyConfig
+from warpgs.model.gaussians import Gaussians
+from warpgs.ops.adam import Adam
+from warpgs.training import optimizer as optim
+
+from .adaptation import Adaptation
+
+SPLIT_SHRINK = 1.6
+"""Factor by which the children of a split are smaller than their parent (3DGS: 0.8 · 2)."""
+
+
+@torch.no_grad()
+def remove(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -> None:
+    """Removes Gaussians; the others keep their order."""
+    kept = _others(gaussians, indices)
+    optim.gather(optimizer, gaussians, kept, num_kept=len(kept))
+
+
+@torch.no_grad()
+def clone(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -> None:
+    """Appends copies of Gaussians; the moments of the copies start at 0."""
+    num = len(gaussians)
+    parents = torch.cat([torch.arange(num, device=indices.device), indices])
+    optim.gather(optimizer, gaussians, parents, num_kept=num)
+
+
+@torch.no_grad()
+def split(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"], generator: torch.Generator) -> None:
+    """Replaces Gaussians by two children each, at the end, whose moments start at 0.
+
+    Children are smaller by ``SPLIT_SHRINK``. A CPU generator samples their positions from the density of their parents.
+    """
+    if not len(indices):
+        return
+    kept = _others(gaussians, indices)
+    optim.gather(optimizer, gaussians, torch.cat([kept, indices.repeat(2)]), num_kept=len(kept))
+    first = len(kept)
+    scales = gaussians.scales[first:]
+    noise = torch.randn(scales.shape, dtype=torch.float32, generator=generator).to(scales.device) * scales
+    gaussians.means[first:] += rotated(noise, gaussians.quats[first:])
+    gaussians.log_scales[first:] = (scales / SPLIT_SHRINK).log()
+
+
+def _others(gaussians: Gaussians, indices: Int64[Tensor, " K"]) -> Int64[Tensor, " M"]:
+    """The indices of all other Gaussians."""
+    is_other = torch.ones(len(gaussians), dtype=torch.bool, device=indices.device)
+    is_other[indices] = False
+    return is_other.nonzero()[:, 0]
+
+
+def rotated(vectors: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3"]:
+    """Vectors rotated by quaternions (w, x, y, z), which need not be normalized."""
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    w, axis = quats[:, :1], quats[:, 1:]
+    # Rotation of v by a unit quaternion (w, u): v + 2 u × (u × v + w v).
+    return vectors + 2.0 * torch.linalg.cross(axis, torch.linalg.cross(axis, vectors) + w * vectors)
+
+
+@torch.no_grad()
+def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) -> None:
+    """Shortens the longest axis of large Gaussians to at most ``config.max_elongation`` times the second longest.
+
+    Needles at the border of what the training views show are streaks in views of what lies beyond
+    (docs/design/needles.md). Flat Gaussians stay: surfaces need them.
+
+    Args:
+        gaussians: Changed in place.
+        config: ``max_elongation``, and ``max_size``, up to which a Gaussian may have any shape.
+        extent: Extent of the capture [scene units].
+    """
+    second = gaussians.log_scales.median(1, keepdim=True).values
+    longest = (second + math.log(max(config.max_elongation, 1.0))).clamp_min(math.log(config.max_size * extent))
+    gaussians.log_scales.clamp_(max=longest)
+
+
+def shorten(at: Adaptation) -> None:
+    """Shortens the needles of the static branch."""
+    shorten_needles(at.scene.static, at.config.densify, at.capture.extent)

@@ -1,0 +1,87 @@
+"""What a strategy of density control is: it decides where Gaussians are added and removed."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.config import DensifyConfig, RenderSettings
+from warpgs.model.splats import Splats
+from warpgs.training.schedule import Action
+
+from .adaptation import Adaptation
+from .opacity_reset import reset
+from .operations import shorten
+from .prune import prune, prune_weakest
+from .reseed import require_branches, reseed
+
+
+class Strategy:
+    """Density control. Statistics that it gathers are per Gaussian, static ones first.
+
+    Args:
+        config: The options ``--densify.*``.
+
+    Attributes:
+        actions: What it does for each action of a plan; it does nothing for actions that are not there.
+        screen_offsets: [N, 2] zeros to render each view with, if their gradients are needed.
+    """
+
+    screen_offsets: Float[Tensor, "N 2"] | None = None
+
+    def __init__(self, config: DensifyConfig) -> None:
+        self.config = config
+        self.actions: dict[Action, Callable[[Adaptation], None]] = {
+            "densify": self.densify,
+            "prune": prune,
+            "reseed": reseed,
+            "prune_weakest": prune_weakest,
+            "shorten": shorten,
+            "reset": reset,
+        }
+
+    def begin(self, num: int, device: torch.device) -> None:
+        """Starts to observe N Gaussians: at first, and whenever Gaussians were replaced. All is forgotten."""
+
+    def settings(self, settings: RenderSettings) -> RenderSettings:
+        """How a training step is rendered, from how it would be without the strategy."""
+        return settings
+
+    def observe(self, splats: Splats, camera: Camera, radii: Int32[Tensor, "N 2"]) -> None:
+        """Looks at one view after its backward pass; on CUDA captured in a graph with the rest of the step.
+
+        Args:
+            splats: The activated Gaussians at the time of the view.
+            camera: Its camera.
+            radii: [N, 2] ``Rendering.radii``; 0 = culled.
+        """
+
+    def state(self) -> dict[str, Float[Tensor, " N"]]:
+        """What was observed, by name: checkpoints keep it, and resuming fills it. Finite and never negative."""
+        return {}
+
+    def merge(self) -> None:
+        """Moves what all ranks have observed to rank 0; the others are left as after ``begin``."""
+
+    def densify(self, at: Adaptation) -> None:
+        """Changes the numbers of Gaussians; both branches together grow by at most ``at.capacity``."""
+        raise NotImplementedError
+
+    def adapt(self, at: Adaptation) -> None:
+        """Does the actions of a plan, in their order; on rank 0.
+
+        A dynamic branch that has lost its last Gaussian gets new ones at once.
+
+        Raises:
+            ValueError: If a branch that is needed has lost its last Gaussian all the same.
+        """
+        before = len(at.scene.static), len(at.scene.dynamic)
+        for action in at.plan.actions:
+            if action in self.actions:
+                self.actions[action](at)
+        if before[1] > 0 == len(at.scene.dynamic):
+            reseed(at)
+        if lost := require_branches(before, at.scene, at.views):
+            at.log(f"warning: {lost}")
