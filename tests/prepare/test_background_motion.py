@@ -46,8 +46,9 @@ def off(frames: list[np.ndarray]) -> list[np.ndarray]:
     return [cv2.resize(mask.astype(np.uint8), SIZE, interpolation=cv2.INTER_NEAREST) > 0 for mask in found]
 
 
-def test_what_the_camera_follows_is_off_the_background():
-    found = off(followed(6, 5))
+@pytest.mark.parametrize("step", [5, 1])
+def test_what_the_camera_follows_is_off_the_background_however_slowly_it_passes(step):
+    found = off(followed(12, step))
     true = np.zeros(SIZE[::-1], bool)
     true[BOX] = True
     for mask in found:

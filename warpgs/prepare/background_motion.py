@@ -3,9 +3,9 @@
 The camera that follows something keeps it in the image, while the background passes: the features of what is followed
 have the longest tracks, and structure from motion places the cameras relative to it. Epipolar geometry does not tell,
 because one that fits both usually exists. The background, however, is most of the image, and between neighbouring
-frames one homography, that of its dominant plane or of what is far away, explains nearly all of it: its
-outliers are masked in the first pass. Parts of the static foreground are masked as well, which only costs some
-features.
+frames one homography, that of its dominant plane or of what is far away, explains nearly all of it: its outliers are
+masked in the first pass. Where it passes slowly, frames farther apart show them. Parts of the static foreground are
+masked as well, which only costs some features.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,9 @@ from .parallel import map_frames
 SIDE = 128
 """Longest side of the images that are compared [px]."""
 
-OFFSETS = (-2, -1, 1, 2)
-"""Frames that a frame is compared with."""
+STEPS, MIN_OFF = (1, 2, 4, 8), 0.08
+"""Frames one and two steps away, in both directions, are compared; the next longer step as well if less than this
+fraction of the frame is off: what moves slowly has hardly left its place after one frame."""
 
 SPACING = 3
 """Distance of the pixels that the homography is fitted to [px]; evenly, so that area counts and not texture."""
@@ -52,15 +53,29 @@ def off_background(images: Sequence[UInt8[np.ndarray, "H W 3"]], quiet: bool = T
     flows = Flows(images)
 
     def find(frame: int) -> np.ndarray:
-        others = [frame + offset for offset in OFFSETS if 0 <= frame + offset < len(images)]
-        votes = [vote for other in others if (vote := _is_off(flows, frame, other)) is not None]
+        off = np.zeros(flows.x.shape, bool)
+        for step in STEPS:
+            more = off | _off_at(flows, frame, step)
+            if more.mean() >= MAX_FRACTION:
+                break
+            off = more
+            if off.mean() >= MIN_OFF:
+                break
         flows.release(frame)
-        seen = np.sum([~np.isnan(vote) for vote in votes], axis=0)
-        off = 2 * np.nansum(votes, axis=0) > seen if votes else np.zeros(flows.x.shape, bool)
-        off = cv2.dilate(off.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8)) > 0
-        return off if off.mean() < MAX_FRACTION else np.zeros_like(off)
+        return off
 
     return map_frames(find, range(len(images)), "background", quiet)
+
+
+def _off_at(flows: Flows, frame: int, step: int) -> Bool[np.ndarray, "H W"]:
+    """[H, W] true where most of the frames one and two steps away see a pixel off their homographies."""
+    others = [frame + count * step for count in (-2, -1, 1, 2) if 0 <= frame + count * step < len(flows.planes)]
+    votes = [vote for other in others if (vote := _is_off(flows, frame, other)) is not None]
+    seen = np.sum([~np.isnan(vote) for vote in votes], axis=0)
+    against = np.nansum(votes, axis=0)
+    # Where the image moves on by many pixels, flow to a single frame may err.
+    off = (2 * against > seen) & (against >= min(step, 2)) if votes else np.zeros(flows.x.shape, bool)
+    return cv2.dilate(off.astype(np.uint8), np.ones((MARGIN, MARGIN), np.uint8)) > 0
 
 
 def _is_off(flows: Flows, frame: int, other: int) -> Float[np.ndarray, "H W"] | None:
