@@ -36,13 +36,8 @@ def reset_opacities(
         phase: Says whether the deformation is in use.
         settings: How images are rendered.
     """
-    if settings.antialias:
-        highest = torch.logit((RESET_OPACITY / _compensations(scene, cameras, phase, settings)).clamp(max=1.0))
-    else:
-        num = len(scene.static) + len(scene.dynamic)
-        highest = (
-            torch.logit(torch.tensor(RESET_OPACITY, dtype=torch.float32)).to(scene.static.means.device).expand(num)
-        )
+    compensations = _compensations(scene, cameras if settings.antialias else (), phase, settings)
+    highest = torch.logit((RESET_OPACITY / compensations).clamp(max=1.0))
     branches = (scene.static, scene.dynamic)
     for gaussians, limits in zip(branches, highest.split([len(gaussians) for gaussians in branches]), strict=True):
         gaussians.logit_opacities.clamp_(max=limits)
