@@ -7,7 +7,7 @@ import torch
 
 from warpgs.cameras import Camera
 from warpgs.data import capture as capture_module
-from warpgs.data.capture import MIN_EXTENT, Capture, Frame, missing_view
+from warpgs.data.capture import Capture, Frame, missing_view
 
 
 def camera(x: float) -> Camera:
@@ -84,13 +84,50 @@ def test_a_number_or_a_long_name_that_is_no_view_is_shown_as_given():
     assert repr(name) in missing_view(capture, name)
 
 
-def test_the_extent_is_a_tenth_more_than_the_radius_of_the_training_cameras():
-    assert make_capture()[0].extent == pytest.approx(1.1 * 2.0)
-    assert make_capture(train=("f0", "f1"))[0].extent == pytest.approx(1.1 * 1.0)
+def test_the_radius_of_the_path_is_the_distance_of_the_farthest_training_camera_from_their_mean():
+    assert make_capture()[0].path_radius == pytest.approx(2.0)
+    assert make_capture(train=("f0", "f1"))[0].path_radius == pytest.approx(1.0)
+    assert make_capture(xs=(3.0,))[0].path_radius == 0.0
 
 
-def test_a_camera_that_does_not_move_has_the_minimum_extent():
-    assert make_capture(xs=(3.0,))[0].extent == MIN_EXTENT
+def with_points(capture, depth):
+    """The capture with 50 points at a depth of its first camera, on its optical axis."""
+    return dataclasses.replace(capture, points=torch.tensor([0.5, 0.5, 1.0]).expand(50, 3) * depth)
+
+
+@pytest.mark.parametrize(("step", "hardly"), [(0.0, True), (0.009, True), (0.011, False)])
+@pytest.mark.parametrize("unit", [0.1, 30.0])
+def test_the_camera_hardly_moves_if_its_path_is_short_for_how_far_it_looks(step, hardly, unit):
+    capture = make_capture(xs=(-step * unit, 0.0, step * unit))[0]
+    assert with_points(capture, unit).hardly_moves == hardly
+
+
+def test_only_metric_depth_tells_the_median_depth():
+    depth = torch.full((2, 4), 0.2)
+    capture, read = make_capture(depth=depth)
+    assert capture.median_depth == 1.0
+    assert read == []
+    assert dataclasses.replace(capture, metric_depth=True).median_depth == pytest.approx(5.0)
+    assert with_points(dataclasses.replace(capture, metric_depth=True), 3.0).median_depth == pytest.approx(3.0)
+
+
+def test_few_frames_are_read_for_the_median_depth_and_for_none_twice():
+    capture, read = make_capture(xs=tuple(map(float, range(40))), depth=torch.full((2, 4), 0.2))
+    capture = dataclasses.replace(capture, metric_depth=True)
+    assert capture.median_depth == capture.assuming("static").median_depth == pytest.approx(5.0)
+    assert 0 < len(read) == len(set(read)) <= capture_module.MAX_DEPTH_IMAGES
+
+
+def test_other_cameras_and_other_training_frames_have_a_median_depth_of_their_own():
+    capture = with_points(make_capture()[0], 3.0)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 2.0
+    assert capture.median_depth == pytest.approx(3.0)
+    back = {name: dataclasses.replace(camera, viewmat=viewmat) for name, camera in capture.cameras.items()}
+    assert capture.with_cameras(back).median_depth == pytest.approx(5.0)
+    half = capture.with_cameras({"f1": back["f1"]})
+    assert (half.split(["f0"], ["f1"]).median_depth, half.split(["f1"], []).median_depth) == pytest.approx((3.0, 5.0))
+    assert capture.median_depth == pytest.approx(3.0)
 
 
 def test_a_capture_without_training_frames_is_refused():
@@ -130,4 +167,8 @@ def test_an_assumption_shares_the_cache_and_everything_but_the_mask():
     assumed = capture.assuming("dynamic")
     assert assumed.frame("f1").image is capture.frame("f1").image
     assert read == ["f1"]
-    assert (assumed.train, assumed.extent, assumed.points) == (capture.train, capture.extent, capture.points)
+    assert (assumed.train, assumed.median_depth, assumed.points) == (
+        capture.train,
+        capture.median_depth,
+        capture.points,
+    )

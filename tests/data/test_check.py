@@ -206,6 +206,23 @@ def test_points_at_the_cameras_are_a_warning(root):
     assert "not on surfaces" in texts(check_capture(root), "warning")
 
 
+def test_a_camera_that_hardly_moves_for_how_far_it_looks_is_told_what_not_to_trust(root):
+    capture = load_capture(root)
+    center = torch.stack([capture.cameras[name].position for name in capture.train]).mean(0)
+
+    def shrunk(camera, factor):
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (center + factor * (camera.position - center))
+        return replace(camera, viewmat=viewmat)
+
+    share = capture.path_radius / capture.median_depth
+    for factor, told in ((0.009 / share, True), (0.02 / share, False)):
+        closer = capture.with_cameras({name: shrunk(camera, factor) for name, camera in capture.cameras.items()})
+        warnings = [f.text for f in check_points(closer, closer.train) if f.level == "warning"]
+        text = "the camera hardly moves, by 0.9% of the depth at which it sees the scene: images do not determine depth"
+        assert warnings == [f"{text}, so trust no render from another place"] * told
+
+
 def write_depth(root, convert):
     for k, view in enumerate(boards.poses(16)):
         write_array(root / f"depth/1x/shot{k:03d}.npy", convert(boards.depth(view)).astype(np.float32))

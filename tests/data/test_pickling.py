@@ -31,8 +31,8 @@ def test_a_capture_of_any_layout_is_pickled_with_its_frames(tmp_path, layout):
 
 
 def assert_the_same(copy, capture):
-    assert (copy.train, copy.val, copy.extent, copy.assumption) == (
-        capture.train, capture.val, capture.extent, capture.assumption
+    assert (copy.train, copy.val, copy.median_depth, copy.assumption) == (
+        capture.train, capture.val, capture.median_depth, capture.assumption
     )  # fmt: skip
     for name in (capture.train[0], capture.train[-1], *capture.val[:1]):
         a, b = copy.frame(name), capture.frame(name)

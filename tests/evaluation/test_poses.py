@@ -59,9 +59,9 @@ def scene_and_capture(finished_run, poses):
 def test_held_out_cameras_are_aligned_if_poses_were_corrected(finished_run, poses):
     scene, capture = scene_and_capture(finished_run, poses)
     frame = capture.frame(capture.val[0])
-    aligned = alignment(scene, capture.extent)(frame)
+    aligned = alignment(scene, capture.median_depth)(frame)
     assert torch.equal(aligned.viewmat, frame.camera.viewmat) == (poses == 0.0)
-    limit = 2.0 * MAX_CORRECTION * max(1.0, capture.extent)  # this scene is poor: images would lead far away
+    limit = 2.0 * MAX_CORRECTION * max(1.0, capture.median_depth)  # this scene is poor: images would lead far away
     assert (aligned.viewmat - frame.camera.viewmat).abs().max() < limit
     assert aligned.time == frame.camera.time
 
@@ -72,6 +72,6 @@ def test_pixels_that_are_not_covisible_do_not_align_a_camera(finished_run):
     seen = torch.zeros(frame.image.shape[:2], dtype=torch.bool)
     seen[:12] = True
     changed = torch.where(seen[..., None], frame.image, 255 - frame.image)
-    align = alignment(scene, capture.extent)
+    align = alignment(scene, capture.median_depth)
     cameras = [align(dataclasses.replace(frame, image=image, covisible=seen)) for image in (frame.image, changed)]
     assert torch.equal(cameras[0].viewmat, cameras[1].viewmat)

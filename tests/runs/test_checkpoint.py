@@ -211,7 +211,7 @@ def test_missing_metadata_is_named_with_the_file(path, missing):
 
 WRONG = {"moving": ["yes"], "relit": [1], "sh_degree": [0.5, []], "iteration": [-1, True, 10**400]}
 WRONG |= {"train_seconds": ["1", None], "rollbacks": [-1], "views": [[1]]}
-WRONG |= {"times": [["0"], [1.5], [True], [math.nan]]}
+WRONG |= {"times": [["0"], [1.5], [True], [math.nan]], "unit": [0, -1.0, math.nan, math.inf, True, "1"]}
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in WRONG.items() for value in values])

@@ -372,7 +372,6 @@ def test_training_cameras_are_where_training_moved_them_and_the_others_stay(data
         assert not torch.equal(corrected.cameras[name].viewmat, capture.cameras[name].viewmat)
     for name in capture.val:
         assert torch.equal(corrected.cameras[name].viewmat, capture.cameras[name].viewmat)
-    assert corrected.extent == capture.extent
     first = capture.train[0]
     assert torch.equal(run.open_capture(quiet=True).frame(first).camera.viewmat, capture.cameras[first].viewmat)
 
@@ -392,5 +391,15 @@ def test_frames_that_were_not_trained_on_keep_their_cameras(data, tmp_path, capt
     first, second = capture.train[:2]
     assert torch.equal(corrected.cameras[first].viewmat, capture.cameras[first].viewmat)
     expected = trainer.views.cameras()[1].viewmat
-    # The unit of translations is the extent of the frames that are still there.
-    assert error(corrected.cameras[second].viewmat, expected) < 0.1 * error(capture.cameras[second].viewmat, expected)
+    assert torch.equal(corrected.cameras[second].viewmat, expected)
+
+
+def test_corrections_of_version_0_3_are_fractions_of_the_radius_of_the_path(data, tmp_path, capture):
+    run, trainer = run_with_poses(data, tmp_path / "run")
+    tiny.edit_metadata(run.newest_checkpoint(), lambda fields: fields.pop("unit"))
+    radius = 1.1 * capture.path_radius
+    assert abs(radius - trainer.unit) > 0.1
+    trainer.views.poses.unit = radius
+    corrected = run.open_corrected_capture(quiet=True)
+    for name, expected in zip(capture.train, trainer.views.cameras(), strict=True):
+        assert error(corrected.cameras[name].viewmat, expected.viewmat) < 1e-6

@@ -60,12 +60,10 @@ def trained(num_steps=3, rate=0.01, **sizes):
 WARM = dict.fromkeys(NETWORKS, 1.0)
 
 
-def rates_at(
-    progress, network_progress, extent=1.0, config=RATES, warmup_factors=WARM, means_progress=None, settle=0.0
-):
+def rates_at(progress, network_progress, unit=1.0, config=RATES, warmup_factors=WARM, means_progress=None, settle=0.0):
     means_progress = dict.fromkeys(BRANCHES, progress) if means_progress is None else means_progress
     at = RatePlan(progress, settle, means_progress, network_progress, warmup_factors)
-    return learning_rates(config, extent, at)
+    return learning_rates(config, unit, at)
 
 
 def test_every_parameter_of_a_scene_is_in_the_group_of_its_name():
@@ -214,16 +212,16 @@ def test_each_rate_of_the_config_reaches_its_group():
 
 
 @pytest.mark.parametrize(("progress", "factor"), [(0.0, 1.0), (0.5, 0.1), (1.0, 0.01)])
-def test_the_rate_of_positions_decays_to_a_hundredth_in_units_of_the_extent(progress, factor):
-    rates = rates_at(progress, START, extent=3.0)
+def test_the_rate_of_positions_decays_to_a_hundredth_in_a_unit(progress, factor):
+    rates = rates_at(progress, START, unit=3.0)
     for branch in ("static", "dynamic"):
         assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * factor)
 
 
-@pytest.mark.parametrize("extent", [0.3, 7.0])
-def test_the_rate_of_positions_can_have_a_scale_of_its_own_whatever_the_scene(extent):
+@pytest.mark.parametrize("unit", [0.3, 7.0])
+def test_the_rate_of_positions_can_have_a_scale_of_its_own_whatever_the_scene(unit):
     config = OptimConfig(means=1.6e-4, means_scale=5.0)
-    start, end = (rates_at(k, START, extent, config)["dynamic.means"] for k in (0.0, 1.0))
+    start, end = (rates_at(k, START, unit, config)["dynamic.means"] for k in (0.0, 1.0))
     assert start == pytest.approx(8e-4)
     assert end == pytest.approx(8e-6)
 
@@ -243,8 +241,8 @@ def test_gaussians_settle_at_a_tenth_of_their_rates():
         assert rates == pytest.approx(expected)
 
 
-def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_extent():
-    now, later = rates_at(0.0, START), rates_at(0.9, END, extent=5.0)
+def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_unit():
+    now, later = rates_at(0.0, START), rates_at(0.9, END, unit=5.0)
     changed = {name for name in GROUPS if now[name] != later[name]}
     assert changed == {"static.means", "dynamic.means", *NETWORKS}
 

@@ -4,7 +4,7 @@ import copy
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import torch
@@ -14,18 +14,17 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.errors import suggestion
 
+from .median_depth import median_depth
 from .read_ahead import ReadAhead
+from .sampling import evenly_spaced
 from .time_source import AS_GIVEN, TimeSource
 
-MIN_EXTENT = 0.05
-"""Minimum extent, so that learning rates are positive even if the camera hardly moves [scene units]."""
+MIN_PATH = 0.01
+"""Radius of the training cameras' positions, relative to the median depth, below which depth cannot be learned: a tenth
+more depth moves a point by about a thousandth of the focal length then, which is less than a pixel."""
 
-
-def extent_of(cameras: Sequence[Camera]) -> float:
-    """The extent of a capture with these training cameras; see ``Capture``."""
-    positions = torch.stack([camera.position for camera in cameras])
-    return max(MIN_EXTENT, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
-
+MAX_DEPTH_IMAGES = 8
+"""Maximum number of depth images that tell the median depth."""
 
 MAX_CACHE_BYTES = 1 << 30
 """Maximum memory of a capture's cache of frames."""
@@ -148,8 +147,6 @@ class Capture:
         notes: Remarks of the loader on files that it skipped or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
-        extent: Largest distance of a training camera from their mean position, times 1.1, at least ``MIN_EXTENT``: the
-            unit of 3DGS's position learning rate and densification thresholds [scene units].
 
     Raises:
         ValueError: If there are no training frames.
@@ -174,13 +171,11 @@ class Capture:
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)
-    extent: float = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError(f"{self.name} has no frames to train on")
         self.train, self.val, self.notes = tuple(self.train), tuple(self.val), tuple(self.notes)
-        self.extent = extent_of([self.cameras[name] for name in self.train])
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()
         self._make_cache()
@@ -207,6 +202,39 @@ class Capture:
     def __repr__(self) -> str:
         frames = f"{len(self.train)} frames to train on, {len(self.val)} to evaluate on"
         return f"<Capture {self.name}: {frames}, {len(self.points)} points>"
+
+    @cached_property
+    def median_depth(self) -> float:
+        """Median depth at which the training cameras see the scene [scene units]: the unit of learning rates.
+
+        From the points, else from depth images in scene units, else from where the cameras look; see ``median_depth``.
+
+        Raises:
+            ValueError: If a depth image that is needed is missing or damaged.
+        """
+        cameras = [self.cameras[name] for name in self.train]
+        return median_depth(cameras, self.points, self._inverse_depths() if self.metric_depth else ())
+
+    def _inverse_depths(self) -> Iterator[Tensor]:
+        for name in evenly_spaced(self.train, MAX_DEPTH_IMAGES):
+            if (image := self.frame(name).inverse_depth) is not None:
+                yield image
+
+    @property
+    def path_radius(self) -> float:
+        """Largest distance of a training camera from their mean position [scene units]."""
+        positions = torch.stack([self.cameras[name].position for name in self.train])
+        return float((positions - positions.mean(0)).norm(dim=1).max())
+
+    @property
+    def extent(self) -> float:
+        """1.1 times ``path_radius``, at least 0.05: the unit of 3DGS's densification thresholds [scene units]."""
+        return max(0.05, 1.1 * self.path_radius)
+
+    @property
+    def hardly_moves(self) -> bool:
+        """Whether the training camera moves too little, for how far it looks, to show depth."""
+        return self.path_radius < MIN_PATH * self.median_depth
 
     @property
     def uses_estimated_masks(self) -> bool:
@@ -237,12 +265,14 @@ class Capture:
         """The same capture with other cameras of the frames named; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.cameras, capture._moved = self.cameras | dict(cameras), self._moved | set(cameras)
+        vars(capture).pop("median_depth", None)
         return capture
 
     def split(self, train: Sequence[str], val: Sequence[str]) -> "Capture":
         """The same capture with other frames to train and to evaluate on; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.train, capture.val = tuple(train), tuple(val)
+        vars(capture).pop("median_depth", None)
         return capture
 
     def frame(self, name: str) -> Frame:

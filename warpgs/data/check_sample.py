@@ -74,6 +74,7 @@ class Sample:
 
     def _read(self, name: str) -> Frame:
         if name not in self._frames:
+            self._wanted.add(name)
             self.look(name)
         return self._frames[name]
 

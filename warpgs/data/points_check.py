@@ -7,7 +7,7 @@ import torch
 
 from warpgs.cameras import Camera
 
-from .capture import MIN_EXTENT, Capture, Frame
+from .capture import Capture, Frame
 from .findings import Finding
 
 MIN_VISIBLE_FRACTION = 0.2
@@ -17,7 +17,7 @@ MIN_POINT_CONTRAST = 0.8
 """Contrast at the points over the contrast of the image: 2 to 4 for points of COLMAP, about 1 for a depth sensor's."""
 
 MIN_POINT_DISTANCE = 0.01
-"""Points closer to a camera than this fraction of the capture's extent are not on surfaces."""
+"""Points closer to a camera than this fraction of the median depth are not on surfaces."""
 
 MAX_FRACTION_AT_CAMERAS = 0.01
 """Maximum fraction of such points."""
@@ -26,8 +26,13 @@ MAX_FRACTION_AT_CAMERAS = 0.01
 def check_points(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
     """Compares cameras, points and images with each other."""
     cameras = [capture.cameras[name] for name in capture.train]
-    if capture.extent <= MIN_EXTENT:
-        yield Finding("warning", "cameras", "the camera hardly moves: depth cannot be learned from it")
+    if capture.hardly_moves:
+        share = capture.path_radius / capture.median_depth
+        text = (
+            f"the camera hardly moves, by {share:.1%} of the depth at which it sees the scene: images do not determine "
+            "depth, so trust no render from another place"
+        )
+        yield Finding("warning", "cameras", text)
     if len(capture.points) == 0:
         remedy = "; warpgs prepare CAPTURE --add points adds some (after warpgs import, if the layout needs it)"
         text = f"there are no sparse points: Gaussians are randomly initialized{'' if capture.is_builtin else remedy}"
@@ -56,7 +61,7 @@ def _points_at_cameras(capture: Capture, cameras: list[Camera]) -> Iterator[Find
     positions = torch.stack([camera.position for camera in cameras[:: max(1, len(cameras) // 200)]])
     points = capture.points[:: max(1, len(capture.points) // 20_000)]
     nearest = torch.cat([torch.cdist(part, positions).amin(1) for part in points.split(2000)])
-    fraction = float((nearest < MIN_POINT_DISTANCE * capture.extent).float().mean())
+    fraction = float((nearest < MIN_POINT_DISTANCE * capture.median_depth).float().mean())
     if fraction > MAX_FRACTION_AT_CAMERAS:
         text = f"{fraction:.1%} of the points lie at camera positions, not on surfaces"
         yield Finding("warning", "points", text)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from .capture import MIN_EXTENT, Capture, Frame
+from .capture import Capture, Frame
 from .findings import Finding
 from .turning import MIN_MATCHES, Matches, Turning, find_turning
 
@@ -37,7 +37,7 @@ def check_turning(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
             "positions are undetermined; move the camera sideways"
         )
         # Cameras that all stand at one place say so themselves, as those of warpgs prepare --camera turning do.
-        yield Finding("error" if capture.extent > MIN_EXTENT else "warning", "cameras", text)
+        yield Finding("warning" if capture.hardly_moves else "error", "cameras", text)
     else:
         text = (
             f"a rotation explains {searched} of the matches between frames with the best focal length, {known} with "

@@ -64,7 +64,7 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
-    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.extent)
+    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth)
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}

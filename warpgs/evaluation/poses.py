@@ -22,7 +22,7 @@ MAX_CORRECTION = 0.05
 """Maximum of each component of a correction [rad, and fractions of the unit]: a poor scene must not lead far away."""
 
 DIFFERENCE = 0.15
-"""Step of the derivatives of an image by the pose [px at the image's centre, for rotations]."""
+"""Step of the derivatives of an image by the pose [px at the image's centre, for translations at the median depth]."""
 
 ROBUST_ERROR = 0.03
 """Error of a channel, in [0, 1], beyond which the loss grows linearly: what moves may be at another place."""
@@ -43,7 +43,7 @@ def alignment(scene: TrainedScene, unit: float) -> Align:
 
     Args:
         scene: The scene.
-        unit: Length of a unit of translation: the extent of the capture [scene units].
+        unit: Length of a unit of translation: the median depth of the capture [scene units].
     """
 
     def align(frame: Frame) -> Camera:

@@ -14,10 +14,11 @@ class PoseCorrections(nn.Module):
 
     Args:
         num: T.
-        unit: Length of a translation of 1 [scene units], such as the extent of the capture, so that rotations and
-            translations move the image by about as much.
+        unit: Length of a translation of 1 [scene units]: the depth at which the cameras see the scene, so that
+            rotations and translations of one size move the image by about as much.
 
     Attributes:
+        unit: As given.
         rotations: [T, 3] axes times angles [rad], for small angles: a rotation r has the quaternion (1, r / 2),
             normalized.
         translations: [T, 3] in ``unit``.
@@ -29,7 +30,7 @@ class PoseCorrections(nn.Module):
         super().__init__()
         self.rotations = nn.Parameter(torch.zeros(num, 3, dtype=torch.float32))
         self.translations = nn.Parameter(torch.zeros(num, 3, dtype=torch.float32))
-        self._unit = unit
+        self.unit = unit
         axes = torch.zeros(3, 3, 3, dtype=torch.float32)
         axes[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
         self.register_buffer("_cross", axes - axes.mT, persistent=False)
@@ -40,7 +41,7 @@ class PoseCorrections(nn.Module):
         With u = r / 2 and U v = u × v, the quaternion (1, u) / |(1, u)| rotates by I + 2 / (1 + |u|²) (U + U²).
         """
         half = 0.5 * self.rotations.index_select(0, index)[0]
-        translation = self._unit * self.translations.index_select(0, index)
+        translation = self.unit * self.translations.index_select(0, index)
         cross = (half[:, None, None] * self._cross).sum(0)
         rotation = 2.0 / (1.0 + half.square().sum()) * (cross + cross @ cross)
         motion = torch.cat([rotation, translation.T], 1)

@@ -73,7 +73,7 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
     """
     run = Run.open(evaluated.folder, device)
     capture, scene = run.open_capture(quiet), run.trained_scene()
-    align = alignment(scene, capture.extent)
+    align = alignment(scene, capture.median_depth)
     strips = {}
     for name in progress(names, f"rendering {evaluated.label}", quiet):
         if name not in capture.cameras:

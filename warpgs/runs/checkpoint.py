@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from warpgs.cameras import Camera
 from warpgs.config import ModelConfig
 from warpgs.config.bounds import MAX_VALUE
 from warpgs.files import atomic_path, require_file
@@ -57,6 +58,8 @@ class Metadata:
         rollbacks: Returns to a checkpoint after a loss that was not finite.
         views: Ids of the training frames.
         times: Their times in [0, 1]; none in checkpoints of version 0.2 and earlier.
+        unit: Of learning rates of positions and of corrections of poses [scene units]; None in checkpoints of version
+            0.3 and earlier. See ``unit_of``.
     """
 
     iteration: int
@@ -68,6 +71,7 @@ class Metadata:
     rollbacks: int = 0
     views: tuple[str, ...] = ()
     times: tuple[float, ...] = ()
+    unit: float | None = None
 
 
 FILE_KEYS = {"use_deformation": "moving", "use_appearance": "relit"}
@@ -186,7 +190,7 @@ def _parse_metadata(path: Path, text: str) -> Metadata:
     if not isinstance(values, dict) or not all(isinstance(values.get(key, []), list) for key in LISTS):
         raise DamagedCheckpointError(path, "expected an object of plain values")
     parsed: dict[str, Any] = {}
-    values = {"times": [], **values}
+    values = {"times": [], "unit": None, **values}
     for field in fields(Metadata):
         key = FILE_KEYS.get(field.name, field.name)
         if key not in values:
@@ -205,9 +209,11 @@ def _is_valid(name: str, value: Any) -> bool:
         return all(type(time) in (int, float) and 0 <= time <= 1 for time in value)
     if name in ("use_deformation", "use_appearance"):
         return isinstance(value, bool)
-    if name == "peak_bytes" and value is None:
+    if name in ("peak_bytes", "unit") and value is None:
         return True
-    is_number = isinstance(value, int) or (name == "train_seconds" and isinstance(value, float))
+    if name == "unit" and value == 0:
+        return False
+    is_number = isinstance(value, int) or (name in ("train_seconds", "unit") and isinstance(value, float))
     return is_number and not isinstance(value, bool) and 0 <= value <= MAX_VALUE
 
 
@@ -262,12 +268,24 @@ def restore_newest(run: Path, restore: Callable[[Path], None], log: Callable[[st
     return None
 
 
+def unit_of(checkpoint: Checkpoint, cameras: Sequence[Camera]) -> float:
+    """Unit of learning rates of positions and of corrections of poses [scene units].
+
+    Checkpoints of version 0.3 and earlier do not have it. It was the radius of the positions of the training cameras,
+    times 1.1, at least 0.05; with another unit, corrections would mean other poses.
+    """
+    if checkpoint.metadata.unit is not None:
+        return checkpoint.metadata.unit
+    positions = torch.stack([camera.position for camera in cameras])
+    return max(0.05, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+
+
 def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:
     """The corrections of the training cameras, on the CPU.
 
     Args:
         checkpoint: Of a run that corrected poses.
-        unit: Of ``PoseCorrections``: the extent of the capture [scene units].
+        unit: Of ``PoseCorrections``; from ``unit_of`` [scene units].
 
     Raises:
         DamagedCheckpointError: If they are missing, or not one for each training view.

@@ -13,7 +13,7 @@ import torch
 
 from warpgs.config import TrainConfig
 from warpgs.data.builtin import is_builtin
-from warpgs.data.capture import Capture, extent_of
+from warpgs.data.capture import Capture
 from warpgs.errors import command, similar_path
 from warpgs.files import partial_path
 from warpgs.locks import LOCK, lock_folder
@@ -150,7 +150,7 @@ class Run:
         cameras = {name: capture.cameras[name] for name in loaded.metadata.views if name in capture.cameras}
         if not cameras:
             return capture
-        poses = checkpoint.load_poses(loaded, extent_of(list(cameras.values())))
+        poses = checkpoint.load_poses(loaded, checkpoint.unit_of(loaded, list(cameras.values())))
         indices = {name: torch.tensor([k]) for k, name in enumerate(loaded.metadata.views)}
         with torch.no_grad():
             return capture.with_cameras({name: poses.moved(camera, indices[name]) for name, camera in cameras.items()})

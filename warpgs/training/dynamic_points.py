@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
-from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import MIN_KNOWN_FRACTION
@@ -35,8 +34,8 @@ MAX_POINTS_PER_IMAGE = 2_000
 PIXELS_PER_CHUNK = 8_192
 """Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
 
-MAX_SCALE_FRACTION = 0.5
-"""Maximum scale of initial Gaussians of unknown depth, relative to the size at which densification removes them."""
+MAX_SCALE = 0.038
+"""Maximum standard deviation of initial dynamic Gaussians of unknown depth, as a fraction of the median depth."""
 
 
 NEWTON_STEPS, MAX_STEP = 12, 1.5
@@ -117,11 +116,6 @@ def to_canonical(
         if not start.is_cuda and bool(reached.all()):
             break
     return found, reached[:, 0]
-
-
-def max_scale(config: TrainConfig, extent: float) -> float:
-    """Maximum standard deviation of initial dynamic Gaussians of unknown depth, by the capture's extent."""
-    return MAX_SCALE_FRACTION * config.densify.max_size * extent
 
 
 @torch.no_grad()

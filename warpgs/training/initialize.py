@@ -18,7 +18,7 @@ from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import DEFAULTS, render
 
 from .density.reseed import gaussians_in_box
-from .dynamic_points import is_depth_known, max_scale, unproject_pixels
+from .dynamic_points import MAX_SCALE, is_depth_known, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, pixel_size, random_points, scene_box, subsample
@@ -112,7 +112,7 @@ def dynamic_gaussians(
     config = protocol.config
     max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if isinstance(deformation, SplineDeformation):
-        return start_from_tracks(find_tracks(capture), deformation, config, capture.extent, generator)
+        return start_from_tracks(find_tracks(capture), deformation, config, capture.median_depth, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return _gaussians_at_points(config, capture, generator)
     count = max(max_count, MAX_POINTS) if protocol.fits_motion else max_count
@@ -121,7 +121,7 @@ def dynamic_gaussians(
         return Gaussians.empty(0, degree)
     if protocol.fits_motion and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
-        fitted = fit_motion(deformation, found, times, capture.extent, config, generator, is_stopped)
+        fitted = fit_motion(deformation, found, times, capture.median_depth, config, generator, is_stopped)
         if fitted is None:
             return None
         found = fitted
@@ -129,7 +129,7 @@ def dynamic_gaussians(
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
         return gaussians_in_box(capture, max_count, config, generator)
-    largest = math.inf if found.depth_known else max_scale(config, capture.extent)
+    largest = math.inf if found.depth_known else MAX_SCALE * capture.median_depth
     return gaussians_at(found.positions, found.colors, config.model, largest)
 
 

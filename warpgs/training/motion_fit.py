@@ -28,8 +28,8 @@ MAX_POINTS, MAX_POINTS_PER_VIEW = 40_000, 2_000
 WINDOW = 0.015
 """Largest difference in time, of all in [0, 1], between frames that together give the canonical points."""
 
-POSITION_UNIT, COLOR_UNIT = 0.05, 0.15
-"""Differences of positions, as a fraction of the extent, and of colours in [0, 1] that count as 1."""
+POSITION_UNIT, COLOR_UNIT = 0.038, 0.15
+"""Differences of positions, as a fraction of the median depth, and of colours in [0, 1] that count as 1."""
 
 MAX_SQUARED_DISTANCE = 9.0
 """Limit that squared distances approach (Geman and McClure): frames see sides that others do not."""
@@ -49,15 +49,15 @@ MAX_STRETCH = 1.5
 """Maximum distance of a point from the nearest canonical one, relative to that at the time when it was seen: they are
 the same where an object turns as a whole."""
 
-MAX_ERROR = 0.03
-"""Maximum distance of a deformed point from where it was seen, as a fraction of the extent."""
+MAX_ERROR = 0.023
+"""Maximum distance of a deformed point from where it was seen, as a fraction of the median depth."""
 
 
 def fit_motion(
     deformation: nn.Module,
     found: DynamicPoints,
     times: Float[Tensor, " T"],
-    extent: float,
+    median_depth: float,
     config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
@@ -71,7 +71,7 @@ def fit_motion(
         deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
-        extent: Extent of the capture [scene units].
+        median_depth: Median depth of the capture [scene units].
         config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
             says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
@@ -86,7 +86,7 @@ def fit_motion(
     device = next((parameter.device for parameter in fitted.parameters()), None)
     if device is None:
         return found
-    points = _PointsByView(found, times, extent, device, generator)
+    points = _PointsByView(found, times, median_depth, device, generator)
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
@@ -137,8 +137,8 @@ class _PointsByView:
     """Dynamic points as features: positions and colours in the units in which they are compared.
 
     Attributes:
-        extent: Extent of the capture [scene units].
         unit: Difference of positions that counts as 1 [scene units].
+        max_error: Maximum distance of a deformed point from where it was seen [scene units].
         views: The V views with points, by their distance in time from the canonical points.
         gaps: [V] these distances.
         times: [V, 1] times.
@@ -152,11 +152,11 @@ class _PointsByView:
         self,
         found: DynamicPoints,
         times: Float[Tensor, " T"],
-        extent: float,
+        median_depth: float,
         device: torch.device,
         generator: torch.Generator,
     ) -> None:
-        self.extent, self.unit = extent, POSITION_UNIT * extent
+        self.unit, self.max_error = POSITION_UNIT * median_depth, MAX_ERROR * median_depth
         features = self._features(found)
         views, counts = found.views.unique(return_counts=True)
         start = _start_time(times[views], counts)
@@ -229,7 +229,7 @@ class _PointsByView:
         self, deformation: nn.Module, time: Float[Tensor, "1"], seen: Float[Tensor, "P 6"]
     ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
         """Canonical positions [scene units] of points seen at a time, and which of them to keep; see ``canonical``."""
-        deformed, max_error = self.deformed(deformation, time), MAX_ERROR * self.extent
+        deformed, max_error = self.deformed(deformation, time), self.max_error
         distances, nearest = torch.cdist(seen, deformed).min(1)
         is_shown = distances.square() <= MAX_SQUARED_DISTANCE
         goal, home = seen[:, :3] * self.unit, self.home[nearest, :3] * self.unit

@@ -91,15 +91,15 @@ class RatePlan:
     warmup_factors: dict[str, float]
 
 
-def learning_rates(config: OptimConfig, extent: float, at: RatePlan) -> dict[str, float]:
+def learning_rates(config: OptimConfig, unit: float, at: RatePlan) -> dict[str, float]:
     """Learning rate of each group of ``GROUPS``, for a step over as many views as there are ranks.
 
     Args:
         config: Rates of one view per step.
-        extent: Extent of the capture [scene units], see ``OptimConfig.means_scale``.
+        unit: Factor of the rate of positions if ``OptimConfig.means_scale`` is None [scene units].
         at: Of the iteration.
     """
-    scale = extent if config.means_scale is None else config.means_scale
+    scale = unit if config.means_scale is None else config.means_scale
     gaussians = {
         "quats": config.quats,
         "log_scales": config.scales,

@@ -77,7 +77,7 @@ class Step:
         views: Training views.
         alignments: [T, 2] scale and offset of each view's inverse depth; may be changed in place.
         depth_trust: [T] how much the depth of each view is trusted.
-        extent: Extent of the capture [scene units].
+        unit: See ``optimizer.learning_rates`` [scene units].
 
     Attributes:
         scene: What is trained.
@@ -92,9 +92,9 @@ class Step:
         views: Views,
         alignments: Float[Tensor, "T 2"],
         depth_trust: DepthTrust,
-        extent: float,
+        unit: float,
     ) -> None:
-        self.config, self.scene, self.views, self.extent = config, scene, views, extent
+        self.config, self.scene, self.views, self.unit = config, scene, views, unit
         device = views.device
         self.alignments, self._depth_trust = alignments, depth_trust
         sums = (*TERMS, "psnr", STEPS)
@@ -133,7 +133,7 @@ class Step:
             background=background,
             dynamic_background=background if self.views.background == "white" else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, STEPS: 1.0},
-            learning_rates=optim.learning_rates(self.config.optim, self.extent, plan),
+            learning_rates=optim.learning_rates(self.config.optim, self.unit, plan),
         )
         self.views.select(sample.view)
         if self._graphs is None:

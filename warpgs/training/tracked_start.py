@@ -12,11 +12,11 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.spline_deformation import SplineDeformation
 
 from . import ranks
-from .dynamic_points import max_scale
+from .dynamic_points import MAX_SCALE
 from .point_cloud import front_of_ball, gaussians_at, subsample
 from .tracks import Track
 
-MAX_RATE, MAX_FINAL_RATE, MAX_POSITION_RATE = 3e-4, 1e-5, 8e-4
+MAX_RATE, MAX_FINAL_RATE, MAX_POSITION_RATE = 3e-4, 1e-5, 1e-3
 """Maximum initial and final learning rates of paths and networks, and initial one of Gaussians' positions; what higher
 ones cost is in docs/design/tracks.md."""
 
@@ -39,7 +39,11 @@ def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
 
 @torch.no_grad()
 def start_from_tracks(
-    tracks: list[Track], deformation: SplineDeformation, config: TrainConfig, extent: float, generator: torch.Generator
+    tracks: list[Track],
+    deformation: SplineDeformation,
+    config: TrainConfig,
+    median_depth: float,
+    generator: torch.Generator,
 ) -> Gaussians:
     """Dynamic Gaussians on objects that were tracked, and the paths along which these move.
 
@@ -49,7 +53,7 @@ def start_from_tracks(
         tracks: At least one.
         deformation: Its homes and paths are replaced.
         config: Number of Gaussians, degree of spherical harmonics and limits of size.
-        extent: Extent of the capture [scene units].
+        median_depth: Median depth of the capture [scene units].
         generator: CPU generator that chooses the pixels.
     """
     start = _time_apart(tracks)
@@ -59,7 +63,7 @@ def start_from_tracks(
     positions = torch.cat([points for points, _ in parts]) + starts[label]
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
-    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, max_scale(config, extent))
+    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * median_depth)
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
     deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))

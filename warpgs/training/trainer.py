@@ -56,6 +56,8 @@ class Trainer:
         capture: The capture, with the masks and background that the config implies.
         scene: What is trained.
         iteration: Iterations done.
+        unit: Of learning rates of positions and of corrections of poses [scene units]: the capture's median depth, or
+            the one with which the run was begun.
         gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
@@ -76,9 +78,8 @@ class Trainer:
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3).float()
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
-        poses = None
-        if config.optim.poses:
-            poses = PoseCorrections(len(self.capture.train), self.capture.extent).to(self.device)
+        self.unit = self.capture.median_depth
+        poses = PoseCorrections(len(self.capture.train), self.unit).to(self.device) if config.optim.poses else None
         self.views = Views(
             self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph
         )
@@ -110,7 +111,7 @@ class Trainer:
     def _set_scene(self, scene: SplitScene) -> None:
         """Replaces the scene, with a new optimizer."""
         self.scene = scene.to(self.device)
-        self.step = Step(self.config, self.scene, self.views, self.alignments, self.depth_trust, self.capture.extent)
+        self.step = Step(self.config, self.scene, self.views, self.alignments, self.depth_trust, self.unit)
 
     # The algorithm ----------------------------------------------------------------------------------------------------
 
@@ -298,6 +299,7 @@ class Trainer:
             rollbacks=self.rollbacks,
             views=tuple(self.capture.train),
             times=tuple(self.capture.cameras[name].time for name in self.capture.train),
+            unit=self.unit,
         )
 
     def _peak_bytes(self) -> int | None:
@@ -318,8 +320,9 @@ class Trainer:
             raise ValueError(f"{path} was trained on other frames than {self.capture.name} has now")
         require_same_times(self.capture, loaded.metadata)
         self.alignments = loaded.tensor("alignments", self.alignments.shape).to(self.device)
+        self.unit = checkpoint.unit_of(loaded, [self.capture.cameras[name] for name in self.capture.train])
         if self.views.poses is not None:
-            self.views.poses.load_state_dict(checkpoint.load_poses(loaded, self.capture.extent).state_dict())
+            self.views.poses = checkpoint.load_poses(loaded, self.unit).to(self.device)
         self._set_scene(checkpoint.load_scene(loaded, self.config.model))
         for name, parameter in self.step.parameters().items():
             if f"adam.step.{name}" in loaded.tensors:

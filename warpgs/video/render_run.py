@@ -33,8 +33,9 @@ PATHS_OF_OPTION = {
 
 MAX_SUPERSAMPLING = 8
 
-REACH = 0.3
-"""Radius of the spiral, relative to the radius of the training camera's path."""
+REACH, MIN_REACH = 0.33, 0.015
+"""Radius of the spiral, relative to the radius of the training camera's path, because nothing shows the scene from
+farther away; and its minimum relative to the median depth, for a camera that stood still."""
 
 
 def render_run(options: Render) -> str:
@@ -120,7 +121,8 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         return _numbered(camera_paths.at_times(camera, camera_paths.evenly_spaced(frames)))
     times = camera_paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
     distance = camera_paths.focus(camera, dynamic, means)
-    return _numbered(camera_paths.spiral(camera, distance, REACH * capture.extent, times))
+    reach = max(REACH * capture.path_radius, MIN_REACH * capture.median_depth)
+    return _numbered(camera_paths.spiral(camera, distance, reach, times))
 
 
 def _time(options: Render) -> float:

@@ -13,15 +13,16 @@ from .renderer import RenderRequest
 from .training_cameras import TrainingCameras
 
 MAX_DISTANCE = 1e-3
-"""Distance from a training camera, relative to the extent of the capture, up to which its image can be shown."""
+"""Distance from a training camera, relative to the median depth of the capture, up to which its image can be
+shown: there, parallax is at most a thousandth of the focal length."""
 
 BORDER = 2
 """Width of the border between truth and render [px]."""
 
 
-def is_beside(camera: Camera, other: Camera, extent: float) -> bool:
+def is_beside(camera: Camera, other: Camera, median_depth: float) -> bool:
     """Whether two cameras are at the same place, so that the image of one can be turned into that of the other."""
-    return float((camera.position - other.position).norm()) <= MAX_DISTANCE * extent
+    return float((camera.position - other.position).norm()) <= MAX_DISTANCE * median_depth
 
 
 def turned(

@@ -336,7 +336,7 @@ class Session:
             return None
         index = self._selected(training)
         camera = camera_of(request.pose, request.size, request.time)
-        return index if comparison.is_beside(camera, training.camera(index), training.capture.extent) else None
+        return index if comparison.is_beside(camera, training.camera(index), training.capture.median_depth) else None
 
     def _render(self, request: RenderRequest, scale: float) -> None:
         """Renders an image and sends it to the browser."""

@@ -21,8 +21,9 @@ THUMBNAIL_WIDTH = 320
 MAX_FRUSTUMS = 48
 """Maximum number of cameras to show in the scene; the slider has all."""
 
-FRUSTUM_SCALE = 0.08
-"""Size of a camera in the scene, relative to the capture's extent."""
+FRUSTUM_SCALE, MIN_FRUSTUM_SCALE = 0.088, 0.004
+"""Size of a camera in the scene, relative to the radius of the cameras' path, along which they would hide each other if
+their size were relative to the scene's; and its minimum relative to the median depth, for cameras that stand still."""
 
 
 class TrainingCamera(NamedTuple):
@@ -73,7 +74,7 @@ class TrainingCameras:
     @property
     def frustum_scale(self) -> float:
         """Size of the cameras in the scene [scene units]."""
-        return FRUSTUM_SCALE * self.capture.extent
+        return max(FRUSTUM_SCALE * self.capture.path_radius, MIN_FRUSTUM_SCALE * self.capture.median_depth)
 
     def target(self, index: int) -> np.ndarray:
         """The point straight ahead of a view, at the median depth of the points of the capture that it sees."""
