@@ -97,7 +97,8 @@ def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
 
     Before there was ``background``, it was always black. Before there was ``loss.depth_gate``, runs without depth-aware
     pretraining had no depth loss at all. A preset that is gone is none: the file has all of its values.
-    ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed nothing that is still to be done.
+    ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed nothing that is still to be done,
+    but for ``densify.depth_gradients``: terms of depth count from now on where densification did not look at them.
     """
     values = {"background": "black", **values}
     if values.get("preset") in REMOVED_PRESETS:
