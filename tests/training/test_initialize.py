@@ -18,7 +18,6 @@ from warpgs.training.point_cloud import (
     color_points,
     distinct,
     gaussians_at,
-    pixel_size,
     scene_box,
     subsample,
     unproject,
@@ -153,14 +152,6 @@ def test_sizes_without_bounds_have_no_resolution():
     model = UNBOUNDED.model
     plain, resolved = (gaussians_at(points, torch.rand(40, 3), model, resolution=r).scales for r in (0.0, 1.0))
     assert torch.equal(plain, resolved)
-
-
-def test_cameras_resolve_a_pixel_at_the_median_depth_of_what_they_see():
-    depths = torch.tensor([2.0, 3.0, 7.0])
-    points = torch.cat([points_at([9, 12, 14], [9, 20, 30], depth) for depth in depths])
-    behind = CAMERA.position - (points[:2] - CAMERA.position)
-    assert pixel_size(torch.cat([points, behind]), [CAMERA]) == pytest.approx(3.0 / 45.0, rel=1e-4)
-    assert pixel_size(behind, [CAMERA]) == 0.0
 
 
 def test_static_gaussians_of_a_cloud_of_several_scans_are_visible():

@@ -1,7 +1,7 @@
 """The state that training starts from: initial Gaussians of both branches, and the alignment of monocular depth."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from warpgs.config import LossConfig, RenderSettings, TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
@@ -21,18 +22,18 @@ from .density.reseed import gaussians_in_box
 from .dynamic_points import MAX_SCALE, is_depth_known, unproject_pixels
 from .losses import DepthTrust
 from .motion_fit import MAX_POINTS, fit_motion
-from .point_cloud import color_points, gaussians_at, pixel_size, random_points, scene_box, subsample
+from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .schedule import Protocol
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
 from .views import Views
 
-MAX_SPREAD_VIEWS = 12
-"""Maximum number of training views that tell the colours of points without colours, and the size of a pixel."""
+MAX_COLOR_VIEWS = 12
+"""Maximum number of training views that tell the colours of points without colours."""
 
 RESOLUTION = 0.25
-"""Distance of points, in pixels at their median depth, below which clouds of several scans or models show one place. A
-Gaussian as small as the error between the scans would be culled and pruned."""
+"""Distance of points, in pixels at the capture's median depth, below which clouds of several scans or models show one
+place. A Gaussian as small as the error between the scans would be culled and pruned."""
 
 MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
 """Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
@@ -57,13 +58,9 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
 def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
     """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
     points, colors = _colored_points(config, capture, generator)
-    resolution = RESOLUTION * pixel_size(points, (capture.cameras[name] for name in _spread_views(capture)))
+    focal = torch.stack([capture.cameras[name].K[0, 0] for name in capture.train]).median()
+    resolution = RESOLUTION * capture.median_depth / float(focal)
     return gaussians_at(points, colors, config.model, resolution=resolution)
-
-
-def _spread_views(capture: Capture) -> Sequence[str]:
-    """At most ``MAX_SPREAD_VIEWS`` training views, evenly spaced."""
-    return capture.train[:: -(-len(capture.train) // MAX_SPREAD_VIEWS)]
 
 
 def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -78,7 +75,7 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     if colors is not None:
         return points, colors[chosen].float() / 255.0
     views = []
-    for name in _spread_views(capture):
+    for name in evenly_spaced(capture.train, MAX_COLOR_VIEWS):
         frame = capture.frame(name)
         mask = frame.static_mask
         if mask is None or capture.assumption == "dynamic":

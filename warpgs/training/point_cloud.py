@@ -1,7 +1,6 @@
 """Gaussians from point clouds, and point clouds from depth."""
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -90,16 +89,6 @@ def distinct(points: Float[Tensor, "N 3"], resolution: float = 0.0) -> tuple[Int
     first = np.delete(first, np.unique(pairs.max(1)))
     place = cKDTree(values[first]).query(values, workers=-1)[1] if len(first) < len(values) else first
     return torch.from_numpy(first), torch.from_numpy(place)
-
-
-def pixel_size(points: Float[Tensor, "P 3"], cameras: Iterable[Camera]) -> float:
-    """Median size of a pixel at the points that cameras see [scene units]; 0 if they see none."""
-    sizes = []
-    for camera in cameras:
-        _, _, depth, inside = camera.project(points)
-        sizes.append(depth[inside] / camera.K[0, 0])
-    seen = torch.cat(sizes)
-    return float(seen.median()) if len(seen) else 0.0
 
 
 def scene_box(points: Float[Tensor, "P 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
