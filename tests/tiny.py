@@ -53,7 +53,7 @@ CONFIG = TrainConfig(
     device="cpu",
     model=MODEL,
     loss=LossConfig(ssim=0.0),
-    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, max_size=1.0, weakest=0.01),
+    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, weakest=0.01),
     schedule=SCHEDULE,
     checkpoint_every=7,
     keep_checkpoints=100,

@@ -321,6 +321,17 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
     assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
 
 
+def test_sizes_of_a_run_of_version_0_3_stay_fractions_of_the_extent(run):
+    def reduce(values):
+        values["densify"] |= {"dense_fraction": 0.02, "max_size": 0.3}
+        for name in ("unit", "split_size"):
+            del values["densify"][name]
+
+    edit(run, reduce)
+    densify = read_config(run).densify
+    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.02, 0.3)
+
+
 def test_a_misspelt_capture_of_a_run_is_told_the_similar_one(run, tmp_path):
     meant = tmp_path / "elsewhere"
     meant.mkdir()

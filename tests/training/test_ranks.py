@@ -74,6 +74,9 @@ def test_a_step_averages_gradients_and_adds_statistics_over_the_ranks(data, tmp_
     for name in ("gradients.total", "gradients.count"):
         assert alone[0][name].any()
         torch.testing.assert_close(together[name], alone[0][name] + alone[1][name])
+    nearest = torch.maximum(*(state["gradients.resolution"] for state in alone))
+    torch.testing.assert_close(together["gradients.resolution"], nearest)
+    assert all((nearest != state["gradients.resolution"]).any() for state in alone)
     beta = optimizer.BETAS[0]
     moments = [name for name in together if name.startswith("adam.exp_avg.") and together[name].any()]
     assert len(moments) > 4

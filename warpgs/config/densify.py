@@ -1,7 +1,7 @@
 """The options ``--densify.*``."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from .bounds import Bounds
 
@@ -16,13 +16,17 @@ class DensifyConfig:
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
-    dense_fraction: float = 0.01
-    """Size above which a Gaussian is split instead of cloned, as a fraction of the extent."""
+    unit: Literal["pixel", "extent"] = "pixel"
+    """Unit of ``split_size`` and ``max_size``, which are standard deviations: a pixel of the nearest training view that
+    has shown the Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as
+    in 3DGS (paper). Gaussians that no view has shown have any size in pixels."""
+    split_size: float = 2.0
+    """Size above which a Gaussian is split instead of cloned."""
     min_opacity: float = 0.005
     """Opacity below which a Gaussian is removed."""
-    max_size: Annotated[float, Bounds(positive=True)] = 0.1
-    """Size above which a Gaussian is removed once opacities have been reset, and above which ``max_elongation`` holds,
-    as a fraction of the extent."""
+    max_size: Annotated[float, Bounds(positive=True)] = 20.0
+    """Size above which a Gaussian is removed once opacities have been reset, and above which ``max_elongation``
+    holds."""
     max_elongation: float = 0.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
     their second longest, or to ``max_size`` if that is longer. 0: never."""

@@ -28,6 +28,7 @@ PAPER = TrainConfig(
     ),
     loss=LossConfig(dynamic_background="black", depth=1.0, depth_dynamic=0.0, depth_end=0.01, depth_gate=False),
     optim=OptimConfig(means_scale=5.0, means_anneal="trained"),
+    densify=DensifyConfig(unit="extent", split_size=0.01, max_size=0.1),
     schedule=Schedule(densify_from=600, densify_until=14_900, appearance_from=None, warmup=0),
 )
 """The paper, and the code that it builds upon where it says nothing; docs/method.md explains every value."""

@@ -168,6 +168,8 @@ def load(path: Path) -> Checkpoint:
     if "sha256" in header and header["sha256"] != _hash(tensors, header.get("facts", "")):
         raise DamagedCheckpointError(path, "its content has another SHA-256 than what was written")
     _check_state(path, tensors)
+    if "gradients.total" in tensors:  # of version 0.3 and earlier: as if no view had shown any Gaussian
+        tensors.setdefault("gradients.resolution", torch.zeros_like(tensors["gradients.total"]))
     return Checkpoint(path, tensors, _parse_metadata(path, header.get("facts", "")))
 
 

@@ -24,13 +24,13 @@ REMOVED = {
     "schedule": ("half_size_until", "mask_trial"),
 }
 
-RENAMED = {"relight_from": "appearance_from"}
+RENAMED = {"relight_from": "appearance_from", "dense_fraction": "split_size"}
 """Fields that earlier versions wrote under another name."""
 
 ALWAYS = {
     "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
     "static_geometry vdp",
-    "densify": "dense_fraction every gradient max_gaussians max_size min_opacity visibility",
+    "densify": "every gradient max_gaussians max_size min_opacity split_size visibility",
     "loss": "depth depth_dynamic depth_end dynamic dynamic_background joint ssim static",
     "masks": "dilate erode holes",
     "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
@@ -95,12 +95,15 @@ def _require_complete(values: dict[str, Any], path: Path) -> None:
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
     """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
 
-    Before there was ``background``, it was always black. Before there was ``loss.depth_gate``, runs without depth-aware
-    pretraining had no depth loss at all. A preset that is gone is none: the file has all of its values.
-    ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed nothing that is still to be done,
-    but for ``densify.depth_gradients``: terms of depth count from now on where densification did not look at them.
+    Before there was ``background``, it was always black; before ``densify.unit``, it was the extent. Before there was
+    ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that is gone is none:
+    the file has all of its values. ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed
+    nothing that is still to be done, but for ``densify.depth_gradients``: terms of depth count from now on where
+    densification did not look at them.
     """
     values = {"background": "black", **values}
+    if isinstance(densify := values.get("densify"), dict):
+        values = {**values, "densify": {"unit": "extent", **densify}}
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
     for part, names in REMOVED.items():

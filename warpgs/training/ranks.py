@@ -145,6 +145,13 @@ def add_(tensor: Tensor) -> None:
             dist.all_reduce(tensor)
 
 
+def maximum_(tensor: Tensor) -> None:
+    """Replaces a tensor on every rank by its maximum over the ranks."""
+    if num_ranks() > 1 and tensor.numel():
+        with _reaching_all(tensor):
+            dist.all_reduce(tensor, dist.ReduceOp.MAX)
+
+
 def copy_first_(tensor: Tensor) -> None:
     """Replaces a tensor, which has one shape everywhere, by that of rank 0."""
     if num_ranks() > 1 and tensor.numel():

@@ -12,9 +12,10 @@ NOISE = 0.1
 
 StageName = Literal["pretrain", "stage1", "stage2"]
 
-Action = Literal["realign", "densify", "prune", "reseed", "prune_weakest", "shorten", "reset"]
-"""Done after an iteration: align depth again, densify, prune by visibility, start new dynamic Gaussians where none
-shows what moves, prune what contributes least, shorten needles, reset opacities."""
+Action = Literal["realign", "shorten", "densify", "prune", "reseed", "prune_weakest", "reset"]
+"""Done after an iteration, in this order: align depth again, shorten needles, densify, prune by visibility, start new
+dynamic Gaussians where none shows what moves, prune what contributes least, reset opacities. Needles come before
+Gaussians are replaced, because their limit depends on what was observed of each."""
 
 REPLACING = frozenset[Action](("densify", "prune", "reseed", "prune_weakest"))
 """Actions that add or remove Gaussians."""
@@ -196,11 +197,11 @@ class Protocol:
         is_reset = done % schedule.reset_every == 0 and done < schedule.densify_until
         is_due: dict[Action, bool] = {
             "realign": stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
+            "shorten": densify.max_elongation > 0.0 and (is_end_of_interval or is_last),
             "densify": is_growing and is_end_of_interval,
             "prune": self.config.vdp and prunes,
             "reseed": densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
             "prune_weakest": densify.weakest > 0.0 and prunes and is_grown,
-            "shorten": densify.max_elongation > 0.0 and (is_end_of_interval or is_last),
             "reset": is_growing and is_reset,
         }
         return tuple(action for action, due in is_due.items() if due)

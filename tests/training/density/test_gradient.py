@@ -16,22 +16,29 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training.density.gradient import GradientStatistics, Limits, densify
 from warpgs.training.logger import TrainingLogger
 
-EXTENT = 2.0
-CONFIG = DensifyConfig(gradient=0.5, dense_fraction=0.05, min_opacity=0.1, max_size=0.5)
-SMALL, LARGE = 0.09, 0.11  # around EXTENT · dense_fraction = 0.1
-HUGE, OVERSIZED = 0.9, 1.1  # around EXTENT · max_size = 1
+UNIT = 2.0
+CONFIG = DensifyConfig(gradient=0.5, split_size=0.05, min_opacity=0.1, max_size=0.5)
+SMALL, LARGE = 0.09, 0.11  # around UNIT · split_size = 0.1
+HUGE, OVERSIZED = 0.9, 1.1  # around UNIT · max_size = 1
 SMALL_GRADIENT, LARGE_GRADIENT = 0.4, 0.6  # around the threshold
-LIMITS = Limits(EXTENT, capacity=1000, remove_large=False)
+
+
+def limits(num, capacity=1000):
+    """Limits of a densification of ``num`` Gaussians that removes none of them as too large."""
+    return Limits(torch.full((num,), UNIT), capacity, remove_large=False)
+
+
 BRANCHES = ("static", "dynamic")
 
 
-def densified(sizes, gradients, opacities=0.8, capacity=1000, remove_large=False, seed=5, extent=EXTENT):
+def densified(sizes, gradients, opacities=0.8, capacity=1000, remove_large=False, seed=5, unit=UNIT):
     """Gaussians before and after one densification, as dicts of tensors."""
     gaussians = make_gaussians(sizes, opacities)
     before = copies(gaussians)
     _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    limits = Limits(extent, capacity, remove_large)
-    densify(gaussians, optimizer, torch.tensor(gradients), CONFIG, limits, generator(seed))
+    units = torch.as_tensor(unit).expand(len(sizes))
+    given = Limits(units, capacity, remove_large)
+    densify(gaussians, optimizer, torch.tensor(gradients), CONFIG, given, generator(seed))
     return before, copies(gaussians)
 
 
@@ -77,7 +84,7 @@ def test_a_large_gaussian_with_a_large_gradient_is_split_in_two():
     assert not (after["means"] == before["means"][1]).all(1).any()
 
 
-LIMIT = EXTENT * CONFIG.max_size
+LIMIT = UNIT * CONFIG.max_size
 # Factors of the maximum size, and whether a Gaussian of it that does not grow, and the children of one that does, stay.
 NEAR_LIMITS = {0.99: (True, True), 1.01: (False, True), 1.59: (False, True), 1.61: (False, False)}
 
@@ -119,8 +126,7 @@ def test_children_of_a_split_are_distributed_as_their_parent():
     gaussians.gather(torch.zeros(num, dtype=torch.int64))
     parent = copies(gaussians)
     _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-    gradients, limits = torch.full((num,), LARGE_GRADIENT), LIMITS._replace(capacity=num)
-    densify(gaussians, optimizer, gradients, CONFIG, limits, generator())
+    densify(gaussians, optimizer, torch.full((num,), LARGE_GRADIENT), CONFIG, limits(num, num), generator())
     offsets = (gaussians.means.detach() - parent["means"][:1]).double()
     expected = covariance(parent["quats"][:1].double(), parent["log_scales"][:1].double().exp())[0]
     assert offsets.shape == (2 * num, 3)
@@ -134,7 +140,7 @@ def test_the_length_of_the_quaternion_does_not_matter_to_children():
         gaussians = make_gaussians([LARGE])
         gaussians.quats.data *= length
         _, optimizer = make_scene(gaussians, Gaussians.empty(0))
-        densify(gaussians, optimizer, torch.tensor([LARGE_GRADIENT]), CONFIG, LIMITS, generator())
+        densify(gaussians, optimizer, torch.tensor([LARGE_GRADIENT]), CONFIG, limits(1), generator())
         means.append(gaussians.means.detach())
     assert error(means[0], means[1]) < 1e-6
 
@@ -145,10 +151,16 @@ def test_children_depend_on_the_generator_only():
     assert not torch.equal(first["means"], other["means"])
 
 
-@pytest.mark.parametrize(("extent", "cloned"), [(EXTENT, True), (EXTENT / 2, False)])
-def test_the_size_threshold_is_relative_to_the_extent(extent, cloned):
-    before, after = densified([SMALL], [LARGE_GRADIENT], extent=extent)
+@pytest.mark.parametrize(("unit", "cloned"), [(UNIT, True), (UNIT / 2, False), (math.inf, True)])
+def test_the_size_to_split_at_is_in_units(unit, cloned):
+    before, after = densified([SMALL], [LARGE_GRADIENT], unit=unit)
     assert torch.equal(rows_in(after, 2)["log_scales"], before["log_scales"].repeat(2, 1)) == cloned
+
+
+def test_every_gaussian_has_a_unit_of_its_own():
+    units = torch.tensor([UNIT, 2 * UNIT, math.inf, UNIT / 2])
+    before, after = densified([OVERSIZED, OVERSIZED, 9.0, HUGE], [SMALL_GRADIENT] * 4, remove_large=True, unit=units)
+    assert equal(chosen(before, [1, 2]), after)
 
 
 def test_a_split_takes_the_capacity_of_one_gaussian():
@@ -161,7 +173,7 @@ def test_densifying_one_branch_leaves_the_other_unchanged(branch):
     scene, optimizer = make_scene(make_gaussians([SMALL, LARGE]), make_gaussians([LARGE, SMALL, SMALL]))
     ours, other = getattr(scene, branch), getattr(scene, *(set(BRANCHES) - {branch}))
     before, num = copies(other), len(ours)
-    densify(ours, optimizer, torch.full((num,), LARGE_GRADIENT), CONFIG, LIMITS, generator())
+    densify(ours, optimizer, torch.full((num,), LARGE_GRADIENT), CONFIG, limits(num), generator())
     assert len(ours) == 2 * num
     assert equal(before, copies(other))
 
@@ -171,7 +183,7 @@ def test_moments_of_clones_and_children_start_at_zero(branch):
     scene, optimizer = make_scene(*(make_gaussians([SMALL, LARGE, SMALL]) for _ in BRANCHES))
     gaussians = getattr(scene, branch)
     gradients = torch.tensor([SMALL_GRADIENT, LARGE_GRADIENT, LARGE_GRADIENT])
-    densify(gaussians, optimizer, gradients, CONFIG, LIMITS, generator())
+    densify(gaussians, optimizer, gradients, CONFIG, limits(3), generator())
     for name in PARAMETERS:
         state = optimizer.state[getattr(gaussians, name)]
         for moments in (state["exp_avg"], state["exp_avg_sq"]):
@@ -215,7 +227,25 @@ def test_oversized_gaussians_are_removed_once_opacities_have_been_reset(data, tm
     trainer = tiny.trainer(data, tmp_path)
     static = trainer.scene.static
     num, plan = len(static), dataclasses.replace(tiny.plan_to(trainer, "densify"), done=done)
+    trainer.step.density.resolution[:] = 1.0
     static.log_scales.data[:] = -5.0
     static.log_scales.data[3] = 5.0
     trainer._adapt(plan, Mock(spec=TrainingLogger))
     assert num - len(static) == removed
+
+
+@pytest.mark.parametrize(("pixels", "is_split"), [(1.9, False), (2.1, True)])
+def test_gaussians_are_split_above_a_number_of_pixels_of_the_nearest_view(data, tmp_path, pixels, is_split):
+    trainer = tiny.trainer(data, tmp_path)
+    for _ in range(3):
+        plan = trainer.protocol.at(trainer.iteration)
+        trainer.step(plan, trainer._sample(plan))
+        trainer.iteration += 1
+    density, static = trainer.step.density, trainer.scene.static
+    seen = density.resolution[: len(static)].argmax()
+    density.statistics.total.zero_()[seen] = 1.0
+    static.log_scales.data[seen] = math.log(pixels / density.resolution[seen])
+    num, before = len(static), static.means[seen].clone()
+    trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+    assert len(static) == num + 1
+    assert (static.means == before).all(1).sum() == (0 if is_split else 2)

@@ -11,14 +11,12 @@ from tests import tiny
 from tests.reference.covariance import rotation
 from tests.scenes import error, generator, relative_error
 from tests.training.density.sets import NETWORK, copies, equal, make_gaussians, make_scene, trained
-from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.density.operations import clone, remove, rotated, shorten_needles, split
 from warpgs.training.logger import TrainingLogger
 
-EXTENT, SIZE = 2.0, 0.1
-CONFIG = DensifyConfig(max_size=0.5)
+SIZE = 0.1
 
 
 def changed(change, num=5):
@@ -76,11 +74,11 @@ def test_a_quaternion_of_any_length_rotates_as_its_matrix_does():
 
 
 def shortened(scales, max_elongation=10.0):
-    """Scales after shortening, in scene units; ``max_size`` is 1 there."""
+    """Scales after shortening, in scene units; up to a size of 1, any shape is allowed."""
     gaussians = make_gaussians([SIZE] * len(scales))
     gaussians.log_scales.data = torch.tensor(scales).log()
     before = copies(gaussians)
-    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=max_elongation), EXTENT)
+    shorten_needles(gaussians, max_elongation, torch.ones(len(gaussians)))
     changed = [name for name, value in copies(gaussians).items() if not torch.equal(value, before[name])]
     assert changed in ([], ["log_scales"])
     return gaussians.scales.detach()
@@ -91,7 +89,7 @@ def test_needles_are_shortened_to_a_multiple_of_their_second_longest_axis():
     assert relative_error(shortened([[0.2, 50.0, 0.1], [9.0, 0.3, 0.3], [1.5, 0.01, 15.1]]), expected) < 1e-6
 
 
-def test_needles_are_not_shortened_below_the_maximum_size():
+def test_needles_are_not_shortened_below_the_size_of_any_shape():
     expected = torch.tensor([[1.0, 0.001, 0.002], [0.9, 0.001, 0.002]])
     assert relative_error(shortened([[50.0, 0.001, 0.002], [0.9, 0.001, 0.002]]), expected) < 1e-6
 
@@ -104,19 +102,29 @@ def test_flat_gaussians_and_balls_keep_their_shape_at_any_limit(max_elongation):
 
 def test_shortening_no_gaussians_gives_none():
     gaussians = Gaussians.empty(0)
-    shorten_needles(gaussians, dataclasses.replace(CONFIG, max_elongation=10.0), EXTENT)
+    shorten_needles(gaussians, 10.0, torch.ones(0))
     assert len(gaussians) == 0
 
 
-def test_needles_are_shortened_in_units_of_the_extent_and_of_static_gaussians_alone(data, tmp_path):
-    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5)
+def test_the_size_of_any_shape_is_that_of_each_gaussian():
+    gaussians = make_gaussians([SIZE] * 3)
+    gaussians.log_scales.data = torch.tensor([[9.0, 0.1, 0.1]]).log().repeat(3, 1)
+    shorten_needles(gaussians, 10.0, torch.tensor([0.5, 2.0, torch.inf]))
+    assert relative_error(gaussians.scales[:, 0].detach(), torch.tensor([1.0, 2.0, 9.0])) < 1e-6
+
+
+@pytest.mark.parametrize("unit", ["extent", "pixel"])
+def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, tmp_path, unit):
+    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5, unit=unit)
     trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
     needles, extent = make_gaussians([SIZE]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
     trainer._set_scene(SplitScene(needles, copy.deepcopy(needles), NETWORK, torch.zeros(3), torch.ones(3)))
+    trainer.step.density.resolution[:] = 4.0
     trainer._adapt(tiny.plan_to(trainer, "shorten"), Mock(spec=TrainingLogger))
     assert abs(extent - 1.0) > 0.1
-    assert trainer.scene.static.scales.max().item() == pytest.approx(0.5 * extent, rel=1e-5)
+    expected = {"extent": 0.5 * extent, "pixel": 0.5 / 4.0}[unit]
+    assert trainer.scene.static.scales.max().item() == pytest.approx(expected, rel=1e-5)
     assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
 
 

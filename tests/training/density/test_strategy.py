@@ -8,7 +8,11 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.scenes import relative_error
+from warpgs.cameras import Camera
 from warpgs.config import DensifyConfig, RenderSettings
+from warpgs.model.splats import Splats
+from warpgs.runs import checkpoint
 from warpgs.training.density import DENSITY, make_strategy
 from warpgs.training.density.strategy import Strategy
 from warpgs.training.logger import TrainingLogger
@@ -25,17 +29,19 @@ class Recorder(Strategy):
         self.actions = {name: lambda at, name=name: self.calls.append(name) for name in self.actions}
 
     def begin(self, num, device):
+        super().begin(num, device)
         self.views = torch.zeros(num, device=device)
 
     def settings(self, settings):
         return dataclasses.replace(settings, max_alpha=0.5)
 
     def observe(self, splats, camera, radii):
+        super().observe(splats, camera, radii)
         assert splats.means.shape[0] == radii.shape[0] == len(self.views)
         self.views += radii[:, 0] > 0
 
     def state(self):
-        return {"views": self.views}
+        return super().state() | {"views": self.views}
 
     def densify(self, at):
         raise AssertionError
@@ -98,3 +104,89 @@ def test_the_state_of_a_strategy_is_resumed(trainer, data):
     resumed.restore_newest(print)
     assert torch.equal(resumed.step.density.views, trainer.step.density.views)
     assert resumed.step.density.views.any()
+
+
+FOCAL = 50.0
+
+
+def camera_at(z, focal=FOCAL):
+    """A camera at a place of the z axis, on which it looks."""
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = -z
+    return Camera(viewmat, torch.tensor([[focal, 0.0, 8.0], [0.0, focal, 6.0], [0.0, 0.0, 1.0]]), 16, 12)
+
+
+def observed(views, depths=(2.0, 4.0, 8.0)):
+    """A strategy that observed views, each of which shows the Gaussians of its indices at z = ``depths`` or its own."""
+    strategy, num = Strategy(DensifyConfig()), len(depths)
+    strategy.begin(num, torch.device("cpu"))
+    for camera, shown, *moved in views:
+        means = torch.zeros(num, 3)
+        means[:, 2] = torch.tensor(moved[0] if moved else depths)
+        splats = Splats(means, torch.ones(num, 4), torch.ones(num, 3), torch.ones(num), torch.ones(num, 3))
+        radii = torch.zeros(num, 2, dtype=torch.int32)
+        radii[shown] = 1
+        strategy.observe(splats, camera, radii)
+    return strategy
+
+
+def test_the_resolution_of_a_gaussian_is_that_of_the_nearest_view_that_showed_it():
+    strategy = observed([(camera_at(0.0), [0, 1]), (camera_at(1.0), [1]), (camera_at(-4.0), [0, 1])])
+    assert strategy.resolution.tolist() == pytest.approx([FOCAL / 2.0, FOCAL / 3.0, 0.0])
+
+
+def test_a_longer_lens_counts_like_a_nearer_camera():
+    strategy = observed([(camera_at(0.0), [0]), (camera_at(0.0, 2.0 * FOCAL), [0])])
+    assert strategy.resolution[0].item() == pytest.approx(2.0 * FOCAL / 2.0)
+
+
+def test_gaussians_that_are_deformed_have_the_depth_to_which_they_were():
+    strategy = observed([(camera_at(0.0), [1]), (camera_at(0.0), [1], (2.0, 0.5, 8.0))])
+    assert strategy.resolution[1].item() == pytest.approx(FOCAL / 0.5)
+
+
+def test_culled_gaussians_behind_or_at_the_camera_leave_the_resolution_finite():
+    strategy = observed([(camera_at(0.0), [2])], (0.0, -3.0, 8.0))
+    assert strategy.resolution.tolist() == pytest.approx([0.0, 0.0, FOCAL / 8.0])
+
+
+@pytest.mark.parametrize("unit", ["pixel", "extent"])
+def test_sizes_are_measured_in_pixels_or_by_the_extent(trainer, unit):
+    densify = dataclasses.replace(trainer.config.densify, unit=unit)
+    trainer.config = dataclasses.replace(trainer.config, densify=densify)
+    trainer.step.density.resolution = torch.tensor([50.0, 0.0])
+    found = trainer.step.density.units(trainer._adaptation(trainer.protocol.at(0), Mock(spec=TrainingLogger)))
+    extent = trainer.capture.extent
+    assert found.tolist() == pytest.approx({"pixel": [0.02, torch.inf], "extent": [extent, extent]}[unit])
+
+
+def test_dynamic_gaussians_are_observed_at_the_time_of_the_view(trainer):
+    trainer._add_dynamic_gaussians()
+    trainer.iteration = trainer.protocol.stage2.start
+    for parameter in trainer.scene.deformation.parameters():
+        parameter.data += 0.02 * torch.randn(parameter.shape)
+    sample, num = trainer._sample(trainer.protocol.at(trainer.iteration)), len(trainer.scene.static)
+    view = trainer.views[sample.view]
+    with torch.no_grad():
+        canonical = trainer.scene.dynamic.means.clone()
+        means = trainer.scene.splats(view.time, time_noise=torch.tensor([sample.time_noise])).means[num:]
+    step(trainer)
+    found = trainer.step.density.resolution[num:]
+    shown = found > 0
+    expected, without = (view.camera.K[0, 0] / view.camera.project(x)[2][shown] for x in (means, canonical))
+    assert shown.sum() > 5
+    assert relative_error(found[shown], expected) < 1e-5 < relative_error(found[shown], without)
+
+
+def test_a_checkpoint_of_version_0_3_is_resumed_as_if_no_view_had_shown_any_gaussian(trainer, data):
+    step(trainer)
+    trainer.save()
+    path = checkpoint.list_checkpoints(trainer.run)[-1]
+    saved = checkpoint.load(path)
+    tensors = saved.tensors | dict.fromkeys(("gradients.total", "gradients.count"), saved.tensors["gradients.views"])
+    checkpoint.save(path, {k: v for k, v in tensors.items() if k != "gradients.resolution"}, saved.metadata)
+    resumed = tiny.trainer(data, trainer.run)
+    resumed.restore_newest(print)
+    assert trainer.step.density.resolution.any()
+    assert not resumed.step.density.resolution.any()
+    assert torch.equal(resumed.step.density.statistics.count, trainer.step.density.views)

@@ -55,13 +55,13 @@ class Limits(NamedTuple):
     """Limits of one densification.
 
     Attributes:
-        extent: Extent of the capture [scene units].
+        units: [N] what ``DensifyConfig.split_size`` and ``max_size`` are measured in [scene units].
         capacity: Number of Gaussians that may be added; if more exceed the threshold, those with the largest gradients
             grow.
-        remove_large: Whether to remove Gaussians larger than ``DensifyConfig.max_size`` of the extent.
+        remove_large: Whether to remove Gaussians larger than ``DensifyConfig.max_size``.
     """
 
-    extent: float
+    units: Float[Tensor, " N"]
     capacity: int
     remove_large: bool
 
@@ -87,8 +87,8 @@ def densify(
     """
     sizes = gaussians.scales.max(1).values
     alive = (gaussians.opacities >= config.min_opacity) & sizes.isfinite() & gaussians.means.isfinite().all(1)
-    max_size = config.max_size * limits.extent if limits.remove_large else math.inf
-    is_large = sizes > config.dense_fraction * limits.extent
+    max_size = (config.max_size if limits.remove_large else math.inf) * limits.units
+    is_large = sizes > config.split_size * limits.units
     # As in 3DGS, growth comes first: the children of an oversized Gaussian stay if they are small enough themselves.
     grows = alive & (gradients > config.gradient) & (torch.where(is_large, sizes / SPLIT_SHRINK, sizes) <= max_size)
     if int(grows.sum()) > limits.capacity:
@@ -106,20 +106,23 @@ class GradientStrategy(Strategy):
 
     def begin(self, num: int, device: torch.device) -> None:
         """Starts with gradients of 0."""
+        super().begin(num, device)
         self.statistics = GradientStatistics(num, device)
         self.screen_offsets = self.statistics.screen_offsets
 
     def observe(self, splats: Splats, camera: Camera, radii: Int32[Tensor, "N 2"]) -> None:
         """Adds the gradients of one view."""
+        super().observe(splats, camera, radii)
         self.statistics.observe(radii)
 
     def state(self) -> dict[str, Float[Tensor, " N"]]:
-        """Sums of the gradients, and over how many views."""
-        return {"total": self.statistics.total, "count": self.statistics.count}
+        """Also the sums of the gradients, and over how many views."""
+        return super().state() | {"total": self.statistics.total, "count": self.statistics.count}
 
     def merge(self) -> None:
-        """Adds the sums of all ranks."""
-        for tensor in self.state().values():
+        """Also adds the sums of all ranks."""
+        super().merge()
+        for tensor in (self.statistics.total, self.statistics.count):
             ranks.add_(tensor)
             if not ranks.is_first():
                 tensor.zero_()
@@ -130,11 +133,11 @@ class GradientStrategy(Strategy):
         Oversized Gaussians are removed once opacities have been reset, as in 3DGS.
         """
         config, branches = at.config.densify, (at.scene.static, at.scene.dynamic)
-        means = self.statistics.mean().split([len(gaussians) for gaussians in branches])
+        numbers = [len(gaussians) for gaussians in branches]
+        means, units = self.statistics.mean().split(numbers), self.units(at).split(numbers)
         generator, capacity = at.generator("densify"), at.capacity
         remove_large = at.plan.done > at.config.schedule.reset_every
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]
-        for gaussians, gradients, count in zip(branches, means, candidates, strict=True):
-            part = capacity * count // max(1, sum(candidates))
-            limits = Limits(at.capture.extent, part, remove_large)
+        for gaussians, gradients, unit, count in zip(branches, means, units, candidates, strict=True):
+            limits = Limits(unit, capacity * count // max(1, sum(candidates)), remove_large)
             densify(gaussians, at.optimizer, gradients, config, limits, generator)

@@ -6,12 +6,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.ops.adam import Adam
 from warpgs.training import optimizer as optim
-
-from .adaptation import Adaptation
 
 SPLIT_SHRINK = 1.6
 """Factor by which the children of a split are smaller than their parent (3DGS: 0.8 · 2)."""
@@ -65,22 +62,17 @@ def rotated(vectors: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"]) -> Float
 
 
 @torch.no_grad()
-def shorten_needles(gaussians: Gaussians, config: DensifyConfig, extent: float) -> None:
-    """Shortens the longest axis of large Gaussians to at most ``config.max_elongation`` times the second longest.
+def shorten_needles(gaussians: Gaussians, max_elongation: float, free_sizes: Float[Tensor, " N"]) -> None:
+    """Shortens the longest axis of large Gaussians to at most ``max_elongation`` times the second longest.
 
     Needles at the border of what the training views show are streaks in views of what lies beyond
     (docs/design/needles.md). Flat Gaussians stay: surfaces need them.
 
     Args:
         gaussians: Changed in place.
-        config: ``max_elongation``, and ``max_size``, up to which a Gaussian may have any shape.
-        extent: Extent of the capture [scene units].
+        max_elongation: A number below 1 counts as 1.
+        free_sizes: [N] size up to which each Gaussian may have any shape [scene units]; may be infinite.
     """
     second = gaussians.log_scales.median(1, keepdim=True).values
-    longest = (second + math.log(max(config.max_elongation, 1.0))).clamp_min(math.log(config.max_size * extent))
+    longest = (second + math.log(max(max_elongation, 1.0))).maximum(free_sizes.log()[:, None])
     gaussians.log_scales.clamp_(max=longest)
-
-
-def shorten(at: Adaptation) -> None:
-    """Shortens the needles of the static branch."""
-    shorten_needles(at.scene.static, at.config.densify, at.capture.extent)

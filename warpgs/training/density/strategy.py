@@ -9,17 +9,18 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import DensifyConfig, RenderSettings
 from warpgs.model.splats import Splats
+from warpgs.training import ranks
 from warpgs.training.schedule import Action
 
 from .adaptation import Adaptation
 from .opacity_reset import reset
-from .operations import shorten
+from .operations import shorten_needles
 from .prune import prune, prune_weakest
 from .reseed import require_branches, reseed
 
 
 class Strategy:
-    """Density control. Statistics that it gathers are per Gaussian, static ones first.
+    """Density control. It gathers statistics of each Gaussian, static ones first; here, how large pixels are.
 
     Args:
         config: The options ``--densify.*``.
@@ -27,6 +28,8 @@ class Strategy:
     Attributes:
         actions: What it does for each action of a plan; it does nothing for actions that are not there.
         screen_offsets: [N, 2] zeros to render each view with, if their gradients are needed.
+        resolution: [N] pixels per scene unit at the depth of the Gaussian, in the nearest view that has shown it since
+            ``begin``; 0 if none has.
     """
 
     screen_offsets: Float[Tensor, "N 2"] | None = None
@@ -38,17 +41,19 @@ class Strategy:
             "prune": prune,
             "reseed": reseed,
             "prune_weakest": prune_weakest,
-            "shorten": shorten,
+            "shorten": self.shorten,
             "reset": reset,
         }
 
     def begin(self, num: int, device: torch.device) -> None:
         """Starts to observe N Gaussians: at first, and whenever Gaussians were replaced. All is forgotten."""
+        self.resolution = torch.zeros(num, dtype=torch.float32, device=device)
 
     def settings(self, settings: RenderSettings) -> RenderSettings:
         """How a training step is rendered, from how it would be without the strategy."""
         return settings
 
+    @torch.no_grad()
     def observe(self, splats: Splats, camera: Camera, radii: Int32[Tensor, "N 2"]) -> None:
         """Looks at one view after its backward pass; on CUDA captured in a graph with the rest of the step.
 
@@ -57,13 +62,30 @@ class Strategy:
             camera: Its camera.
             radii: [N, 2] ``Rendering.radii``; 0 = culled.
         """
+        depth = splats.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        shown = torch.where(radii[:, 0] > 0, camera.K[0, 0] / depth, 0.0)
+        torch.maximum(self.resolution, shown, out=self.resolution)
 
     def state(self) -> dict[str, Float[Tensor, " N"]]:
         """What was observed, by name: checkpoints keep it, and resuming fills it. Finite and never negative."""
-        return {}
+        return {"resolution": self.resolution}
 
     def merge(self) -> None:
         """Moves what all ranks have observed to rank 0; the others are left as after ``begin``."""
+        ranks.maximum_(self.resolution)
+        if not ranks.is_first():
+            self.resolution.zero_()
+
+    def units(self, at: Adaptation) -> Float[Tensor, " N"]:
+        """``DensifyConfig.unit`` of each Gaussian [scene units]; infinite for those that no view has shown."""
+        if at.config.densify.unit == "extent":
+            return torch.full_like(self.resolution, at.capture.extent)
+        return 1.0 / self.resolution
+
+    def shorten(self, at: Adaptation) -> None:
+        """Shortens the needles of the static branch."""
+        static, config = at.scene.static, at.config.densify
+        shorten_needles(static, config.max_elongation, config.max_size * self.units(at)[: len(static)])
 
     def densify(self, at: Adaptation) -> None:
         """Changes the numbers of Gaussians; both branches together grow by at most ``at.capacity``."""
