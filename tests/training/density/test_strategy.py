@@ -183,7 +183,8 @@ def test_a_checkpoint_of_version_0_3_is_resumed_as_if_no_view_had_shown_any_gaus
     trainer.save()
     path = checkpoint.list_checkpoints(trainer.run)[-1]
     saved = checkpoint.load(path)
-    tensors = saved.tensors | dict.fromkeys(("gradients.total", "gradients.count"), saved.tensors["gradients.views"])
+    counts = saved.tensors["gradients.views"]
+    tensors = saved.tensors | {"gradients.total": counts.clone(), "gradients.count": counts.clone()}
     checkpoint.save(path, {k: v for k, v in tensors.items() if k != "gradients.resolution"}, saved.metadata)
     resumed = tiny.trainer(data, trainer.run)
     resumed.restore_newest(print)
