@@ -90,6 +90,11 @@ def test_the_radius_of_the_path_is_the_distance_of_the_farthest_training_camera_
     assert make_capture(xs=(3.0,))[0].path_radius == 0.0
 
 
+def test_the_extent_is_a_tenth_more_and_has_a_minimum():
+    assert make_capture()[0].extent == pytest.approx(1.1 * 2.0)
+    assert make_capture(xs=(3.0,))[0].extent == capture_module.MIN_EXTENT
+
+
 def with_points(capture, depth):
     """The capture with 50 points at a depth of its first camera, on its optical axis."""
     return dataclasses.replace(capture, points=torch.tensor([0.5, 0.5, 1.0]).expand(50, 3) * depth)

@@ -405,12 +405,12 @@ def test_frames_that_were_not_trained_on_keep_their_cameras(data, tmp_path, capt
     assert torch.equal(corrected.cameras[second].viewmat, expected)
 
 
-def test_corrections_of_version_0_3_are_fractions_of_the_radius_of_the_path(data, tmp_path, capture):
+def test_corrections_of_version_0_3_are_fractions_of_the_extent(data, tmp_path, capture):
     run, trainer = run_with_poses(data, tmp_path / "run")
     tiny.edit_metadata(run.newest_checkpoint(), lambda fields: fields.pop("unit"))
-    radius = 1.1 * capture.path_radius
-    assert abs(radius - trainer.unit) > 0.1
-    trainer.views.poses.unit = radius
+    extent = capture.extent
+    assert abs(extent - trainer.unit) > 0.1
+    trainer.views.poses.unit = extent
     corrected = run.open_corrected_capture(quiet=True)
     for name, expected in zip(capture.train, trainer.views.cameras(), strict=True):
         assert error(corrected.cameras[name].viewmat, expected.viewmat) < 1e-6

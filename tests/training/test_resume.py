@@ -106,7 +106,7 @@ def test_a_run_resumed_from_an_earlier_checkpoint_is_bit_identical(data, whole, 
 
 
 @pytest.mark.parametrize("poses", [0.0, 1e-3])
-def test_a_run_of_version_0_3_keeps_the_radius_of_the_path_as_its_unit(data, tmp_path, poses):
+def test_a_run_of_version_0_3_keeps_the_extent_as_its_unit(data, tmp_path, poses):
     config = dataclasses.replace(tiny.CONFIG, optim=dataclasses.replace(tiny.CONFIG.optim, poses=poses))
     first = tiny.trainer(data, tmp_path, config)
     first.save()
@@ -114,7 +114,7 @@ def test_a_run_of_version_0_3_keeps_the_radius_of_the_path_as_its_unit(data, tmp
     again = tiny.trainer(data, tmp_path, config)
     again.restore_newest(print)
     assert first.unit == first.capture.median_depth
-    assert again.unit == again.step.unit == pytest.approx(1.1 * first.capture.path_radius) != first.unit
+    assert again.unit == again.step.unit == first.capture.extent != first.unit
     assert again.views.poses is None or again.views.poses.unit == again.unit
     again.save()
     assert checkpoint.load(checkpoint.path_of(tmp_path, 0)).metadata.unit == again.unit

@@ -23,6 +23,9 @@ MIN_PATH = 0.01
 """Radius of the training cameras' positions, relative to the median depth, below which depth cannot be learned: a tenth
 more depth moves a point by about a thousandth of the focal length then, which is less than a pixel."""
 
+MIN_EXTENT = 0.05
+"""Minimum extent [scene units]."""
+
 MAX_DEPTH_IMAGES = 8
 """Maximum number of depth images that tell the median depth."""
 
@@ -58,6 +61,17 @@ def background_color(background: Background | Literal["capture", "mean"]) -> Col
     if background == "mean":
         raise ValueError('background is "mean": call fitted(config, capture, log) first')
     return background if isinstance(background, tuple) else COLORS["white" if background == "white" else "black"]
+
+
+def path_radius(cameras: Sequence[Camera]) -> float:
+    """Largest distance of a camera from their mean position [scene units]."""
+    positions = torch.stack([camera.position for camera in cameras])
+    return float((positions - positions.mean(0)).norm(dim=1).max())
+
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """``cameras_extent`` of 3DGS: the radius of the training cameras' path, times 1.1, at least ``MIN_EXTENT``."""
+    return max(MIN_EXTENT, 1.1 * path_radius(cameras))
 
 
 class UnknownFrameError(KeyError):
@@ -223,13 +237,12 @@ class Capture:
     @property
     def path_radius(self) -> float:
         """Largest distance of a training camera from their mean position [scene units]."""
-        positions = torch.stack([self.cameras[name].position for name in self.train])
-        return float((positions - positions.mean(0)).norm(dim=1).max())
+        return path_radius([self.cameras[name] for name in self.train])
 
     @property
     def extent(self) -> float:
-        """1.1 times ``path_radius``, at least 0.05: the unit of 3DGS's densification thresholds [scene units]."""
-        return max(0.05, 1.1 * self.path_radius)
+        """See ``extent_of`` [scene units]."""
+        return extent_of([self.cameras[name] for name in self.train])
 
     @property
     def hardly_moves(self) -> bool:

@@ -17,6 +17,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import ModelConfig
 from warpgs.config.bounds import MAX_VALUE
+from warpgs.data.capture import extent_of
 from warpgs.files import atomic_path, require_file
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
@@ -273,13 +274,10 @@ def restore_newest(run: Path, restore: Callable[[Path], None], log: Callable[[st
 def unit_of(checkpoint: Checkpoint, cameras: Sequence[Camera]) -> float:
     """Unit of learning rates of positions and of corrections of poses [scene units].
 
-    Checkpoints of version 0.3 and earlier do not have it. It was the radius of the positions of the training cameras,
-    times 1.1, at least 0.05; with another unit, corrections would mean other poses.
+    Checkpoints of version 0.3 and earlier do not have it. It was the extent of the training cameras; with another unit,
+    corrections would mean other poses.
     """
-    if checkpoint.metadata.unit is not None:
-        return checkpoint.metadata.unit
-    positions = torch.stack([camera.position for camera in cameras])
-    return max(0.05, 1.1 * float((positions - positions.mean(0)).norm(dim=1).max()))
+    return extent_of(cameras) if checkpoint.metadata.unit is None else checkpoint.metadata.unit
 
 
 def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:
