@@ -6,11 +6,13 @@ To add one, write its class in a new file, add a line to ``DENSITY`` and a test;
 from warpgs.config import DensifyConfig
 from warpgs.errors import suggestion
 
+from .absgrad import AbsoluteGradientStrategy
 from .gradient import GradientStrategy
 from .strategy import Strategy
 
 DENSITY: dict[str, type[Strategy]] = {
     "3dgs": GradientStrategy,
+    "absgrad": AbsoluteGradientStrategy,
 }
 """Strategies by name, each constructed from a ``DensifyConfig``."""
 
