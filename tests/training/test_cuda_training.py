@@ -20,6 +20,7 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
 from warpgs.runtime.profiling import profile
 from warpgs.training import motion_fit
+from warpgs.training.density import DENSITY
 from warpgs.training.density.prune import blend_weights
 from warpgs.training.density.reseed import lost_fraction, lost_pixels
 
@@ -32,7 +33,7 @@ def trainer_on_cuda(data, run, **changes):
 
 
 def parameters_after_steps(data, run, **changes):
-    """Parameters after iterations of stage II with constant numbers of Gaussians."""
+    """Parameters and observations for densification after iterations of stage II with constant numbers of Gaussians."""
     optim = dataclasses.replace(tiny.CONFIG.optim, poses=1e-3)
     trainer = trainer_on_cuda(data, run, optim=optim, **changes)
     trainer._add_dynamic_gaussians()
@@ -44,7 +45,7 @@ def parameters_after_steps(data, run, **changes):
         trainer.views.announce(trainer._sampler.views(iteration, 0))
         trainer.step(plan, trainer._sample(plan))
     torch.cuda.synchronize()
-    return {name: p.detach().clone() for name, p in trainer.step.parameters().items()}
+    return {name: p.detach().clone() for name, p in (trainer.step.parameters() | trainer.step.density.state()).items()}
 
 
 @pytest.mark.parametrize("resident_bytes", [1 << 30, 0])
@@ -58,8 +59,10 @@ def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path, resi
             assert relative_error(replayed[name], expected) < max(1e-3, 4.0 * noise), name
 
 
-def test_a_run_with_graphs_passes_all_stages(data, tmp_path):
-    trainer = trainer_on_cuda(data, tmp_path / "run")
+@pytest.mark.parametrize("strategy", DENSITY)
+def test_a_run_with_graphs_passes_all_stages(data, tmp_path, strategy):
+    densify = dataclasses.replace(tiny.CONFIG.densify, strategy=strategy)
+    trainer = trainer_on_cuda(data, tmp_path / "run", densify=densify)
     assert tiny.train(trainer)
     assert all(p.isfinite().all() for p in trainer.scene.parameters())
 

@@ -6,7 +6,16 @@ import pytest
 import torch
 
 from tests.reference.ssim import ssim_map
-from tests.scenes import as_gaussians, assert_same_gradients, error, generator, make_camera, make_splats, select
+from tests.scenes import (
+    as_gaussians,
+    assert_same_gradients,
+    error,
+    generator,
+    make_camera,
+    make_splats,
+    relative_error,
+    select,
+)
 from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.scene import SplitScene
@@ -27,7 +36,8 @@ WEIGHTS = [0.0, 0.2]
 @pytest.fixture(autouse=True)
 def terms_of_the_paper(monkeypatch):
     """A term that is added to the dictionary has tests of its own."""
-    for name in TERMS.keys() - {"static", "dynamic", "joint", "squared", "depth", "depth_dynamic"}:
+    known = {"static", "dynamic", "joint", "squared", "depth", "depth_dynamic", "opacity", "scale"}
+    for name in TERMS.keys() - known:
         monkeypatch.delitem(TERMS, name)
 
 
@@ -226,6 +236,13 @@ def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_to
     scene, plan, step = prepared("pretrain", ungated)
     step(plan, Sample(0, 0.0, PURPLE, 0))
     assert all(parameter.isfinite().all() for parameter in scene.parameters())
+
+
+def test_the_means_of_opacities_and_standard_deviations_can_be_terms():
+    terms, _ = terms_of("stage2", dataclasses.replace(LOSS, opacity=3.0, scale=5.0))
+    assert {"opacity", "scale"}.isdisjoint(terms_of("stage2")[0])
+    assert relative_error(terms["opacity"], 3.0 * SPLATS.opacities.mean()) < 1e-5
+    assert relative_error(terms["scale"], 5.0 * SPLATS.scales.mean()) < 1e-5
 
 
 def terms_with_trust(weight, margin):

@@ -13,7 +13,8 @@ class DensifyConfig:
     strategy: str = "3dgs"
     """Density strategy, a key of DENSITY in warpgs/training/density/__init__.py: clone and split where the gradient on
     screen is large (3dgs), or the sum of the absolute values of its parts, which needs a larger ``gradient``, 8e-4 in
-    gsplat (absgrad)."""
+    gsplat (absgrad); or Markov chain Monte Carlo, which copies opaque Gaussians in the place of transparent ones, up to
+    ``max_gaussians``, and has ``loss.opacity`` and ``loss.scale`` of 0.01 (mcmc)."""
     every: Annotated[int, Bounds(min=1)] = 100
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
@@ -32,6 +33,8 @@ class DensifyConfig:
     max_elongation: float = 0.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
     their second longest, or to ``max_size`` if that is longer. 0: never."""
+    noise: float = 5e5
+    """Factor of the noise on positions in strategy mcmc, next to their learning rate and covariance."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
     min_pixels: int = 0

@@ -12,10 +12,13 @@ from . import ranks
 from .step import Sample
 
 
-def random_numbers(seed: int, purpose: str, iteration: int, rollbacks: int) -> torch.Generator:
-    """The CPU generator for a purpose at an iteration, after a number of returns to a checkpoint."""
+def random_numbers(
+    seed: int, purpose: str, iteration: int, rollbacks: int, device: torch.device | str = "cpu"
+) -> torch.Generator:
+    """The generator for a purpose at an iteration, after a number of returns to a checkpoint."""
     words = f"{seed} {purpose} {iteration} {rollbacks}"
-    return torch.Generator().manual_seed(int.from_bytes(hashlib.blake2b(words.encode(), digest_size=7).digest(), "big"))
+    digest = hashlib.blake2b(words.encode(), digest_size=7).digest()
+    return torch.Generator(device).manual_seed(int.from_bytes(digest, "big"))
 
 
 class Sampler:

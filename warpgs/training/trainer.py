@@ -133,6 +133,7 @@ class Trainer:
             plan = self.protocol.at(self.iteration)
             self.views.announce(self._sampler.views(self.iteration, self.rollbacks))
             self.step(plan, self._sample(plan))
+            self.step.density.after_step(self.scene, self.step.optimizer, self._generator)
             if plan.actions:
                 self._adapt(plan, logger)
             self.iteration += 1
@@ -214,9 +215,9 @@ class Trainer:
 
     # Randomness -------------------------------------------------------------------------------------------------------
 
-    def _generator(self, purpose: str) -> torch.Generator:
-        """Random numbers for a purpose at the current iteration."""
-        return random_numbers(self.config.seed, purpose, self.iteration, self.rollbacks)
+    def _generator(self, purpose: str, device: torch.device | str = "cpu") -> torch.Generator:
+        """Random numbers for a purpose at the current iteration, the same on all ranks."""
+        return random_numbers(self.config.seed, purpose, self.iteration, self.rollbacks, device)
 
     def _sample(self, plan: IterationPlan) -> Sample:
         """This rank's view, noise on time and background in the current iteration."""

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import DensifyConfig, RenderSettings
+from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
+from warpgs.ops.adam import Adam
 from warpgs.training import ranks
 from warpgs.training.schedule import Action
 
@@ -65,6 +67,17 @@ class Strategy:
         depth = splats.means @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         shown = torch.where(radii[:, 0] > 0, camera.K[0, 0] / depth, 0.0)
         torch.maximum(self.resolution, shown, out=self.resolution)
+
+    def after_step(
+        self, scene: SplitScene, optimizer: Adam, generator: Callable[[str, torch.device], torch.Generator]
+    ) -> None:
+        """Changes Gaussians, but not their numbers, after every step of Adam, alike on all ranks.
+
+        Args:
+            scene: Changed in place.
+            optimizer: Its optimizer, after the step.
+            generator: Makes the generator of random numbers for a purpose on a device; they are the same on all ranks.
+        """
 
     def state(self) -> dict[str, Float[Tensor, " N"]]:
         """What was observed, by name: checkpoints keep it, and resuming fills it. Finite and never negative."""
