@@ -10,6 +10,7 @@ from tests import tiny
 from tests.reference.covariance import covariance
 from tests.scenes import generator, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians
+from warpgs.training import ranks
 from warpgs.training.density.mcmc import add_noise
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.sampling import random_numbers
@@ -112,7 +113,13 @@ def test_noise_is_another_one_in_each_iteration_and_after_a_rollback(data, tmp_p
     assert not any(torch.equal(found[a], found[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
 
 
-def test_training_reaches_the_maximum_and_a_resumed_one_ends_with_the_same_bits(data, tmp_path):
+def test_noise_is_the_same_on_all_ranks(data, tmp_path, monkeypatch):
+    first = positions_after(data, tmp_path / "0")[1]
+    monkeypatch.setattr(ranks, "rank", lambda: 1)
+    assert torch.equal(positions_after(data, tmp_path / "1")[1], first)
+
+
+def test_training_adds_gaussians_and_a_resumed_one_ends_with_the_same_bits(data, tmp_path):
     with tiny.in_haste():
         whole = tiny.trainer(data, tmp_path / "whole", CONFIG)
         assert tiny.train(whole)
