@@ -6,6 +6,8 @@ Training runs the cheap part of the same checks before it begins, so that both s
 import time
 from pathlib import Path
 
+from warpgs.files import read_json
+
 from .builtin import is_builtin
 from .capture import Assumption, Capture
 from .check_sample import Content, Sample, read_contents
@@ -17,6 +19,7 @@ from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_
 from .motion_check import check_motion, motions_of
 from .points_check import check_points
 from .turning_check import check_turning
+from .writer import REPORT
 
 READ_SECONDS = 15.0
 """Time after which only frames that are compared are still read [s]: a check takes at most 30 s on two cores."""
@@ -61,7 +64,7 @@ def check_capture(
             *check_depth(sample.capture, sample.names),
             *check_motion(motions, capture.conventions.masks),
         ]
-    return Report(root, findings)
+    return Report(root, [*findings, *_noted(root)])
 
 
 def quick_findings(capture: Capture) -> list[Finding]:
@@ -84,6 +87,17 @@ def quick_findings(capture: Capture) -> list[Finding]:
         findings += [*check_masks(masks, capture, motions), *check_motion(motions, capture.conventions.masks)]
     findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]
     return [f for f in findings if f.level != "note" or f.topic == "files"]
+
+
+def _noted(root: Path) -> list[Finding]:
+    """What ``warpgs prepare`` noted of a capture that it made."""
+    report = root / REPORT
+    try:
+        notes = read_json(report).get("notes", []) if report.is_file() else []
+    except ValueError as error:
+        return [Finding("warning", "preparation", str(error))]
+    noted = notes if isinstance(notes, list) else []
+    return [Finding("warning", "preparation", f"warpgs prepare noted: {note}") for note in noted]
 
 
 def _masks(capture: Capture, contents: dict[str, Content]) -> list[DynamicCounts]:

@@ -12,10 +12,11 @@ from warpgs.locks import lock_folder
 
 from .cameras import MISLED, Cameras, NoCamerasError
 from .checks import check_options
+from .doubts import DOUBTFUL_FRACTION
 from .journal import Journal, first_lost
 from .masks import MASKERS, Masks
 from .options import Options
-from .scene import DOUBTFUL_FRACTION, capture_files
+from .scene import capture_files
 from .steps import Steps, take
 
 MAX_DYNAMIC_FRACTION = 0.6

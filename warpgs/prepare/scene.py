@@ -35,14 +35,6 @@ NO_PARALLAX = (
     "(unless a network estimates depth), and views from elsewhere are guesses"
 )
 
-NOTHING_MOVES = (
-    "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
-    "(--masks sam2)"
-)
-
-DOUBTFUL_FRACTION = 0.4
-"""Fraction of dynamic pixels above which the masks are probably wrong."""
-
 
 def write_capture(
     root: Path,
@@ -77,7 +69,6 @@ def write_capture(
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
     write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, masks.estimated)
-    notes += _doubts(float(np.mean([mask.mean() for mask in dynamic])), masks.estimated)
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
     write_contact_sheet(root / "masks.png", painted, cameras.names)
     return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
@@ -88,13 +79,6 @@ def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
     sizes = [f"{folder}/{factor}x/{{}}{end}" for folder, end in FOLDERS.items() for factor in FACTORS]
     frames = [root / path.format(name) for path in (*sizes, "camera/{}.json") for name in names]
     return [root / "dataset.json", root / "metadata.json", root / "scene.json", root / "points.npy", *frames]
-
-
-def _doubts(fraction: float, estimated: bool) -> list[str]:
-    """What to say of masks that mark a fraction of the pixels as dynamic."""
-    if fraction > DOUBTFUL_FRACTION:
-        return [f"according to the masks, {fraction:.0%} of the pixels move: look at masks.png"]
-    return [NOTHING_MOVES] if estimated and fraction == 0.0 else []
 
 
 def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], notes: list[str]) -> Cameras:

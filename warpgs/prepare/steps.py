@@ -15,6 +15,7 @@ from .background_motion import SIDE, off_background
 from .cameras import Cameras, NoCamerasError
 from .checks import check_count
 from .depth import DEPTHS, add_depth, depth_files
+from .doubts import doubts_of_lens, doubts_of_masks
 from .frames import Frames, take_frames
 from .given_masks import find_given_masks, read_dynamic
 from .images import read_images, resize_to_side
@@ -33,6 +34,9 @@ CAPTURE_BYTES = 16
 
 FEATURE_BYTES, MASK_BYTES, IMAGE_BYTES, DEPTH_BYTES = 5, 1, 5, 2
 """Disk space per pixel of a frame that single steps need [bytes]."""
+
+BACKGROUND = "background"
+"""Name of the step that finds what does not move with the background, and of the folder with its masks."""
 
 STILL_FOCAL = 1.0
 """Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""
@@ -142,7 +146,7 @@ class Steps:
         names = self.frames.names
         if self.options.camera != "moving":
             return self.recover(name, names, thorough=False)
-        background = self.find_background("background")
+        background = self.find_background(BACKGROUND)
         try:
             return self.recover(name, names, background, thorough=False)
         except NoCamerasError:  # too few features, or all parallax is in the masked region
@@ -197,9 +201,18 @@ class Steps:
             self._require_space(IMAGE_BYTES)
             root, notes, quiet = self.journal.root, self.journal.notes, self.journal.quiet
             holdout = self.options.holdout
-            return write_capture(root, self.frames, cameras, masks, holdout=holdout, notes=notes, quiet=quiet)
+            summary = write_capture(root, self.frames, cameras, masks, holdout=holdout, notes=notes, quiet=quiet)
+            notes += self._doubts(cameras, masks)
+            return summary
 
         self.journal.step(name, make, lambda: capture_files(self.journal.root, cameras.names))
+
+    def _doubts(self, cameras: Cameras, masks: Masks) -> list[str]:
+        background = self.journal.work / BACKGROUND
+        off = Masks.load(background).read_dynamic(cameras) if background.is_dir() else None
+        found = doubts_of_masks(masks.read_dynamic(cameras), masks.estimated, off)
+        is_known = self.options.camera == "still" or self.options.focal or self.options.intrinsics
+        return found if is_known else [*found, *doubts_of_lens(cameras)]
 
     def add_depth(self, name: str, cameras: Cameras) -> None:
         """Adds depth to the capture."""

@@ -1,0 +1,67 @@
+"""Doubts about masks and lenses that a preparation has found."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.prepare import boards
+from warpgs.data.check import check_capture
+from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.doubts import doubts_of_lens, doubts_of_masks
+from warpgs.prepare.options import Options
+from warpgs.prepare.pipeline import prepare
+
+
+def columns(*counts: int) -> list[np.ndarray]:
+    """[4, 100] masks of this many columns on the left."""
+    return [np.tile(np.arange(100) < count, (4, 1)) for count in counts]
+
+
+@pytest.mark.parametrize(("crowded", "noted"), [(1, False), (2, True)])
+def test_masks_of_which_a_quarter_mark_much_are_doubtful(crowded, noted):
+    masks = columns(*[35] * crowded, *[5] * (8 - crowded))
+    found = doubts_of_masks(masks, True)
+    assert [text.split(": ")[1] for text in found] == ["look at masks.png"] * noted
+    assert not noted or f"in {crowded} of 8 frames" in found[0]
+    assert doubts_of_masks(masks, False) == []
+
+
+@pytest.mark.parametrize(("held", "noted"), [(3, True), (5, False)])
+def test_masks_without_what_does_not_move_with_the_background_are_doubtful(held, noted):
+    found = doubts_of_masks(columns(held, held), True, columns(20, 20))
+    assert len(found) == noted
+    assert not noted or "the masks hold only 15% of what does not move with the background" in found[0]
+
+
+def test_hardly_anything_that_does_not_move_with_the_background_says_nothing_of_masks():
+    off = columns(1, 0, 0)
+    assert doubts_of_masks(columns(0, 5, 5), True, off) == []
+
+
+@pytest.mark.parametrize(("factor", "noted"), [(4.0, False), (6.0, True)])
+def test_a_focal_length_that_no_usual_lens_has_is_doubtful(factor, noted):
+    lens = dataclasses.replace(boards.lens(), focal=(factor * boards.SIZE[0],) * 2)
+    cameras = Cameras(["a"], lens, boards.poses(2)[:1], boards.points(), 0.1, 10.0)
+    assert [text[:37] for text in doubts_of_lens(cameras)] == ["the focal length that was found is 6 "[:37]] * noted
+
+
+def mark_left(frames: object, *rest: object) -> list[np.ndarray]:
+    """Takes the place of ``find_dynamic``: some columns where nothing moves."""
+    return [np.tile(np.arange(image.shape[1]) < 20, (image.shape[0], 1)) for image in frames.images]
+
+
+def test_doubts_are_noted_and_the_check_warns_of_them(tmp_path, monkeypatch):
+    """The masks miss the board, which does not move with the background."""
+    images, masks = boards.record(12)
+    shots = boards.write_folder(tmp_path / "shots", images)
+    monkeypatch.setattr(
+        "warpgs.prepare.steps.recover_cameras", lambda folder, names, *rest: boards.true_cameras(folder, names)
+    )
+    monkeypatch.setattr("warpgs.prepare.steps.off_background", lambda images, quiet: masks)
+    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", mark_left)
+    notes = prepare(shots, tmp_path / "made", Options(depth="none"))["notes"]
+    assert len(notes) == 1
+    assert "what does not move with the background" in notes[0]
+    warnings = [f.text for f in check_capture(tmp_path / "made").findings if f.level == "warning"]
+    assert f"warpgs prepare noted: {notes[0]}" in warnings

@@ -1,0 +1,73 @@
+"""What may be wrong with the cameras and masks that a preparation has found, one sentence each."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool
+
+from .cameras import Cameras
+
+DOUBTFUL_FRACTION = 0.4
+"""Fraction of dynamic pixels above which the masks are probably wrong."""
+
+CROWDED_FRACTION, MANY_FRAMES = 0.3, 0.25
+"""Fraction of dynamic pixels in a frame, and of such frames, from which on estimated masks are rarely right
+(docs/design/motion-masks.md)."""
+
+MIN_OFF, MIN_CONFIRMED = 0.01, 0.2
+"""Fraction of the pixels that do not move with the background, from which on it says something, and fraction of them
+that masks hold at least where cameras are right. Static foreground does not move with the background either."""
+
+MAX_FOCAL = 5.0
+"""Focal length over the longer side that is hardly found where cameras are right: a view of 11°."""
+
+NOTHING_MOVES = (
+    "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
+    "(--masks sam2)"
+)
+
+Planes = Sequence[Bool[np.ndarray, "H W"]]
+
+
+def doubts_of_masks(dynamic: Planes, estimated: bool, off: Planes | None = None) -> list[str]:
+    """Doubts about dynamic masks.
+
+    Args:
+        dynamic: [H, W] dynamic mask of each frame.
+        estimated: Whether they are estimates.
+        off: [H, W] what does not move with the background of each frame (``background_motion``); None if unknown.
+    """
+    fractions = np.array([mask.mean() for mask in dynamic])
+    mean, crowded = float(fractions.mean()), int((fractions > CROWDED_FRACTION).sum())
+    if mean > DOUBTFUL_FRACTION:
+        return [f"according to the masks, {mean:.0%} of the pixels move: look at masks.png"]
+    if not estimated:
+        return []
+    if mean == 0.0:
+        return [NOTHING_MOVES]
+    found = []
+    if crowded >= MANY_FRAMES * len(dynamic):
+        found.append(
+            f"according to the masks, more than {CROWDED_FRACTION:.0%} of the pixels move in {crowded} of "
+            f"{len(dynamic)} frames: look at masks.png"
+        )
+    if off is not None:
+        num_off = sum(int(plane.sum()) for plane in off)
+        both = sum(int((plane & mask).sum()) for plane, mask in zip(off, dynamic, strict=True))
+        if num_off > MIN_OFF * sum(plane.size for plane in off) and both < MIN_CONFIRMED * num_off:
+            found.append(
+                f"the masks hold only {both / num_off:.0%} of what does not move with the background: the rest is "
+                "static foreground, or cameras were found that follow it; look at masks.png"
+            )
+    return found
+
+
+def doubts_of_lens(cameras: Cameras) -> list[str]:
+    """Doubts about a focal length that was found."""
+    ratio = max(cameras.lens.focal) / max(cameras.lens.width, cameras.lens.height)
+    if ratio <= MAX_FOCAL:
+        return []
+    return [
+        f"the focal length that was found is {ratio:.0f} times the longer side of the frames, longer than most "
+        "telephoto lenses': the cameras are probably wrong; give it (--focal PX)"
+    ]
