@@ -113,6 +113,7 @@ PAPER = {
         "loss.opacity": 0.0,
         "loss.scale": 0.0,
         "densify.noise": 5e5,  # of the strategy "mcmc" alone
+        "loss.acceleration": 0.0,
         "loss.hidden_appearance": True,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,

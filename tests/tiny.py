@@ -52,7 +52,7 @@ CONFIG = TrainConfig(
     preset="quick",
     device="cpu",
     model=MODEL,
-    loss=LossConfig(ssim=0.0),
+    loss=LossConfig(ssim=0.0, acceleration=0.01),
     densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, weakest=0.01),
     schedule=SCHEDULE,
     checkpoint_every=7,

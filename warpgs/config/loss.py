@@ -21,6 +21,9 @@ class LossConfig:
     squared: float = 0.0
     """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
     paper. Large errors vanish sooner and fewer remain."""
+    acceleration: float = 0.0
+    """Weight of the acceleration of dynamic Gaussians on screen [per pixel per frame²], of which images say nothing
+    between frames; 0 in the paper."""
     hidden_appearance: bool = True
     """Whether the joint image also trains how static Gaussians change over time while something dynamic hides them, as
     in the paper. No object is quite opaque, so that what it hides takes its colour."""

@@ -52,6 +52,7 @@ BEST = TrainConfig(
     ),
     loss=LossConfig(
         squared=15.0,
+        acceleration=0.01,
         hidden_appearance=False,
         dynamic_background="black",
         depth=0.5,

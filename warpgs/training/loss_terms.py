@@ -11,6 +11,7 @@ from warpgs.ops.depth_error import depth_error
 from warpgs.rendering import Layer
 
 from . import losses
+from .acceleration import acceleration
 from .losses import LossInputs, LossTerm
 from .schedule import compares_branches
 
@@ -97,6 +98,11 @@ TERMS: dict[str, LossTerm] = {
         squared,
         is_active=lambda phase, config: phase.with_joint and config.squared > 0,
         weight=lambda plan, config: config.squared,
+    ),
+    "acceleration": LossTerm(
+        acceleration,
+        is_active=lambda phase, config: phase.use_deformation and config.acceleration > 0,
+        weight=lambda plan, config: config.acceleration,
     ),
     "depth": LossTerm(
         depth,

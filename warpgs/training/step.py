@@ -20,6 +20,7 @@ from warpgs.runtime.graphs import GraphCache
 
 from . import optimizer as optim
 from . import ranks
+from .acceleration import sample_paths
 from .density import make_strategy
 from .loss_terms import TERMS
 from .losses import DepthTrust, LossInputs
@@ -170,7 +171,8 @@ class Step:
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
-        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust)
+        paths = self._paths(view) if phase.use_deformation and config.acceleration > 0 else None
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, paths)
         terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()
@@ -190,6 +192,9 @@ class Step:
         """Static Gaussians whose centres the mask says to be behind something dynamic."""
         row, column, _, is_inside = view.camera.project(self.scene.static.means)
         return is_inside & ~view.static_mask[row, column]
+
+    def _paths(self, view: View) -> Float[Tensor, "3 K 3"]:
+        return sample_paths(self.scene, view.time, self.views.interval, self._inputs.dropout_seed)
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
         """Alignment of the depth of the selected view, and how much it is trusted."""

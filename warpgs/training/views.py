@@ -1,7 +1,7 @@
 """Training views on the device."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -187,6 +187,12 @@ class Views:
         else:
             self._reader.change_depth(index, change)
             self._read_ahead.discard(index)
+
+    @cached_property
+    def interval(self) -> float:
+        """Median time between successive training views; 0 if all have the same time."""
+        times = torch.tensor([self._capture.cameras[name].time for name in self._capture.train], dtype=torch.float64)
+        return float(times.unique().diff().median()) if len(times.unique()) > 1 else 0.0
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
