@@ -17,7 +17,7 @@ from warpgs.rendering import render
 from warpgs.training import tracks as module
 from warpgs.training.fitting import fitted
 from warpgs.training.silhouettes import Region
-from warpgs.training.tracked_start import MAX_FINAL_RATE, MAX_POSITION_RATE, MAX_RATE
+from warpgs.training.tracked_start import MAX_FINAL_RATE, MAX_RATE
 from warpgs.training.tracks import _divided, find_tracks
 
 SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
@@ -158,7 +158,7 @@ def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
     assert (found.model.deformation, found.model.paths) == ("splines", 5)
     assert found.model.path_points == len(tracks[0].path.c)
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
-    assert (found.optim.networks, found.optim.means) == (MAX_RATE, MAX_POSITION_RATE)
+    assert found.optim.networks == MAX_RATE
     assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
     assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in lines
 

@@ -64,7 +64,7 @@ BEST = TrainConfig(
         mask_margin=0.008,
         branches_in_stage2="given-masks",
     ),
-    optim=OptimConfig(means=1.3e-3, poses=1e-4),
+    optim=OptimConfig(means=5e-4, poses=5e-5),
     densify=DensifyConfig(gradient=3e-4, max_elongation=10.0, min_pixels=8, weakest=0.01, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
@@ -102,7 +102,7 @@ PATIENT = dataclasses.replace(
         dynamic_points=3_000,
     ),
     loss=dataclasses.replace(BEST.loss, ssim=0.0),
-    optim=OptimConfig(means=1.3e-3, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
+    optim=OptimConfig(means=6.5e-4, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8, reseed=0.05),
     schedule=Schedule(
         pretrain=300,

@@ -219,7 +219,7 @@ class Capture:
 
     @cached_property
     def median_depth(self) -> float:
-        """Median depth at which the training cameras see the scene [scene units]: the unit of learning rates.
+        """Median depth at which the training cameras see the scene [scene units].
 
         From the points, else from depth images in scene units, else from where the cameras look; see ``median_depth``.
 
@@ -228,6 +228,17 @@ class Capture:
         """
         cameras = [self.cameras[name] for name in self.train]
         return median_depth(cameras, self.points, self._inverse_depths() if self.metric_depth else ())
+
+    @property
+    def view_width(self) -> float:
+        """Width of what an image shows at the median depth [scene units].
+
+        It is the unit of what must mean the same on screen: moving by a fraction of it moves a point at
+        that depth by that fraction of the image, whatever the lens.
+        """
+        cameras = [self.cameras[name] for name in self.train]
+        ratios = torch.tensor([camera.width / float(camera.K[0, 0]) for camera in cameras], dtype=torch.float64)
+        return self.median_depth * float(ratios.median())
 
     def _inverse_depths(self) -> Iterator[Tensor]:
         for name in evenly_spaced(self.train, MAX_DEPTH_IMAGES):

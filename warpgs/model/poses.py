@@ -14,8 +14,8 @@ class PoseCorrections(nn.Module):
 
     Args:
         num: T.
-        unit: Length of a translation of 1 [scene units]: the depth at which the cameras see the scene, so that
-            rotations and translations of one size move the image by about as much.
+        unit: Length of a translation of 1 [scene units]: the width of what an image shows, so that rotations and
+            translations of one size move the image by about as much.
 
     Attributes:
         unit: As given.

@@ -34,8 +34,8 @@ MAX_POINTS_PER_IMAGE = 2_000
 PIXELS_PER_CHUNK = 8_192
 """Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
 
-MAX_SCALE = 0.038
-"""Maximum standard deviation of initial dynamic Gaussians of unknown depth, as a fraction of the median depth."""
+MAX_SCALE = 0.019
+"""Maximum standard deviation of initial dynamic Gaussians of unknown depth, as a fraction of the view width."""
 
 
 NEWTON_STEPS, MAX_STEP = 12, 1.5

@@ -28,8 +28,8 @@ MAX_POINTS, MAX_POINTS_PER_VIEW = 40_000, 2_000
 WINDOW = 0.015
 """Largest difference in time, of all in [0, 1], between frames that together give the canonical points."""
 
-POSITION_UNIT, COLOR_UNIT = 0.038, 0.15
-"""Differences of positions, as a fraction of the median depth, and of colours in [0, 1] that count as 1."""
+POSITION_UNIT, COLOR_UNIT = 0.019, 0.15
+"""Differences of positions, as a fraction of the view width, and of colours in [0, 1] that count as 1."""
 
 MAX_SQUARED_DISTANCE = 9.0
 """Limit that squared distances approach (Geman and McClure): frames see sides that others do not."""
@@ -49,15 +49,15 @@ MAX_STRETCH = 1.5
 """Maximum distance of a point from the nearest canonical one, relative to that at the time when it was seen: they are
 the same where an object turns as a whole."""
 
-MAX_ERROR = 0.023
-"""Maximum distance of a deformed point from where it was seen, as a fraction of the median depth."""
+MAX_ERROR = 0.011
+"""Maximum distance of a deformed point from where it was seen, as a fraction of the view width."""
 
 
 def fit_motion(
     deformation: nn.Module,
     found: DynamicPoints,
     times: Float[Tensor, " T"],
-    median_depth: float,
+    view_width: float,
     config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
@@ -71,7 +71,7 @@ def fit_motion(
         deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
-        median_depth: Median depth of the capture [scene units].
+        view_width: Width of what an image shows at the median depth [scene units].
         config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
             says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
@@ -86,7 +86,7 @@ def fit_motion(
     device = next((parameter.device for parameter in fitted.parameters()), None)
     if device is None:
         return found
-    points = _PointsByView(found, times, median_depth, device, generator)
+    points = _PointsByView(found, times, view_width, device, generator)
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
@@ -152,11 +152,11 @@ class _PointsByView:
         self,
         found: DynamicPoints,
         times: Float[Tensor, " T"],
-        median_depth: float,
+        view_width: float,
         device: torch.device,
         generator: torch.Generator,
     ) -> None:
-        self.unit, self.max_error = POSITION_UNIT * median_depth, MAX_ERROR * median_depth
+        self.unit, self.max_error = POSITION_UNIT * view_width, MAX_ERROR * view_width
         features = self._features(found)
         views, counts = found.views.unique(return_counts=True)
         start = _start_time(times[views], counts)

@@ -16,9 +16,8 @@ from .dynamic_points import MAX_SCALE
 from .point_cloud import front_of_ball, gaussians_at, subsample
 from .tracks import Track
 
-MAX_RATE, MAX_FINAL_RATE, MAX_POSITION_RATE = 3e-4, 1e-5, 1e-3
-"""Maximum initial and final learning rates of paths and networks, and initial one of Gaussians' positions; what higher
-ones cost is in docs/design/tracks.md."""
+MAX_RATE, MAX_FINAL_RATE = 3e-4, 1e-5
+"""Maximum initial and final learning rates of paths and networks; higher ones cost as docs/design/tracks.md says."""
 
 
 def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
@@ -31,7 +30,6 @@ def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
             optim,
             networks=min(MAX_RATE, optim.networks),
             networks_end=min(MAX_FINAL_RATE, optim.networks_end),
-            means=min(MAX_POSITION_RATE, optim.means),
         ),
         schedule=dataclasses.replace(config.schedule, deform_from=0, noise_until=0),
     )
@@ -42,7 +40,7 @@ def start_from_tracks(
     tracks: list[Track],
     deformation: SplineDeformation,
     config: TrainConfig,
-    median_depth: float,
+    view_width: float,
     generator: torch.Generator,
 ) -> Gaussians:
     """Dynamic Gaussians on objects that were tracked, and the paths along which these move.
@@ -53,7 +51,7 @@ def start_from_tracks(
         tracks: At least one.
         deformation: Its homes and paths are replaced.
         config: Number of Gaussians, degree of spherical harmonics and limits of size.
-        median_depth: Median depth of the capture [scene units].
+        view_width: Width of what an image shows at the median depth [scene units].
         generator: CPU generator that chooses the pixels.
     """
     start = _time_apart(tracks)
@@ -63,7 +61,7 @@ def start_from_tracks(
     positions = torch.cat([points for points, _ in parts]) + starts[label]
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
-    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * median_depth)
+    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_width)
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
     deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))
