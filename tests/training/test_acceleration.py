@@ -11,6 +11,7 @@ from tests import tiny
 from tests.scenes import as_gaussians, generator, make_camera, make_splats, select
 from warpgs.cameras import Camera
 from warpgs.config import LossConfig
+from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.training import acceleration as module
@@ -62,18 +63,27 @@ def test_the_term_is_the_mean_over_gaussians():
     assert measured(paths).item() == pytest.approx(sum(parts) / 3, rel=1e-5)
 
 
-def test_a_gaussian_behind_the_camera_leaves_the_term_finite():
-    paths = torch.cat([accelerated(1.0), accelerated(1.0, -2.0), accelerated(1.0, 0.0)], 1).requires_grad_()
+@pytest.mark.parametrize("depths", [(-2.0, 0.0), (-0.001, -100.0)])
+def test_gaussians_behind_or_at_the_camera_count_as_0_and_get_no_gradient(depths):
+    hidden = [accelerated(1.0, depth) + torch.tensor([0.1, 0.0, 0.0]).view(3, 1, 1) for depth in depths]
+    paths = torch.cat([accelerated(1.0), *hidden], 1).requires_grad_()
     value = measured(paths)
     value.backward()
-    assert value.isfinite()
-    assert paths.grad.isfinite().all()
+    assert value.item() == pytest.approx(measured(accelerated(1.0)).item() / 3, rel=1e-5)
+    assert paths.grad[:, 0].any()
+    assert not paths.grad[:, 1:].any()
 
 
 def test_depth_gets_no_gradient_by_making_pixels_larger():
     paths = accelerated(2.0).requires_grad_()
     measured(paths).backward()
     assert paths.grad[:, 0, 2].abs().max() < 1e-6 * paths.grad.abs().max()
+
+
+def test_cameras_get_no_gradient_by_moving_away():
+    poses = PoseCorrections(1, 1.0)
+    measured(accelerated(2.0).requires_grad_(), poses.moved(CAMERA, torch.tensor([0]))).backward()
+    assert all(parameter.grad is None for parameter in poses.parameters())
 
 
 def test_without_dynamic_gaussians_the_term_is_0():

@@ -18,7 +18,7 @@ MAX_SAMPLES = 1_024
 """Maximum number of Gaussians whose paths an iteration looks at."""
 
 MIN_DEPTH = 1e-3
-"""Minimum depth of a Gaussian, relative to the farthest: behind the camera, a pixel has no size."""
+"""Minimum depth of a Gaussian in front of the camera, relative to the farthest, so that its pixels have some size."""
 
 
 def sample_paths(
@@ -50,14 +50,16 @@ def sample_paths(
 def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
     """Mean acceleration of the sampled dynamic Gaussians as the view's camera sees it [pixels per frame²].
 
-    Accelerations a well below one pixel count as a², larger ones as a: a² / √(a² + 1).
+    Accelerations a well below one pixel count as a², larger ones as a: a² / √(a² + 1). Those behind the camera, where a
+    pixel has no size, count as 0. Neither depth nor camera gets a gradient for making pixels larger.
     """
     paths, camera = inputs.paths, inputs.view.camera
     assert paths is not None
     before, now, after = paths
-    depth = now.detach() @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    if not len(depth):
+    if not len(now):
         return paths.sum()
-    depth = depth.clamp_min(MIN_DEPTH * depth.abs().max())
-    squared = ((before - 2.0 * now + after) * (camera.K[0, 0] / depth)[:, None]).square().sum(1)
+    with torch.no_grad():
+        depth = now @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        pixels = torch.where(depth > 0.0, camera.K[0, 0] / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)
+    squared = ((before - 2.0 * now + after) * pixels[:, None]).square().sum(1)
     return (squared / (squared + 1.0).sqrt()).mean()
