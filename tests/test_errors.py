@@ -127,6 +127,7 @@ def test_real_allocation_failures_are_recognized():
 
 OUT_OF_MEMORY = [
     "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported at some other API call",
+    "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
     "DefaultCPUAllocator: not enough memory: you tried to allocate 4096 bytes.",
     "Failed to allocate 4096 bytes on device 'cuda:0'",
     "OpenCV(5.0.0) alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 4096 bytes in function 'f'",

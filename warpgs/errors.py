@@ -42,7 +42,7 @@ MAX_MESSAGE = 4000
 """Maximum number of characters of a message: names and values in it come from files."""
 
 OUT_OF_MEMORY = re.compile(
-    r"CUDA error: out of memory"  # torch, outside of its allocator: CUDA graphs and pinned memory
+    r"CUDA error: (out of memory|CUBLAS_STATUS_ALLOC_FAILED)"  # torch, outside of its allocator: graphs, pinned memory
     r"|can't allocate memory|not enough memory: you tried to allocate"  # torch on the CPU; the second on Windows
     r"|Failed to allocate \d+ bytes on device '[^']*'$"  # Warp; it says more if a capture forbids the allocation
     r"|\(-4:Insufficient memory\)"  # OpenCV

@@ -167,6 +167,33 @@ def test_out_of_memory_is_one_line_with_advice(data, run, monkeypatch, capsys, e
     assert "--factor" in text
 
 
+def test_out_of_memory_says_how_many_gaussians_were_too_many_and_leaves_the_last_checkpoint(
+    data, run, monkeypatch, capsys
+):
+    take = Step.__call__
+
+    def fail(step, plan, sample):
+        if plan.done == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        take(step, plan, sample)
+
+    monkeypatch.setattr(Step, "__call__", fail)
+    with pytest.raises(torch.OutOfMemoryError):
+        command.run(dataclasses.replace(tiny.CONFIG, data=data, out=run))
+    saved = checkpoint.load(checkpoint.list_checkpoints(run)[-1])
+    assert saved.metadata.iteration == 7
+    text = capsys.readouterr().out
+    assert "memory ran out in iteration 9, with 50 static and 20 dynamic Gaussians; --densify.max-gaussians" in text
+
+
+@pytest.mark.parametrize("error", [ValueError("a damaged file"), RuntimeError("a bug")])
+def test_other_errors_say_nothing_of_memory(data, run, monkeypatch, capsys, error):
+    monkeypatch.setattr(Step, "__call__", Mock(side_effect=error))
+    with pytest.raises(type(error)):
+        command.run(dataclasses.replace(tiny.CONFIG, data=data, out=run))
+    assert "memory" not in capsys.readouterr().out
+
+
 def test_a_capture_that_is_refused_leaves_no_run_folder(data, run, monkeypatch, capsys):
     shutil.rmtree(data / "resized_mask")
     options = ["--data", data, "--preset", "quick", "--device", "cpu", "--out", run]

@@ -12,7 +12,7 @@ from warpgs.data.check import quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.findings import Finding
 from warpgs.data.loaders import describe_layout
-from warpgs.errors import command
+from warpgs.errors import command, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
@@ -148,6 +148,10 @@ def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], qu
             trainer.callbacks = (*callbacks, HeldOut(logger), Previewer(run.folder, logger), run.require_present)
         try:
             finished = trainer.train(logger, interrupt)
+        except Exception as error:
+            if is_out_of_memory(error):
+                logger.log(_too_many(trainer))
+            raise
         finally:
             if is_first:
                 preview.remove(run.folder)
@@ -155,6 +159,13 @@ def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], qu
         interrupted = ranks.any_rank(not finished and interrupt.requested)
     if interrupted:
         raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
+
+
+def _too_many(trainer: Trainer) -> str:
+    """What to say of the scene when it has become too large for the memory."""
+    scene, iteration = trainer.scene, trainer.iteration + 1
+    numbers = f"{len(scene.static):,} static and {len(scene.dynamic):,} dynamic Gaussians"
+    return f"memory ran out in iteration {iteration}, with {numbers}; --densify.max-gaussians limits their sum"
 
 
 def _describe(trainer: Trainer, log: Log) -> None:
