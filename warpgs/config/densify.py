@@ -14,7 +14,7 @@ class DensifyConfig:
     """Density strategy, a key of DENSITY in warpgs/training/density/__init__.py: clone and split where the gradient on
     screen is large (3dgs), or the sum of the absolute values of its parts, which needs a larger ``gradient``, 8e-4 in
     gsplat (absgrad); or Markov chain Monte Carlo, which copies opaque Gaussians in the place of transparent ones, up to
-    ``max_gaussians``, and has ``loss.opacity`` and ``loss.scale`` of 0.01 (mcmc)."""
+    ``max_gaussians``, and for which its authors set ``loss.opacity`` and ``loss.scale`` to 0.01 (mcmc)."""
     every: Annotated[int, Bounds(min=1)] = 100
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 2e-4
