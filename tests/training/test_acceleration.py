@@ -23,9 +23,9 @@ pytestmark = pytest.mark.usefixtures("quickly")
 CAMERA = Camera(torch.eye(4), torch.tensor([[400.0, 0.0, 240.0], [0.0, 400.0, 135.0], [0.0, 0.0, 1.0]]), 480, 270)
 
 
-def measured(paths, camera=CAMERA):
-    """The term for [3, K, 3] paths."""
-    view = SimpleNamespace(camera=camera)
+def measured(paths, camera=CAMERA, num_static=0):
+    """The term for [3, K, 3] paths in a view of 100 pixels."""
+    view = SimpleNamespace(camera=camera, static_mask=torch.arange(100).view(10, 10) < num_static)
     return acceleration(LossInputs(LossConfig(), view, None, None, None, None, None, paths))
 
 
@@ -61,6 +61,12 @@ def test_the_term_is_the_mean_over_gaussians():
     paths = torch.cat([accelerated(p) for p in (1.0, 2.0, 5.0)], 1)
     parts = [measured(accelerated(p)).item() for p in (1.0, 2.0, 5.0)]
     assert measured(paths).item() == pytest.approx(sum(parts) / 3, rel=1e-5)
+
+
+def test_the_term_is_proportional_to_the_dynamic_part_of_the_image():
+    paths = accelerated(3.0)
+    assert measured(paths, num_static=90).item() == pytest.approx(0.1 * measured(paths).item(), rel=1e-5)
+    assert measured(paths, num_static=100).item() == 0.0
 
 
 @pytest.mark.parametrize("depths", [(-2.0, 0.0), (-0.001, -100.0)])

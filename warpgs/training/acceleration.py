@@ -48,10 +48,11 @@ def sample_paths(
 
 
 def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
-    """Mean acceleration of the sampled dynamic Gaussians as the view's camera sees it [pixels per frame²].
+    """Acceleration of the sampled dynamic Gaussians as the view's camera sees it [pixels per frame²].
 
     Accelerations a well below one pixel count as a², larger ones as a: a² / √(a² + 1). Those behind the camera, where a
-    pixel has no size, count as 0. Neither depth nor camera gets a gradient for making pixels larger.
+    pixel has no size, count as 0. The mean is multiplied by the fraction of the pixels that are dynamic, because the
+    image terms pull at small objects as much less. Neither depth nor camera gets a gradient for making pixels larger.
     """
     paths, camera = inputs.paths, inputs.view.camera
     assert paths is not None
@@ -62,4 +63,5 @@ def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
         depth = now @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
         pixels = torch.where(depth > 0.0, camera.K[0, 0] / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)
     squared = ((before - 2.0 * now + after) * pixels[:, None]).square().sum(1)
-    return (squared / (squared + 1.0).sqrt()).mean()
+    dynamic_fraction = (~inputs.view.static_mask).float().mean()
+    return (squared / (squared + 1.0).sqrt()).mean() * dynamic_fraction
