@@ -22,8 +22,8 @@ class LossConfig:
     """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
     paper. Large errors vanish sooner and fewer remain."""
     acceleration: float = 0.0
-    """Weight of the acceleration of dynamic Gaussians on screen [per pixel per frame²], of which images say nothing
-    between frames; 0 in the paper."""
+    """Weight of the acceleration of dynamic Gaussians on screen [per pixel per frame²], times the dynamic fraction of
+    the image; 0 in the paper. Images say nothing of the times between frames."""
     hidden_appearance: bool = True
     """Whether the joint image also trains how static Gaussians change over time while something dynamic hides them, as
     in the paper. No object is quite opaque, so that what it hides takes its colour."""

@@ -52,7 +52,7 @@ BEST = TrainConfig(
     ),
     loss=LossConfig(
         squared=15.0,
-        acceleration=0.01,
+        acceleration=0.1,
         hidden_appearance=False,
         dynamic_background="black",
         depth=0.5,
@@ -65,7 +65,7 @@ BEST = TrainConfig(
         branches_in_stage2="given-masks",
     ),
     optim=OptimConfig(means=5e-4, poses=5e-5),
-    densify=DensifyConfig(gradient=3e-4, max_elongation=10.0, min_pixels=8, weakest=0.01, reseed=0.05),
+    densify=DensifyConfig(gradient=3e-4, max_elongation=10.0, min_pixels=24, weakest=0.01, reseed=0.05),
     schedule=Schedule(
         pretrain=400,
         stage1=7_500,
@@ -101,7 +101,7 @@ PATIENT = dataclasses.replace(
         max_static_points=8_000,
         dynamic_points=3_000,
     ),
-    loss=dataclasses.replace(BEST.loss, ssim=0.0),
+    loss=dataclasses.replace(BEST.loss, ssim=0.0, acceleration=0.02),
     optim=OptimConfig(means=6.5e-4, sh_dc=1e-2, networks=3e-3, networks_end=1e-4),
     densify=DensifyConfig(gradient=2.5e-4, max_gaussians=20_000, min_pixels=8, reseed=0.05),
     schedule=Schedule(
