@@ -15,7 +15,7 @@ from warpgs.prepare.methods import DepthMethod
 from warpgs.prepare.motion_masks import clean, confirmed, find_dynamic, gather, outline, vote
 from warpgs.prepare.posed_frames import PosedFrames
 from warpgs.prepare.revisits import MIN_GAPS, Agreement, Evidence, Revisits
-from warpgs.prepare.segments import Graph, Segments
+from warpgs.prepare.segments import Graph, Segments, segment
 from warpgs.prepare.triangulation import Observation, fill_unknown, triangulate
 
 
@@ -183,12 +183,13 @@ def test_a_dynamic_colour_does_not_outvote_proof_that_a_surface_is_static():
     assert graph.dynamic_probabilities(1)[0].max() < 0.1  # the other kind of evidence
 
 
-def gathered(image: np.ndarray, residual: np.ndarray, witnesses: int = 0) -> Segments:
+def gathered(image: np.ndarray, residual: np.ndarray, witnesses: int = 0, followed: bool = True) -> Segments:
     """The evidence on an image, with a residual in pixels and nothing that agrees in the far frames."""
     nothing = np.zeros(residual.shape, np.float32)
     seen = np.full(residual.shape, witnesses, np.uint8)
     evidence = Evidence(residual, (Agreement(nothing, seen),) * 2, nothing + 1.0)
-    return gather(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), evidence)
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
+    return gather(lab, evidence, np.full(image.shape[:2], followed))
 
 
 def test_evidence_at_half_the_size_counts_where_it_is():
@@ -247,6 +248,28 @@ def test_stripes_are_no_evidence_of_motion(witnesses):
     )
     assert of_checks > 0.2
     assert of_stripes < 0.02 * of_checks
+
+
+@pytest.mark.parametrize(("contrast", "least", "most"), [(6, 0.0, 0.25), (60, 0.9, 1.0)])
+def test_weak_texture_that_no_frame_shows_again_is_little_evidence_of_motion(contrast, least, most):
+    """Blurred asphalt is found nowhere; strong texture would have been found if it stood still."""
+    row, column = np.mgrid[:144, :256]
+    checks = (128 + contrast * np.sin(row / 3.0) * np.sin(column / 3.0)).astype(np.uint8)
+    image, residual = np.repeat(checks[..., None], 3, 2), np.full((144, 256), np.nan, np.float32)
+    inner = np.s_[40:100, 80:180]
+    followed, lost = (evidence_on(inner, gathered(image, residual, 6, is_followed))[1] for is_followed in (True, False))
+    assert followed > 0.05
+    assert least * followed <= lost <= most * followed
+
+
+def test_evidence_on_a_thin_superpixel_counts_for_all_of_it():
+    image = np.full((96, 128, 3), 90, np.uint8)
+    image[:, 62:66] = 250
+    moves = np.full((1, 96, 128), 0.5, np.float32)
+    found = segment(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), moves[0], 0.0 * moves, moves)
+    thin = np.unique(found.labels[:, 63:65])
+    assert (found.sizes[thin] < 80).all()
+    assert np.allclose(found.dynamic[0, thin] / found.sizes[thin], 0.35, atol=0.02)
 
 
 def test_nothing_is_masked_where_nothing_moves():

@@ -61,6 +61,10 @@ chance; from twice that on, it is certain evidence of motion."""
 PATCH, GRADIENT_NOISE = 9, 0.3
 """Side of the patches whose directions of texture are compared [px]; noise of gradients [levels per px]."""
 
+TEXTURE, STRONG_TEXTURE = (0.8, 2.3), (2.0, 5.0)
+"""Slopes of lightness from which on texture counts, and in full; the second for evidence of motion on pixels that are
+found nowhere, as of blurred asphalt [levels per px]."""
+
 MIN_ISOTROPY, FULL_ISOTROPY = 0.1, 0.5
 """Texture across a patch's main direction over that along it, from which on evidence of motion counts, and in full."""
 
@@ -79,14 +83,17 @@ class _Finder:
 
     def find(self, frame: int) -> tuple[Segments, Carried | None]:
         """A frame's superpixels with the evidence on them, and where its pixels are in the next frame."""
-        segments = gather(self.labs[frame], self.revisits.evidence(frame))
-        carried = self._carried(frame) if frame + 1 < len(self.labs) else None
+        has_next = frame + 1 < len(self.labs)
+        carried = self._carried(frame, frame + 1 if has_next else frame - 1)
+        followed = np.zeros(self.labs[frame].shape[:2], bool)
+        followed.ravel()[carried[0]] = True
+        segments = gather(self.labs[frame], self.revisits.evidence(frame), followed)
         self.flows.release(frame)
-        return segments, carried
+        return segments, carried if has_next else None
 
-    def _carried(self, frame: int) -> Carried:
-        """The pixels that flow carries to the next frame, and their indices there."""
-        column, row, visible = self.flows.track(frame, frame + 1)
+    def _carried(self, frame: int, other: int) -> Carried:
+        """The pixels that flow carries to another frame, and their indices there."""
+        column, row, visible = self.flows.track(frame, other)
         height, width = self.labs[frame].shape[:2]
         across, down = width / column.shape[1], height / column.shape[0]
         # Interpolated, at pixel centres of the larger size.
@@ -99,20 +106,24 @@ class _Finder:
         return pixels.astype(np.int32), (row * width + column).ravel()[pixels].astype(np.int32)
 
 
-def gather(lab: UInt8[np.ndarray, "H W 3"], evidence: Evidence) -> Segments:
+def gather(lab: UInt8[np.ndarray, "H W 3"], evidence: Evidence, followed: Bool[np.ndarray, "H W"]) -> Segments:
     """The superpixels of a frame with the evidence on its textured pixels.
 
     Args:
         lab: [H, W, 3] image in 8-bit Lab.
         evidence: Evidence on its pixels, at this size or a smaller one.
+        followed: [H, W] whether optical flow finds a pixel in the next frame.
     """
     dx, dy = _gradients(lab)
-    texture = _texture(dx, dy)
+    texture = _texture(dx, dy, *TEXTURE)
     residual = np.nan_to_num(evidence.residual, nan=UNKNOWN_RESIDUAL)
     size = lab.shape[1::-1]
     contradiction = _contradiction(evidence.residual)
+    # Where neither the neighbours nor the next frame show a pixel, blur and grain are as likely as motion.
+    lost = cv2.resize(np.isnan(evidence.residual).astype(np.float32), size) * ~followed
+    motion_texture = texture + lost * (_texture(dx, dy, *STRONG_TEXTURE) - texture)
     # Along an edge or a stripe, flow is a guess: it may contradict the cameras, but not show motion.
-    motion_texture = texture * _isotropy(dx, dy)
+    motion_texture *= _isotropy(dx, dy)
     static, dynamic = [], []
     for agreement, witnesses in evidence.agreements:
         seen = witnesses >= NUM_AGREEING
@@ -139,9 +150,9 @@ def _gradients(lab: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cv2.Sobel(lightness, -1, 1, 0) / 8.0, cv2.Sobel(lightness, -1, 0, 1) / 8.0
 
 
-def _texture(dx: np.ndarray, dy: np.ndarray) -> Float[np.ndarray, "H W"]:
+def _texture(dx: np.ndarray, dy: np.ndarray, least: float, full: float) -> Float[np.ndarray, "H W"]:
     """[H, W] in [0, 1], whether a pixel has enough texture to be recognized."""
-    return np.clip((np.hypot(dx, dy) - 0.8) / 1.5, 0.0, 1.0)
+    return np.clip((np.hypot(dx, dy) - least) / (full - least), 0.0, 1.0)
 
 
 def _isotropy(dx: np.ndarray, dy: np.ndarray) -> Float[np.ndarray, "H W"]:

@@ -23,6 +23,10 @@ from scipy.sparse.linalg import cg
 SIDE = 12
 """Side of a superpixel [px]."""
 
+INNER, MIN_INNER = 0.7, 0.25
+"""Fraction of a superpixel that is inside of its border, usually, and the least from which evidence counts for all of
+it."""
+
 COLOR_WEIGHTS = np.array([0.7, 2.0, 2.0])
 """Weights of lightness and of the two colour axes in differences: shading changes lightness."""
 
@@ -85,7 +89,8 @@ def segment(
 ) -> Segments:
     """Superpixels (SLIC) of a frame with the evidence on their inner pixels.
 
-    A patch on a border shows both sides, so its evidence is not used.
+    A patch on a border shows both sides, so its evidence is not used: that on the inner pixels counts for all, because
+    arms and legs are thin and have few.
 
     Args:
         lab: [H, W, 3] image in 8-bit Lab.
@@ -103,13 +108,14 @@ def segment(
         return np.bincount(labels.ravel(), values.ravel(), count)
 
     sizes = total(np.ones(labels.shape))
+    weights = INNER * sizes / np.maximum(total(inner), MIN_INNER * sizes)
     return Segments(
         labels,
         sizes,
         np.stack([total(lab[..., c]) / sizes for c in range(3)], 1),
         total(np.log(np.maximum(inverse_depth, 1e-6))) / sizes,
-        np.stack([total(plane * inner) for plane in static]),
-        np.stack([total(plane * inner) for plane in dynamic]),
+        np.stack([weights * total(plane * inner) for plane in static]),
+        np.stack([weights * total(plane * inner) for plane in dynamic]),
     )
 
 
