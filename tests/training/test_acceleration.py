@@ -99,6 +99,14 @@ def test_without_dynamic_gaussians_the_term_is_0():
     assert measured(paths, make_camera()).item() == 0.0
 
 
+def test_without_dynamic_gaussians_the_deformation_is_not_trained(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path / "run", dataclasses.replace(tiny.CONFIG, assume="static"))
+    assert tiny.train(trainer)
+    assert not len(trainer.scene.dynamic)
+    state = trainer.step.optimizer.state
+    assert not any(state.get(parameter) for parameter in trainer.scene.deformation.parameters())
+
+
 def test_paths_are_one_frame_apart_and_at_most_half_a_frame_from_the_time(monkeypatch):
     scene, times = scene_of(5), []
 

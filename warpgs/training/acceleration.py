@@ -38,10 +38,12 @@ def sample_paths(
         [3, K, 3] positions [scene units]; K is at most ``MAX_SAMPLES``, 0 without dynamic Gaussians.
     """
     means = scene.dynamic.means.detach()
+    if not len(means):
+        return means.new_zeros(3, 0, 3)
     # Consecutive Gaussians, so that nothing is sorted or drawn: each belongs to as many samples as any other.
     count = min(len(means), MAX_SAMPLES)
     first = torch.arange(count, device=means.device)
-    means = means[(first + seed.long()) % max(1, len(means))]
+    means = means[(first + seed.long()) % len(means)]
     moment = time + (seed / MAX_SEED - 0.5) * interval
     shifts = (moment - interval, moment, moment + interval)
     return torch.stack([means + scene.deformation(means, shift)[:, :3] for shift in shifts])
