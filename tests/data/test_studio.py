@@ -4,6 +4,7 @@ import hashlib
 import itertools
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ import rich
 import torch
 
 from warpgs.data import studio
-from warpgs.data.builtin import builtin_folder
+from warpgs.data.builtin import builtin_folder, parse_builtin
 from warpgs.data.degraded_depth import DegradedDepth
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.studio import StudioSize, studio_capture, trace
@@ -114,7 +115,7 @@ def test_variants_differ_in_depth_only(cache):
 
 def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(studio, "StudioSize", lambda: SMALL)
+    monkeypatch.setattr(studio, "StudioSize", lambda num_frames: SMALL)
     capture = load_capture("builtin:studio?depth=none")
     assert len(capture.train) == 4
     assert re.search(r"making the built-in capture .*studio, once: this can take a minute\n", capsys.readouterr().err)
@@ -123,6 +124,34 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch, cap
     assert builtin_folder("builtin:studio").name == "studio"
     assert capsys.readouterr().err == ""
     assert load_capture("builtin:studio?depth=network").frame("left_000000").inverse_depth is not None
+
+
+def test_a_name_tells_depth_and_number_of_frames():
+    assert parse_builtin("builtin:studio") == ("studio", "exact", 160)
+    assert parse_builtin("builtin:studio?frames=12") == ("studio", "exact", 12)
+    assert parse_builtin("builtin:studio?frames=12&depth=none") == ("studio", "none", 12)
+    assert parse_builtin("builtin:room") == ("room", "exact", 160)
+
+
+@pytest.mark.parametrize("name", ["studio?frames", "studio?frames=1", "studio?frames=161", "studio?frames=-3"])
+def test_a_number_of_frames_that_the_studio_lacks_is_refused(name):
+    with pytest.raises(ValueError, match="expected 2 to 160 frames, got"):
+        parse_builtin(f"builtin:{name}")
+
+
+@pytest.mark.parametrize("name", ["room?frames=12", "studio?frame=12", "studio?depth=12", "balls?depth=none"])
+def test_an_option_that_a_built_in_capture_lacks_is_refused(name):
+    with pytest.raises(ValueError, match=re.escape(f"there is no built-in capture builtin:{name}")):
+        parse_builtin(f"builtin:{name}")
+
+
+def test_fewer_frames_take_wider_steps_along_the_same_path(cache):
+    many, few = (
+        load_capture(studio_capture("none", cache, replace(SMALL, num_frames=number), quiet=True)) for number in (4, 2)
+    )
+    for k in (0, -1):
+        assert torch.equal(few.cameras[few.train[k]].viewmat, many.cameras[many.train[k]].viewmat)
+        assert few.cameras[few.train[k]].time == many.cameras[many.train[k]].time
 
 
 @pytest.mark.parametrize("quiet", [False, True])

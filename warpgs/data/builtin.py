@@ -1,13 +1,16 @@
-"""Captures that the package renders itself, by name: ``--data builtin:studio?depth=network``."""
+"""Captures that the package renders itself, by name: ``--data 'builtin:studio?depth=network&frames=12'``."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple, cast
 
 from warpgs.errors import suggestion
 
 PREFIX = "builtin:"
 
 DEPTHS = ("exact", "network", "none")
+MIN_FRAMES, MAX_FRAMES = 2, 160
+"""Number of training frames of ``builtin:studio?frames=N``; as many are the default."""
+
 NAMES = ("builtin:room", "builtin:balls", "builtin:studio", *(f"builtin:studio?depth={depth}" for depth in DEPTHS))
 
 
@@ -16,19 +19,38 @@ def is_builtin(data: Path | str) -> bool:
     return str(data).startswith(PREFIX)
 
 
-def parse_builtin(data: Path | str) -> tuple[str, str]:
-    """Which built-in capture a name means, without its prefix, and its depth, which only the studio has a choice of.
+class Builtin(NamedTuple):
+    """A built-in capture.
+
+    Attributes:
+        name: "room", "balls" or "studio".
+        depth: Depth of the studio.
+        num_frames: Number of training frames of the studio.
+    """
+
+    name: str
+    depth: Literal["exact", "network", "none"] = "exact"
+    num_frames: int = MAX_FRAMES
+
+
+def parse_builtin(data: Path | str) -> Builtin:
+    """The built-in capture that a name means.
 
     Raises:
         ValueError: If there is no such capture.
     """
     given = str(data).removeprefix(PREFIX)
-    if str(data) not in NAMES:
+    name, mark, query = given.partition("?")
+    options = dict(part.partition("=")[::2] for part in query.split("&")) if mark else {}
+    depth, frames = options.pop("depth", "exact"), options.pop("frames", str(MAX_FRAMES))
+    is_known = f"{PREFIX}{name}" in NAMES and not options and (name == "studio" or not mark)
+    if not is_known or depth not in DEPTHS:
         # Without the prefix, which would make all names similar.
         close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
         raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}{close}")
-    name, _, depth = given.partition("?depth=")
-    return name, depth or "exact"
+    if not frames.isdecimal() or not MIN_FRAMES <= int(frames) <= MAX_FRAMES:
+        raise ValueError(f"{data}: expected {MIN_FRAMES} to {MAX_FRAMES} frames, got {frames}")
+    return Builtin(name, cast(Any, depth), int(frames))
 
 
 def require_factor(data: Path | str, factor: int | None) -> None:
@@ -49,8 +71,7 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
         ValueError: If there is no such capture, or it lacks the factor.
         OSError: If it cannot be written.
     """
-    depth: Any
-    name, depth = parse_builtin(data)
+    name, depth, num_frames = parse_builtin(data)
     require_factor(data, factor)
     if name == "room":
         from .synthetic import builtin_capture  # imports torch
@@ -60,6 +81,6 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
         from .balls import balls_capture
 
         return balls_capture(quiet=quiet)
-    from .studio import studio_capture
+    from .studio import StudioSize, studio_capture
 
-    return studio_capture(depth, quiet=quiet)
+    return studio_capture(depth, size=StudioSize(num_frames=num_frames), quiet=quiet)

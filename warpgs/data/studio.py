@@ -4,7 +4,9 @@
 room a mirroring ring tumbles, a glossy body is squashed and changes its lobes, and both throw soft shadows. Masks are
 exact, points are noisy, depth is exact, has the errors of a network, or is missing:
 
-    builtin:studio    builtin:studio?depth=network    builtin:studio?depth=none
+    builtin:studio    builtin:studio?depth=network    builtin:studio?depth=none    builtin:studio?frames=12
+
+With fewer frames, the camera and all that moves take wider steps along the same paths.
 
 The content is the same bits on every machine, so numbers can be compared: the images by the ray tracer (see its
 kernels), the rest by computing in double precision before the last rounding.
