@@ -106,6 +106,22 @@ def test_the_state_of_a_strategy_is_resumed(trainer, data):
     assert resumed.step.density.views.any()
 
 
+@pytest.mark.parametrize("strategy", list(DENSITY))
+def test_with_every_strategy_a_resumed_run_ends_with_the_same_bits(data, tmp_path, strategy):
+    densify = dataclasses.replace(tiny.CONFIG.densify, strategy=strategy, max_elongation=3.0, reseed=0.05)
+    optim = dataclasses.replace(tiny.CONFIG.optim, poses=1e-3)
+    config = dataclasses.replace(tiny.CONFIG, densify=densify, optim=optim, antialias=True)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    with tiny.in_haste():
+        assert tiny.train(tiny.trainer(data, whole, config))
+        for stop in (8, 16, tiny.LENGTH):  # before the first densification, and between others
+            trainer = tiny.trainer(data, parts, config)
+            trainer.restore_newest(print)
+            tiny.train(trainer, tiny.StopWhen(lambda trainer=trainer, stop=stop: trainer.iteration >= stop))
+            assert trainer.iteration == stop
+    assert tiny.differences(tiny.state(whole), tiny.state(parts)) == []
+
+
 FOCAL = 50.0
 
 
