@@ -135,22 +135,32 @@ def test_other_cameras_and_other_training_frames_have_a_median_depth_of_their_ow
     assert capture.median_depth == pytest.approx(3.0)
 
 
-def test_the_view_width_is_what_an_image_shows_at_the_median_depth():
+def test_the_view_size_is_the_width_of_what_an_image_shows_at_the_median_depth():
     capture = with_points(make_capture()[0], 3.0)
     camera = capture.cameras["f0"]
     corners = camera.unproject(torch.tensor([0, 0]), torch.tensor([0, camera.width - 1]), torch.full((2,), 3.0))
     between_centres = float((corners[1] - corners[0]).norm())
-    assert capture.view_width == pytest.approx(between_centres * camera.width / (camera.width - 1))
+    assert capture.view_size == pytest.approx(between_centres * camera.width / (camera.width - 1))
 
 
 @pytest.mark.parametrize("zoom", [0.2, 5.0])
-def test_a_fraction_of_the_view_width_is_that_fraction_of_the_image_through_every_lens(zoom):
+def test_a_fraction_of_the_view_size_is_that_fraction_of_the_image_through_every_lens(zoom):
     capture = with_points(make_capture()[0], 3.0)
     K = capture.cameras["f0"].K * torch.tensor([zoom, zoom, 1.0])[:, None]
     K[:2, 2] = capture.cameras["f0"].K[:2, 2]
     zoomed = capture.with_cameras({n: dataclasses.replace(c, K=K) for n, c in capture.cameras.items()})
-    shift = 0.1 * zoomed.view_width
+    shift = 0.1 * zoomed.view_size
     assert shift / zoomed.median_depth * float(K[0, 0]) == pytest.approx(0.1 * zoomed.cameras["f0"].width)
+
+
+def test_portrait_and_landscape_have_one_view_size():
+    capture = with_points(make_capture()[0], 3.0)
+    turned = {
+        name: dataclasses.replace(camera, K=camera.K[[1, 0, 2]][:, [1, 0, 2]], width=camera.height, height=camera.width)
+        for name, camera in capture.cameras.items()
+    }
+    assert capture.cameras["f0"].width > capture.cameras["f0"].height
+    assert capture.with_cameras(turned).view_size == pytest.approx(capture.view_size)
 
 
 def test_a_capture_without_training_frames_is_refused():

@@ -533,7 +533,7 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
 def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config, is_bounded):
     capture = make_capture(100.0 * random_points(50))
     max_scale = dynamic_gaussians(capture, ALIGNMENT, config).scales.max()
-    assert (max_scale < 1.0001 * dynamic_points.MAX_SCALE * capture.view_width) == is_bounded
+    assert (max_scale < 1.0001 * dynamic_points.MAX_SCALE * capture.view_size) == is_bounded
 
 
 def test_if_everything_is_assumed_dynamic_the_points_become_dynamic_gaussians():

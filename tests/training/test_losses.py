@@ -147,7 +147,7 @@ def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **opti
     assert plan.phase.stage == stage
     views = Views(capture, torch.device("cpu"), 1 << 30, loss.mask_margin)
     trusts = DepthTrust(*torch.tensor(trust)[:, None])
-    return scene, plan, Step(config, scene, views, ALIGNMENTS, trusts, capture.view_width)
+    return scene, plan, Step(config, scene, views, ALIGNMENTS, trusts, capture.view_size)
 
 
 def terms_of(stage, loss=LOSS, schedule=SCHEDULE):

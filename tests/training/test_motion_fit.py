@@ -15,7 +15,7 @@ from warpgs.training.motion_fit import MAX_ERROR, fit_motion
 
 NUM_VIEWS, NUM_POINTS = 21, 40
 """Frames, and points on each of two objects in a frame."""
-VIEW_WIDTH = 4.0
+VIEW_SIZE = 4.0
 TIMES = torch.linspace(0, 1, NUM_VIEWS)
 COLORS = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
 """Colours of the two objects."""
@@ -55,7 +55,7 @@ def new_deformation(device="cpu", **model):
 def fit(found, deformation, num_steps=300, is_stopped=bool, graph=True):
     schedule = dataclasses.replace(TrainConfig().schedule, fit_motion=num_steps)
     config = dataclasses.replace(TrainConfig(), schedule=schedule, graph=graph)
-    return fit_motion(deformation, found, TIMES, VIEW_WIDTH, config, generator(), is_stopped)
+    return fit_motion(deformation, found, TIMES, VIEW_SIZE, config, generator(), is_stopped)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_canonical_points_are_deformed_to_where_they_were_seen(fitted):
     assert len(canonical.views) > 0.9 * len(FOUND.views)
     for view in range(NUM_VIEWS):
         seen = FOUND.positions[FOUND.views == view]
-        assert torch.cdist(deformed(deformation, canonical, view), seen).amin(1).max() <= MAX_ERROR * VIEW_WIDTH
+        assert torch.cdist(deformed(deformation, canonical, view), seen).amin(1).max() <= MAX_ERROR * VIEW_SIZE
 
 
 def test_each_object_is_one_cluster_in_canonical_space(fitted):
@@ -121,7 +121,7 @@ def test_objects_are_followed_through_frames_with_few_points(monkeypatch, repeat
 
 
 def test_repetitions_change_neither_the_distance_of_a_view_nor_its_gradient():
-    points = motion_fit._PointsByView(UNEVEN, TIMES, VIEW_WIDTH, torch.device("cpu"), generator())
+    points = motion_fit._PointsByView(UNEVEN, TIMES, VIEW_SIZE, torch.device("cpu"), generator())
     assert points.counts.unique().tolist() == [12, 2 * NUM_POINTS]
     deformed = (points.home + 0.3 * torch.randn(points.home.shape, generator=generator())).requires_grad_()
     for index, view in enumerate(points.views):
@@ -160,7 +160,7 @@ def test_an_object_that_no_canonical_frame_shows_keeps_its_points(x):
     assert len(grey.views) > 0.7 * 5 * 20
     for view in (16, 20):
         seen = points.positions[(points.views == view) & (points.colors == 0.5).all(1)]
-        assert torch.cdist(deformed(deformation, grey, view), seen).amin(1).max() <= MAX_ERROR * VIEW_WIDTH
+        assert torch.cdist(deformed(deformation, grey, view), seen).amin(1).max() <= MAX_ERROR * VIEW_SIZE
 
 
 def test_points_that_the_deformation_does_not_reach_are_dropped():
@@ -265,7 +265,7 @@ def test_sides_that_no_canonical_point_shows_are_found_where_an_object_turns():
     positions = sphere + torch.cat(turns)
     facing = positions[:, 1] < 0.0
     found = DynamicPoints(positions, torch.full_like(positions, 0.5), views, True).chosen(facing)
-    points = motion_fit._PointsByView(found, TIMES, VIEW_WIDTH, torch.device("cpu"), generator())
+    points = motion_fit._PointsByView(found, TIMES, VIEW_SIZE, torch.device("cpu"), generator())
 
     class Known(Turned):
         def forward(self, points, time):
@@ -286,7 +286,7 @@ def test_where_positions_are_searched_and_how_far_from_the_canonical_point(monke
     colors = COLORS[[0, 0, 1]]
     seen = torch.tensor([[-0.5, 0.0, 0.0], [-0.5, -0.1, 0.0], [0.2, 0.3, 0.0]])
     found = DynamicPoints(seen, colors, torch.full((3,), NUM_VIEWS - 1), True)
-    points = motion_fit._PointsByView(found, TIMES, VIEW_WIDTH, torch.device("cpu"), generator())
+    points = motion_fit._PointsByView(found, TIMES, VIEW_SIZE, torch.device("cpu"), generator())
     home = torch.tensor([[0.5, 0.0, 0.0]])
     points.home = points._features(found.chosen(torch.tensor([0]))._replace(positions=home))
 

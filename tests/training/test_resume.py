@@ -113,7 +113,7 @@ def test_a_run_of_version_0_3_keeps_the_extent_as_its_unit(data, tmp_path, poses
     tiny.edit_metadata(checkpoint.path_of(tmp_path, 0), lambda fields: fields.pop("unit"))
     again = tiny.trainer(data, tmp_path, config)
     again.restore_newest(print)
-    assert first.unit == first.capture.view_width
+    assert first.unit == first.capture.view_size
     assert again.unit == again.step.unit == first.capture.extent != first.unit
     assert again.views.poses is None or again.views.poses.unit == again.unit
     again.save()

@@ -112,13 +112,13 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
     protocol = Protocol(config, has_depth=True)
     result: dict[str, Any] = {"gaussians": num_gaussians, "width": size[0], "height": size[1]}
     for stage in (protocol.stage1, protocol.stage2):
-        step = Step(config, scene, views, alignments, trust, capture.view_width)
+        step = Step(config, scene, views, alignments, trust, capture.view_size)
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     scene = random_scene(splats, torch.zeros_like(dynamic), config.model).to(device)
     loss = dataclasses.replace(config.loss, branches_in_stage2="no")
     plain_config = dataclasses.replace(config, static_geometry=True, loss=loss)
-    step = Step(plain_config, scene, views, alignments, trust, capture.view_width)
+    step = Step(plain_config, scene, views, alignments, trust, capture.view_size)
     plain = dataclasses.replace(plan, phase=plain_phase(plan.phase))
     result["3dgs_ms"] = statistics.median(_times(step, plain, device, repeats))
     if device == "cuda":

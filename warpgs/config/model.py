@@ -54,7 +54,7 @@ class ModelConfig:
     and HyperNeRF (grey)."""
     bound_sizes: bool = True
     """Whether initial sizes, which are distances to neighbours, are between 1/1000 and 10 times their median, and those
-    of dynamic Gaussians of unknown depth under 1.9 % of the view width; 3DGS has no such bounds."""
+    of dynamic Gaussians of unknown depth under 1.9 % of the view size; 3DGS has no such bounds."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
     dropout: Annotated[float, Bounds(max=0.9)] = 0.0

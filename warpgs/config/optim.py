@@ -13,7 +13,7 @@ class OptimConfig:
     means: float = 1.6e-4
     """Positions, times ``means_scale``; decays exponentially to 1 %."""
     means_scale: Annotated[float | None, Bounds(positive=True)] = None
-    """Factor of the rate of positions: the view width of the capture if None, 5 in Deformable-3DGS, which the paper
+    """Factor of the rate of positions: the view size of the capture if None, 5 in Deformable-3DGS, which the paper
     builds upon: 8e-4 is also the rate that it prints (section Experimental Setup)."""
     means_anneal: Literal["run", "trained"] = "run"
     """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
@@ -29,7 +29,7 @@ class OptimConfig:
     sh_rest: float = 1.25e-4
     """Spherical harmonics of higher degrees."""
     poses: float = 0.0
-    """Initial rate of the corrections of camera poses [rad, and fractions of the view width]; decays exponentially to
+    """Initial rate of the corrections of camera poses [rad, and fractions of the view size]; decays exponentially to
     1 %. 0: cameras stay as the capture has them (paper)."""
     networks: Annotated[float, Bounds(positive=True)] = 8e-4
     """Initial rate of both networks (paper, training protocol)."""

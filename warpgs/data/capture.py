@@ -230,15 +230,15 @@ class Capture:
         return median_depth(cameras, self.points, self._inverse_depths() if self.metric_depth else ())
 
     @property
-    def view_width(self) -> float:
-        """Width of what an image shows at the median depth [scene units].
+    def view_size(self) -> float:
+        """Length of what an image shows at the median depth, along its larger side [scene units].
 
-        It is the unit of what must mean the same on screen: moving by a fraction of it moves a point at
-        that depth by that fraction of the image, whatever the lens.
+        It is the unit of what must mean the same on screen: moving by a fraction of it moves a point at that depth by
+        that fraction of the image, whatever the lens, in portrait and landscape.
         """
         cameras = [self.cameras[name] for name in self.train]
-        ratios = torch.tensor([camera.width / float(camera.K[0, 0]) for camera in cameras], dtype=torch.float64)
-        return self.median_depth * float(ratios.median())
+        slopes = [torch.tensor(camera.size) / camera.K.diagonal()[:2] for camera in cameras]
+        return self.median_depth * float(torch.stack(slopes).amax(1).median())
 
     def _inverse_depths(self) -> Iterator[Tensor]:
         for name in evenly_spaced(self.train, MAX_DEPTH_IMAGES):

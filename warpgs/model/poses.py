@@ -14,7 +14,7 @@ class PoseCorrections(nn.Module):
 
     Args:
         num: T.
-        unit: Length of a translation of 1 [scene units]: the width of what an image shows, so that rotations and
+        unit: Length of a translation of 1 [scene units]: the size of what an image shows, so that rotations and
             translations of one size move the image by about as much.
 
     Attributes:

@@ -35,7 +35,7 @@ PIXELS_PER_CHUNK = 8_192
 """Number of pixels whose distances to the points are computed at once; keeps the table below 100 MB."""
 
 MAX_SCALE = 0.019
-"""Maximum standard deviation of initial dynamic Gaussians of unknown depth, as a fraction of the view width."""
+"""Maximum standard deviation of initial dynamic Gaussians of unknown depth, as a fraction of the view size."""
 
 
 NEWTON_STEPS, MAX_STEP = 12, 1.5

@@ -109,7 +109,7 @@ def dynamic_gaussians(
     config = protocol.config
     max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if isinstance(deformation, SplineDeformation):
-        return start_from_tracks(find_tracks(capture), deformation, config, capture.view_width, generator)
+        return start_from_tracks(find_tracks(capture), deformation, config, capture.view_size, generator)
     if capture.assumption == "dynamic" and len(capture.points):
         return _gaussians_at_points(config, capture, generator)
     count = max(max_count, MAX_POINTS) if protocol.fits_motion else max_count
@@ -118,7 +118,7 @@ def dynamic_gaussians(
         return Gaussians.empty(0, degree)
     if protocol.fits_motion and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
-        fitted = fit_motion(deformation, found, times, capture.view_width, config, generator, is_stopped)
+        fitted = fit_motion(deformation, found, times, capture.view_size, config, generator, is_stopped)
         if fitted is None:
             return None
         found = fitted
@@ -126,7 +126,7 @@ def dynamic_gaussians(
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
         return gaussians_in_box(capture, max_count, config, generator)
-    largest = math.inf if found.depth_known else MAX_SCALE * capture.view_width
+    largest = math.inf if found.depth_known else MAX_SCALE * capture.view_size
     return gaussians_at(found.positions, found.colors, config.model, largest)
 
 

@@ -29,7 +29,7 @@ WINDOW = 0.015
 """Largest difference in time, of all in [0, 1], between frames that together give the canonical points."""
 
 POSITION_UNIT, COLOR_UNIT = 0.019, 0.15
-"""Differences of positions, as a fraction of the view width, and of colours in [0, 1] that count as 1."""
+"""Differences of positions, as a fraction of the view size, and of colours in [0, 1] that count as 1."""
 
 MAX_SQUARED_DISTANCE = 9.0
 """Limit that squared distances approach (Geman and McClure): frames see sides that others do not."""
@@ -50,14 +50,14 @@ MAX_STRETCH = 1.5
 the same where an object turns as a whole."""
 
 MAX_ERROR = 0.011
-"""Maximum distance of a deformed point from where it was seen, as a fraction of the view width."""
+"""Maximum distance of a deformed point from where it was seen, as a fraction of the view size."""
 
 
 def fit_motion(
     deformation: nn.Module,
     found: DynamicPoints,
     times: Float[Tensor, " T"],
-    view_width: float,
+    view_size: float,
     config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
@@ -71,7 +71,7 @@ def fit_motion(
         deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
-        view_width: Width of what an image shows at the median depth [scene units].
+        view_size: Of the capture [scene units].
         config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
             says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
@@ -86,7 +86,7 @@ def fit_motion(
     device = next((parameter.device for parameter in fitted.parameters()), None)
     if device is None:
         return found
-    points = _PointsByView(found, times, view_width, device, generator)
+    points = _PointsByView(found, times, view_size, device, generator)
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     deformation.load_state_dict(fitted.state_dict())
@@ -152,11 +152,11 @@ class _PointsByView:
         self,
         found: DynamicPoints,
         times: Float[Tensor, " T"],
-        view_width: float,
+        view_size: float,
         device: torch.device,
         generator: torch.Generator,
     ) -> None:
-        self.unit, self.max_error = POSITION_UNIT * view_width, MAX_ERROR * view_width
+        self.unit, self.max_error = POSITION_UNIT * view_size, MAX_ERROR * view_size
         features = self._features(found)
         views, counts = found.views.unique(return_counts=True)
         start = _start_time(times[views], counts)

@@ -40,7 +40,7 @@ def start_from_tracks(
     tracks: list[Track],
     deformation: SplineDeformation,
     config: TrainConfig,
-    view_width: float,
+    view_size: float,
     generator: torch.Generator,
 ) -> Gaussians:
     """Dynamic Gaussians on objects that were tracked, and the paths along which these move.
@@ -51,7 +51,7 @@ def start_from_tracks(
         tracks: At least one.
         deformation: Its homes and paths are replaced.
         config: Number of Gaussians, degree of spherical harmonics and limits of size.
-        view_width: Width of what an image shows at the median depth [scene units].
+        view_size: Of the capture [scene units].
         generator: CPU generator that chooses the pixels.
     """
     start = _time_apart(tracks)
@@ -61,7 +61,7 @@ def start_from_tracks(
     positions = torch.cat([points for points, _ in parts]) + starts[label]
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
-    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_width)
+    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_size)
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
     deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))

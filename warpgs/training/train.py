@@ -214,7 +214,7 @@ def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
     """Logs how far the training cameras were moved."""
     turned, shifted = poses.angles().rad2deg(), 100.0 * poses.shifts()
     log(
-        f"camera poses were corrected by {turned.median():.2f}° and {shifted.median():.2f} % of the view width "
+        f"camera poses were corrected by {turned.median():.2f}° and {shifted.median():.2f} % of the view size "
         f"(medians; at most {turned.max():.2f}° and {shifted.max():.2f} %)"
     )
 

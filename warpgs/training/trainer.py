@@ -56,7 +56,7 @@ class Trainer:
         capture: The capture, with the masks and background that the config implies.
         scene: What is trained.
         iteration: Iterations done.
-        unit: Of learning rates of positions and of corrections of poses [scene units]: the capture's view width, or
+        unit: Of learning rates of positions and of corrections of poses [scene units]: the capture's view size, or
             the one with which the run was begun.
         gains: [T, 3] what the colours of each training frame are divided by.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
@@ -78,7 +78,7 @@ class Trainer:
         self.device = torch.device(config.device or "cpu")
         self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3).float()
         gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
-        self.unit = self.capture.view_width
+        self.unit = self.capture.view_size
         poses = PoseCorrections(len(self.capture.train), self.unit).to(self.device) if config.optim.poses else None
         self.views = Views(
             self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph

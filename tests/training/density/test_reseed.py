@@ -76,7 +76,7 @@ def test_the_fraction_of_lost_pixels_grows_with_what_is_lost(trainer):
 def test_added_gaussians_are_deformed_to_where_they_were_seen(trainer):
     positions = trainer.scene.dynamic.means.detach().clone()
     found = DynamicPoints(positions, torch.rand(len(positions), 3), torch.arange(len(positions)) % 3, True)
-    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, view_width=1.0)
+    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, view_size=1.0)
     assert len(added) == len(positions)
     for index in range(3):
         chosen = found.views == index
@@ -93,7 +93,7 @@ def test_points_that_no_canonical_position_is_found_for_are_left_out(trainer):
     found = DynamicPoints(
         positions, torch.rand(len(positions), 3), torch.zeros(len(positions), dtype=torch.int64), True
     )
-    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, view_width=1.0)
+    added = gaussians_that_show(found, trainer.scene, trainer.views, trainer.config, view_size=1.0)
     assert len(added) < len(positions)
 
 

@@ -29,7 +29,7 @@ MAX_LOST_ALPHA = 0.1
 where Gaussians overlap."""
 
 MAX_INVERSION_ERROR = 0.004
-"""Maximum distance of a deformed point from where it was seen, as a fraction of the view width."""
+"""Maximum distance of a deformed point from where it was seen, as a fraction of the view size."""
 
 MIN_REGION = 1e-3
 """Fraction of the training pixels above which a run does not go on without the Gaussians that show them."""
@@ -89,7 +89,7 @@ def lost_fraction(views: Views, mask_of: Callable[[View], Bool[Tensor, "H W"]]) 
 
 @torch.no_grad()
 def gaussians_that_show(
-    found: DynamicPoints, scene: SplitScene, views: Views, config: TrainConfig, view_width: float
+    found: DynamicPoints, scene: SplitScene, views: Views, config: TrainConfig, view_size: float
 ) -> Gaussians:
     """Dynamic Gaussians that the network deforms to points, each at the time of its view.
 
@@ -100,21 +100,21 @@ def gaussians_that_show(
         scene: Its deformation must be in use.
         views: The views of the points.
         config: Degree of spherical harmonics and limits of size.
-        view_width: Width of what an image shows at the median depth [scene units].
+        view_size: Of the capture [scene units].
     """
     canonical, kept = torch.empty_like(found.positions), torch.zeros(len(found.positions), dtype=torch.bool)
     for index in found.views.unique().tolist():
         chosen = found.views == index
         seen, time = found.positions[chosen].to(views.device), views[index].time
-        x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_width)
+        x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
-    return gaussians_at(canonical[kept], found.colors[kept], config.model, MAX_SCALE * view_width)
+    return gaussians_at(canonical[kept], found.colors[kept], config.model, MAX_SCALE * view_size)
 
 
 def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generator: torch.Generator) -> Gaussians:
     """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
     positions = random_points(capture.points, count, generator)
-    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, MAX_SCALE * capture.view_width)
+    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, MAX_SCALE * capture.view_size)
 
 
 def reseed(at: Adaptation) -> None:
@@ -130,7 +130,7 @@ def reseed(at: Adaptation) -> None:
     generator = at.generator("reseed")
     found = unproject_pixels(at.capture, views, at.alignments, mask_of, count, generator)
     if found is not None:
-        added = gaussians_that_show(found, scene, views, config, at.capture.view_width)
+        added = gaussians_that_show(found, scene, views, config, at.capture.view_size)
         if not len(added) + len(scene.dynamic):
             added = gaussians_in_box(at.capture, count, config, generator)
         optim.append(at.optimizer, scene.dynamic, added)
