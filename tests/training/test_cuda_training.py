@@ -8,7 +8,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator, relative_error
-from tests.training.test_motion_fit import DEPTH, TIMES, UNEVEN, fit, max_error, new_deformation
+from tests.training.test_motion_fit import TIMES, UNEVEN, VIEW_SIZE, fit, max_error, new_deformation
 from warpgs.config.presets import PRESETS
 from warpgs.model.fields import FIELDS
 from warpgs.model.trunk import Trunk
@@ -150,7 +150,7 @@ def test_work_on_all_views_is_the_same_in_a_graph(data, tmp_path, resident_bytes
 def test_canonical_positions_are_the_same_in_a_graph(model):
     deformation = new_deformation("cuda", deformation=model)
     fit(UNEVEN, deformation, 50)
-    points = motion_fit._PointsByView(UNEVEN, TIMES, DEPTH, torch.device("cuda"), generator())
+    points = motion_fit._PointsByView(UNEVEN, TIMES, VIEW_SIZE, torch.device("cuda"), generator())
     eager, replayed = (points.canonical(deformation, UNEVEN, is_replayed) for is_replayed in (False, True))
     assert torch.equal(eager.views, replayed.views)
     assert relative_error(replayed.positions, eager.positions) < 1e-3
