@@ -173,6 +173,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.count is not None and options.count < MIN_TRAIN:
         parser.error(f"--count must be at least {MIN_TRAIN}, got {options.count}")
+    if not (options.davis / "JPEGImages/480p").is_dir():
+        parser.error(f"{options.davis} has no folder JPEGImages/480p")
     failed = False
     print(f"{'clip':16} frames  recall  IoU    IoU below 0.5")
     with ThreadPoolExecutor(options.jobs) as pool:

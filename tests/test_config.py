@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.scenes import make_camera
-from warpgs.config import LossConfig, ModelConfig, TrainConfig, scaled, validate
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig, scaled, validate
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
 from warpgs.runs.config_file import NAME, read_config, write_config
@@ -73,6 +73,13 @@ def test_networks_without_any_input_of_position_or_time_are_refused(bands):
     validate(TrainConfig(model=model))
     with pytest.raises(ValueError, match=r"without model\.raw_input the networks need"):
         validate(TrainConfig(model=dataclasses.replace(model, raw_input=False)))
+
+
+def test_sizes_in_pixels_are_refused_as_fractions_of_the_extent():
+    pixels = DensifyConfig(unit="extent")
+    with pytest.raises(ValueError, match=r"are fractions of the extent, 0.01 and 0.1 in 3DGS, got 2.0 and 20.0"):
+        validate(TrainConfig(densify=pixels))
+    validate(TrainConfig(densify=dataclasses.replace(pixels, split_size=0.01, max_size=0.1)))
 
 
 def test_a_schedule_with_only_pretraining_is_refused():

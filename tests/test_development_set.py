@@ -162,3 +162,11 @@ def test_a_capture_of_more_frames_is_refused(make, capsys):
         make("--count", "4")
     assert ended.value.code == 1
     assert "was made from more than 7 frames" in capsys.readouterr().out
+
+
+def test_a_folder_that_is_not_davis_is_refused_once(make, davis, capsys):
+    (davis / "JPEGImages").rename(davis / "images")
+    with pytest.raises(SystemExit) as ended:
+        make("--clips", "walk", "run")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.count("has no folder JPEGImages/480p") == 1

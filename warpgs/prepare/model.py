@@ -65,11 +65,15 @@ def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Camer
         _angle(model, points),
         weak_features,
     )
-    if found.angle < MIN_ANGLE or len(points) < MIN_POINTS:
+    if len(points) < MIN_POINTS:
         raise NoCamerasError(
-            f"the camera hardly moves: {len(points)} points at a median triangulation angle of {found.angle:.1f}° were "
-            f"found; at least {MIN_POINTS} and {MIN_ANGLE}° are needed; walk around the scene instead of turning on "
-            "the spot"
+            f"only {len(points)} points were found, at least {MIN_POINTS} are needed: too little of what stands still "
+            "is sharp and has texture, or the camera hardly moves"
+        )
+    if found.angle < MIN_ANGLE:
+        raise NoCamerasError(
+            f"the camera hardly moves: the median triangulation angle is {found.angle:.1f}°, at least {MIN_ANGLE}° is "
+            "needed; walk around the scene instead of turning on the spot"
         )
     return found
 

@@ -106,7 +106,9 @@ class Steps:
                 reason = str(error)
             # The static regions were sufficient for the first pass; its cameras are as good as without masks.
             first.save(path)
-            self.journal.notes.append(f"the cameras are those of the first pass, without masks: with masks, {reason}")
+            self.journal.notes.append(
+                f"the cameras may be wrong: they are from before what moves was masked, because after that {reason}"
+            )
             return f"{len(first.names)} frames, those of the first pass"
 
         return self.journal.result(name, Cameras.load, make, Cameras.files)
