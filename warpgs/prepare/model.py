@@ -65,17 +65,22 @@ def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Camer
         _angle(model, points),
         weak_features,
     )
-    if len(points) < MIN_POINTS:
+    _require_parallax(found)
+    return found
+
+
+def _require_parallax(found: Cameras) -> None:
+    """Raises NoCamerasError if there are too few points, or the camera hardly moves."""
+    if len(found.points) < MIN_POINTS:
         raise NoCamerasError(
-            f"only {len(points)} points were found, at least {MIN_POINTS} are needed: too little of what stands still "
-            "is sharp and has texture, or the camera hardly moves"
+            f"only {len(found.points)} points were found, at least {MIN_POINTS} are needed: too little of what stands "
+            "still is sharp and has texture, or the camera hardly moves"
         )
     if found.angle < MIN_ANGLE:
         raise NoCamerasError(
             f"the camera hardly moves: the median triangulation angle is {found.angle:.1f}°, at least {MIN_ANGLE}° is "
             "needed; walk around the scene instead of turning on the spot"
         )
-    return found
 
 
 def _angle(model: Any, points: list[Any]) -> float:
