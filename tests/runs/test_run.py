@@ -235,9 +235,12 @@ def test_a_run_of_the_first_version_opens_with_the_defaults_of_what_it_does_not_
             for name in set(part) - kept:
                 del part[name]
         values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from")
+        del values["densify"]["split_size"]
+        values["densify"] |= {"dense_fraction": 0.01, "max_size": 0.1}
 
     edit(run, reduce)
     config = read_config(run)
+    assert (config.densify.unit, config.densify.split_size, config.densify.max_size) == ("extent", 0.01, 0.1)
     assert config.schedule == dataclasses.replace(Schedule(), **kept_values(before.schedule, "schedule"))
     assert config.model == dataclasses.replace(ModelConfig(), **kept_values(before.model, "model"))
     assert config.max_alpha == TrainConfig().max_alpha
