@@ -66,6 +66,10 @@ class Camera:
         """[3] centre of the camera in the world."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def depths(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        """Depth of points of the world along the optical axis [scene units], negative behind the camera."""
+        return points @ self.viewmat[2, :3] + self.viewmat[2, 3]
+
     def project(
         self, points: Float[Tensor, "P 3"]
     ) -> tuple[Int64[Tensor, " P"], Int64[Tensor, " P"], Float[Tensor, " P"], Bool[Tensor, " P"]]:

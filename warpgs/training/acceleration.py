@@ -62,7 +62,7 @@ def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
     if not len(now):
         return paths.sum()
     with torch.no_grad():
-        depth = now @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        depth = camera.depths(now)
         pixels = torch.where(depth > 0.0, camera.K[0, 0] / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)
     squared = ((before - 2.0 * now + after) * pixels[:, None]).square().sum(1)
     dynamic_fraction = (~inputs.view.static_mask).float().mean()

@@ -192,7 +192,8 @@ class Views:
     def interval(self) -> float:
         """Median time between successive training views; 0 if all have the same time."""
         times = torch.tensor([self._capture.cameras[name].time for name in self._capture.train], dtype=torch.float64)
-        return float(times.unique().diff().median()) if len(times.unique()) > 1 else 0.0
+        gaps = times.unique().diff()
+        return float(gaps.median()) if len(gaps) else 0.0
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
