@@ -133,7 +133,7 @@ def one_step(folder: Path, config: TrainConfig) -> None:
         trainer.step(plan, sample)
         torch.save(tuple(sample), folder / f"sample{ranks.rank()}.pt")
         trainer.step.density.merge()
-        counts = trainer.step.density.statistics.count.clone()
+        counts = trainer.step.density.count.clone()
         trainer.iteration = 1
         trainer.save()
         assert ranks.is_first() or not counts.any()

@@ -110,7 +110,7 @@ def test_equal_phases_are_equal_keys():
     assert {type(phase) for phase in made} == {Phase}
     assert made[STAGE2] == made[END - 1]
     assert hash(made[STAGE2]) == hash(made[END - 1])
-    assert len(set(made)) == 8  # three stages, three increments of the SH degree, two networks
+    assert len(set(made)) == 9  # three stages, three increments of the SH degree, two networks, no more densification
 
 
 def test_gaussians_of_the_preset_best_settle_in_the_last_sixth():
@@ -209,6 +209,8 @@ FLAGS = {
     "dropout: from stage 1 on": ("use_dropout", DROPPING, last(STAGE1)),
     "dropout: until Gaussians settle": ("use_dropout", {**DROPPING, **SETTLING}, list(range(STAGE1, END - 30))),
     "dropout: not unless asked to": ("use_dropout", SETTLING, []),
+    "densification: until its last iteration": ("densifies", {}, list(range(STAGE1 + 60))),
+    "densification: never in stage 2": ("densifies", {"schedule": {"densify_until": 1000}}, list(range(STAGE2))),
     "settling: not unless asked to": ("settle_progress", {"schedule": {"settle": 0}}, []),
     "depth weight: without pretraining, too": ("depth_weight", {"dap": False}, last(0)),
     "depth weight: none without depth": ("depth_weight", {"has_depth": False}, []),

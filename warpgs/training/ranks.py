@@ -19,6 +19,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from types import FrameType
+from typing import Literal
 
 import torch
 import torch.distributed as dist
@@ -145,11 +146,13 @@ def add_(tensor: Tensor) -> None:
             dist.all_reduce(tensor)
 
 
-def maximum_(tensor: Tensor) -> None:
-    """Replaces a tensor on every rank by its maximum over the ranks."""
+def move_to_first_(tensor: Tensor, how: Literal["sum", "maximum"] = "sum") -> None:
+    """Replaces a tensor on rank 0 by its sum or maximum over the ranks, and on the others by 0."""
     if num_ranks() > 1 and tensor.numel():
         with _reaching_all(tensor):
-            dist.all_reduce(tensor, dist.ReduceOp.MAX)
+            dist.reduce(tensor, 0, dist.ReduceOp.SUM if how == "sum" else dist.ReduceOp.MAX)
+        if not is_first():
+            tensor.zero_()
 
 
 def copy_first_(tensor: Tensor) -> None:

@@ -49,6 +49,7 @@ class Phase:
         with_depth: Whether depth is rendered and compared.
         with_joint: Whether the joint image is compared.
         use_dropout: Whether random Gaussians are omitted.
+        densifies: Whether Gaussians may still be densified, so that density control looks at their gradients.
     """
 
     stage: StageName
@@ -58,6 +59,7 @@ class Phase:
     with_depth: bool
     with_joint: bool
     use_dropout: bool
+    densifies: bool
 
 
 def compares_branches(stage: StageName, config: LossConfig) -> bool:
@@ -167,6 +169,7 @@ class Protocol:
             with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
             use_dropout=config.model.dropout > 0.0 and 0 <= in_stage1 < self._settle_from,
+            densifies=stage != "stage2" and in_stage1 < config.schedule.densify_until,
         )
 
     def at(self, iteration: int) -> IterationPlan:

@@ -167,7 +167,7 @@ class Step:
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
-        backgrounds, offsets = self._inputs.backgrounds, self.density.screen_offsets
+        backgrounds, offsets = self._inputs.backgrounds, self.density.screen_offsets if phase.densifies else None
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
@@ -205,7 +205,7 @@ class Step:
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase."""
         settings = replace(self.config.render_settings, branches=True, depth=phase.with_depth)
-        return self.density.settings(settings)
+        return self.density.settings(settings) if phase.densifies else settings
 
     def _choose_trained(self, phase: Phase) -> None:
         """Requires gradients of the parameters that are trained in a phase; the others stay constant."""

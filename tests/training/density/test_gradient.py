@@ -9,11 +9,11 @@ import torch
 
 from tests import tiny
 from tests.reference.covariance import covariance
-from tests.scenes import error, generator, relative_error
+from tests.scenes import error, generator, make_camera, make_splats, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, make_scene, trained
 from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
-from warpgs.training.density.gradient import GradientStatistics, Limits, densify
+from warpgs.training.density.gradient import GradientStrategy, Limits, densify
 from warpgs.training.logger import TrainingLogger
 
 UNIT = 2.0
@@ -192,25 +192,35 @@ def test_moments_of_clones_and_children_start_at_zero(branch):
             assert not moments[2:].any()  # the clone and two children
 
 
+def mean_gradients(num, views):
+    """Mean gradients after views, each with the gradients of the offsets on screen and the radii of the Gaussians."""
+    strategy, splats = GradientStrategy(CONFIG), make_splats(num)
+    strategy.begin(num, torch.device("cpu"))
+    for gradients, radii in views:
+        strategy.screen_offsets.grad = gradients
+        strategy.observe(splats, make_camera(), torch.tensor(radii, dtype=torch.int32)[:, None].repeat(1, 2))
+    return strategy.mean()
+
+
 def test_the_mean_gradient_is_over_the_views_with_the_gaussian_visible():
-    statistics = GradientStatistics(3, torch.device("cpu"))
-    norms = torch.tensor([1.0, 5.0, 2.0])
-    for scale, seen in ((1.0, [1, 0, 1]), (3.0, [1, 0, 0]), (8.0, [1, 0, 1])):
-        statistics.screen_offsets.grad = scale * norms[:, None] * torch.tensor([0.6, -0.8])
-        statistics.observe(torch.tensor(seen, dtype=torch.int32)[:, None].repeat(1, 2))
-    assert error(statistics.mean(), torch.tensor([(1 + 3 + 8) / 3, 0.0, (2 + 16) / 2])) < 1e-6
+    norms, direction = torch.tensor([[1.0], [5.0], [2.0]]), torch.tensor([0.6, -0.8])
+    views = ((1.0, [1, 0, 1]), (3.0, [1, 0, 0]), (8.0, [1, 0, 1]))
+    found = mean_gradients(3, [(scale * norms * direction, seen) for scale, seen in views])
+    assert error(found, torch.tensor([(1 + 3 + 8) / 3, 0.0, (2 + 16) / 2])) < 1e-6
 
 
 def test_gradients_of_culled_gaussians_do_not_count_even_if_not_finite():
-    statistics = GradientStatistics(2, torch.device("cpu"))
-    radii = torch.tensor([[0, 0], [3, 4]], dtype=torch.int32)
-    statistics.screen_offsets.grad = torch.tensor([[math.nan, 1.0], [0.0, 2.0]])
-    statistics.observe(radii)
-    assert statistics.mean().tolist() == [0.0, 2.0]
+    gradients = torch.tensor([[math.nan, 1.0], [0.0, 2.0]])
+    assert mean_gradients(2, [(gradients, [0, 3])]).tolist() == [0.0, 2.0]
 
 
 def test_mean_gradients_without_any_view_are_zero():
-    assert not GradientStatistics(4, torch.device("cpu")).mean().any()
+    assert not mean_gradients(4, []).any()
+
+
+def test_views_that_were_rendered_without_gradients_on_screen_do_not_count():
+    gradients = torch.tensor([[3.0, 0.0], [0.0, 2.0]])
+    assert mean_gradients(2, [(gradients, [1, 1]), (None, [1, 1])]).tolist() == [3.0, 2.0]
 
 
 @pytest.mark.parametrize(("min_pixels", "most"), [(0, 120), (8, 120), (46, 100), (60, 76), (500, 70)])
@@ -243,7 +253,7 @@ def test_gaussians_are_split_above_a_number_of_pixels_of_the_nearest_view(data, 
         trainer.iteration += 1
     density, static = trainer.step.density, trainer.scene.static
     seen = density.resolution[: len(static)].argmax()
-    density.statistics.total.zero_()[seen] = 1.0
+    density.total.zero_()[seen] = 1.0
     static.log_scales.data[seen] = math.log(pixels / density.resolution[seen])
     num, before = len(static), static.means[seen].clone()
     trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))

@@ -31,6 +31,7 @@ PHASE = Phase(
     with_depth=False,
     with_joint=True,
     use_dropout=False,
+    densifies=False,
 )
 ANTIALIAS = RenderSettings(antialias=True)
 FOCAL, DEPTH, SIZE = 100.0, 2.0, (96, 80)

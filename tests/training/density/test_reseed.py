@@ -19,7 +19,7 @@ from warpgs.training.logger import TrainingLogger
 from warpgs.training.point_cloud import scene_box
 from warpgs.training.schedule import Phase
 
-PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False)
+PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False, densifies=False)
 
 
 @pytest.fixture

@@ -91,9 +91,24 @@ def test_a_strategy_observes_every_view_and_starts_anew_after_gaussians_were_rep
     assert trainer.step.density.views.max() == 0
 
 
-def test_a_strategy_changes_how_training_steps_are_rendered(trainer):
-    settings = trainer.step._settings(trainer.protocol.phase_at(0))
-    assert settings == RenderSettings(branches=True, depth=True, antialias=False, max_alpha=0.5)
+@pytest.mark.parametrize(("after", "max_alpha"), [(-1, 0.5), (0, RenderSettings.max_alpha)])
+def test_a_strategy_changes_how_training_steps_are_rendered_until_the_last_densification(trainer, after, max_alpha):
+    end = trainer.protocol.stage1.start + trainer.config.schedule.densify_until
+    settings = trainer.step._settings(trainer.protocol.phase_at(end + after))
+    assert settings == RenderSettings(branches=True, depth=True, antialias=False, max_alpha=max_alpha)
+
+
+@pytest.mark.parametrize("strategy", ["3dgs", "absgrad"])
+def test_gradients_on_screen_are_summed_until_the_last_densification(data, tmp_path, strategy):
+    densify = dataclasses.replace(tiny.CONFIG.densify, strategy=strategy)
+    trainer = tiny.trainer(data, tmp_path / "run", dataclasses.replace(tiny.CONFIG, densify=densify))
+    counts = []
+    end = trainer.protocol.stage1.start + trainer.config.schedule.densify_until
+    for trainer.iteration in (end - 1, end):
+        step(trainer)
+        counts.append(trainer.step.density.count.clone())
+    assert counts[0].any()
+    assert torch.equal(*counts)
 
 
 def test_the_state_of_a_strategy_is_resumed(trainer, data):
@@ -206,4 +221,4 @@ def test_a_checkpoint_of_version_0_3_is_resumed_as_if_no_view_had_shown_any_gaus
     resumed.restore_newest(print)
     assert trainer.step.density.resolution.any()
     assert not resumed.step.density.resolution.any()
-    assert torch.equal(resumed.step.density.statistics.count, trainer.step.density.views)
+    assert torch.equal(resumed.step.density.count, trainer.step.density.views)

@@ -12,43 +12,10 @@ from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.splats import Splats
 from warpgs.ops.adam import Adam
-from warpgs.training import ranks
 
 from .adaptation import Adaptation
 from .operations import SPLIT_SHRINK, clone, remove, split
 from .strategy import Strategy
-
-
-class GradientStatistics:
-    """Mean screen-space gradient norm of each Gaussian over the views in which it was visible.
-
-    Attributes:
-        total: [N] sum of the norms.
-        count: [N] number of the views.
-        screen_offsets: [N, 2] zeros to render each view with; their gradients are what is observed.
-    """
-
-    def __init__(self, num: int, device: torch.device) -> None:
-        self.total = torch.zeros(num, dtype=torch.float32, device=device)
-        self.count = torch.zeros(num, dtype=torch.float32, device=device)
-        self.screen_offsets = torch.zeros(num, 2, dtype=torch.float32, device=device, requires_grad=True)
-
-    @torch.no_grad()
-    def observe(self, radii: Int32[Tensor, "N 2"]) -> None:
-        """Adds one view, after its backward pass.
-
-        Args:
-            radii: [N, 2] ``Rendering.radii``; 0 = culled.
-        """
-        v_offsets, self.screen_offsets.grad = self.screen_offsets.grad, None
-        assert v_offsets is not None
-        visible = radii[:, 0] > 0
-        norms = torch.hypot(*v_offsets.unbind(-1))  # finite where squares would overflow
-        self.total += torch.where(visible, norms, 0.0)
-        self.count += visible
-
-    def mean(self) -> Float[Tensor, " N"]:
-        return self.total / self.count.clamp_min(1.0)
 
 
 class Limits(NamedTuple):
@@ -102,30 +69,39 @@ def densify(
 
 
 class GradientStrategy(Strategy):
-    """3DGS: Gaussians grow where the mean gradient of their position on screen is large."""
+    """3DGS: Gaussians grow where the mean gradient of their position on screen is large.
+
+    Attributes:
+        total: [N] sum of the norms of these gradients over the views that showed the Gaussian.
+        count: [N] number of these views.
+    """
 
     def begin(self, num: int, device: torch.device) -> None:
         """Starts with gradients of 0."""
         super().begin(num, device)
-        self.statistics = GradientStatistics(num, device)
-        self.screen_offsets = self.statistics.screen_offsets
+        self.total = torch.zeros(num, dtype=torch.float32, device=device)
+        self.count = torch.zeros(num, dtype=torch.float32, device=device)
+        self.screen_offsets = torch.zeros(num, 2, dtype=torch.float32, device=device, requires_grad=True)
 
+    @torch.no_grad()
     def observe(self, splats: Splats, camera: Camera, radii: Int32[Tensor, "N 2"]) -> None:
-        """Adds the gradients of one view."""
+        """Adds the gradients of one view, if it was rendered with ``screen_offsets``."""
         super().observe(splats, camera, radii)
-        self.statistics.observe(radii)
+        assert self.screen_offsets is not None
+        v_offsets, self.screen_offsets.grad = self.screen_offsets.grad, None
+        if v_offsets is not None:
+            visible = radii[:, 0] > 0
+            norms = torch.hypot(*v_offsets.unbind(-1))  # finite where squares would overflow
+            self.total += torch.where(visible, norms, 0.0)
+            self.count += visible
+
+    def mean(self) -> Float[Tensor, " N"]:
+        """Mean norm of the gradients; 0 without a view."""
+        return self.total / self.count.clamp_min(1.0)
 
     def state(self) -> dict[str, Float[Tensor, " N"]]:
         """Also the sums of the gradients, and over how many views."""
-        return super().state() | {"total": self.statistics.total, "count": self.statistics.count}
-
-    def merge(self) -> None:
-        """Also adds the sums of all ranks."""
-        super().merge()
-        for tensor in (self.statistics.total, self.statistics.count):
-            ranks.add_(tensor)
-            if not ranks.is_first():
-                tensor.zero_()
+        return super().state() | {"total": self.total, "count": self.count}
 
     def densify(self, at: Adaptation) -> None:
         """Both branches divide the remaining capacity in proportion to how many Gaussians want to grow.
@@ -134,7 +110,7 @@ class GradientStrategy(Strategy):
         """
         config, branches = at.config.densify, (at.scene.static, at.scene.dynamic)
         numbers = [len(gaussians) for gaussians in branches]
-        means, units = self.statistics.mean().split(numbers), self.units(at).split(numbers)
+        means, units = self.mean().split(numbers), self.units(at).split(numbers)
         generator, capacity = at.generator("densify"), at.capacity
         remove_large = at.plan.done > at.config.schedule.reset_every
         candidates = [int((gradients > config.gradient).sum()) for gradients in means]

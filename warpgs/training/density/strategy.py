@@ -29,7 +29,7 @@ class Strategy:
 
     Attributes:
         actions: What it does for each action of a plan; it does nothing for actions that are not there.
-        screen_offsets: [N, 2] zeros to render each view with, if their gradients are needed.
+        screen_offsets: [N, 2] zeros to render each view with while ``Phase.densifies``, if their gradients are needed.
         resolution: [N] pixels per scene unit at the depth of the Gaussian, in the nearest view that has shown it since
             ``begin``; 0 if none has.
     """
@@ -52,7 +52,7 @@ class Strategy:
         self.resolution = torch.zeros(num, dtype=torch.float32, device=device)
 
     def settings(self, settings: RenderSettings) -> RenderSettings:
-        """How a training step is rendered, from how it would be without the strategy."""
+        """How a step is rendered while ``Phase.densifies``, from how it would be without the strategy."""
         return settings
 
     @torch.no_grad()
@@ -83,10 +83,9 @@ class Strategy:
         return {"resolution": self.resolution}
 
     def merge(self) -> None:
-        """Moves what all ranks have observed to rank 0; the others are left as after ``begin``."""
-        ranks.maximum_(self.resolution)
-        if not ranks.is_first():
-            self.resolution.zero_()
+        """Moves what all ranks have observed to rank 0, sums but for the resolution; the others have zeros then."""
+        for name, tensor in self.state().items():
+            ranks.move_to_first_(tensor, "maximum" if name == "resolution" else "sum")
 
     def units(self, at: Adaptation) -> Float[Tensor, " N"]:
         """``DensifyConfig.unit`` of each Gaussian [scene units]; infinite for those that no view has shown."""
