@@ -39,11 +39,37 @@ def test_hardly_anything_that_does_not_move_with_the_background_says_nothing_of_
     assert doubts_of_masks(columns(0, 5, 5), True, off) == []
 
 
-@pytest.mark.parametrize(("factor", "noted"), [(4.0, False), (6.0, True)])
-def test_a_focal_length_that_no_usual_lens_has_is_doubtful(factor, noted):
+@pytest.mark.parametrize(("factor", "noted"), [(0.3, True), (0.5, False), (2.9, False), (3.1, True)])
+def test_a_focal_length_that_few_lenses_have_is_doubtful(factor, noted):
     lens = dataclasses.replace(boards.lens(), focal=(factor * boards.SIZE[0],) * 2)
     cameras = Cameras(["a"], lens, boards.poses(2)[:1], boards.points(), 0.1, 10.0)
-    assert [text[:37] for text in doubts_of_lens(cameras)] == ["the focal length that was found is 6 "[:37]] * noted
+    found = [text.split(" times")[0] for text in doubts_of_lens(cameras)]
+    assert found == [f"the focal length that was found is {factor}"] * noted
+
+
+def test_a_wide_fisheye_lens_is_not_doubtful():
+    lens = dataclasses.replace(boards.lens(), focal=(0.3 * boards.SIZE[0],) * 2, fisheye=(0.0, 0.0, 0.0, 0.0))
+    assert doubts_of_lens(Cameras(["a"], lens, boards.poses(2)[:1], boards.points(), 0.1, 10.0)) == []
+
+
+def test_a_focal_length_that_was_held_for_the_second_pass_is_noted(tmp_path, monkeypatch):
+    images, masks = boards.record(12)
+    shots, held = boards.write_folder(tmp_path / "shots", images), []
+
+    def recover(folder, names, work, settings, *rest):
+        held.append(settings.focal)
+        found = boards.true_cameras(folder, names)
+        return dataclasses.replace(found, has_held_focal=not settings.refine)
+
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
+    monkeypatch.setattr("warpgs.prepare.steps.off_background", lambda images, quiet: masks)
+    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda *rest: masks)
+    notes = prepare(shots, tmp_path / "made", Options(depth="none"))["notes"]
+    assert held == [None, boards.FOCAL]
+    ratio = boards.FOCAL / boards.SIZE[0]
+    assert [note.split(" of the frames")[0] for note in notes] == [
+        f"the focal length is a guess, {ratio:.1f} times the longer side"
+    ]
 
 
 def mark_left(frames: object, *rest: object) -> list[np.ndarray]:

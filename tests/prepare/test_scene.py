@@ -87,9 +87,9 @@ def test_points_in_dynamic_regions_are_omitted():
 
 
 def test_cameras_are_saved_and_loaded(tmp_path):
-    cameras = Cameras(["a", "b"], boards.lens(), boards.poses(2), boards.points(7), 0.5, 8.0, True)
+    cameras = Cameras(["a", "b"], boards.lens(), boards.poses(2), boards.points(7), 0.5, 8.0, False, True)
     cameras.save(tmp_path / "cameras")
     loaded = Cameras.load(tmp_path / "cameras")
     assert (loaded.names, loaded.lens, loaded.angle) == (cameras.names, cameras.lens, cameras.angle)
-    assert loaded.weak_features
+    assert (loaded.weak_features, loaded.has_held_focal) == (False, True)
     assert np.array_equal(loaded.poses, cameras.poses)

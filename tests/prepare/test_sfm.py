@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.prepare import boards
 from warpgs.data.lens import Lens
-from warpgs.prepare import colmap, focal_guess, sfm
+from warpgs.prepare import colmap, focal_guess, mapping, sfm
 from warpgs.prepare.cameras import Cameras, NoCamerasError
-from warpgs.prepare.colmap import Job, _map_globally
+from warpgs.prepare.features import Job
 from warpgs.prepare.focal_guess import calibrated
+from warpgs.prepare.mapping import _map_globally, reconstruct, refine
 from warpgs.prepare.matches import all_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.sfm import Settings, recover_cameras
 
@@ -136,7 +137,7 @@ def test_frames_that_see_too_few_points_lose_their_camera():
     images = {k: SimpleNamespace(frame_id=10 + k, has_pose=p, num_points3D=n) for k, (p, n) in seen.items()}
     removed: list[int] = []
     model = SimpleNamespace(images=images, deregister_frame=removed.append)
-    assert colmap._supported(model) is model
+    assert mapping._supported(model) is model
     assert removed == [12]
 
 
@@ -197,7 +198,7 @@ def test_a_camera_that_passes_a_wall_needs_its_focal_length(tmp_path, monkeypatc
 
     def check(focal: float | None) -> None:
         work = str(tmp_path)
-        job = colmap.Job(work, ["a"], work, "PINHOLE", None, False, False, focal, False)
+        job = Job(work, ["a"], work, "PINHOLE", None, False, False, focal, False)
         colmap._check_parallax(job, tmp_path / "features.db")
 
     with pytest.raises(NoCamerasError, match=r"over flat ground, give its focal length: --focal PX; masks alone"):
@@ -239,6 +240,14 @@ def set_focal(opened: pycolmap.Database, focal: float) -> None:
     opened.update_camera(camera)
 
 
+def a_model(focal: float, error: float = 0.5, num_points: int = 100, placed: int = 6) -> SimpleNamespace:
+    """A reconstruction of frames of 480×270, whose points are seen by four frames and have the same error [px]."""
+    camera = SimpleNamespace(width=480, height=270, mean_focal_length=lambda: focal)
+    point = SimpleNamespace(error=error, track=SimpleNamespace(length=lambda: 4))
+    points = dict.fromkeys(range(num_points), point)
+    return SimpleNamespace(images={}, cameras={1: camera}, points3D=points, num_reg_images=lambda: placed)
+
+
 def agree_on(monkeypatch: pytest.MonkeyPatch, focal: float) -> None:
     """Lets the pairs agree on a focal length."""
 
@@ -269,9 +278,7 @@ def test_mapping_starts_from_the_focal_length_that_pairs_agree_on(agreed, found,
         started.append(opened.read_all_cameras()[0].params[0])
         opened.close()
         focal, error = found[started[-1]]
-        camera = SimpleNamespace(mean_focal_length=lambda: focal)
-        measures = {"num_reg_images": lambda: 6, "compute_mean_reprojection_error": lambda: error}
-        return {0: SimpleNamespace(images={}, cameras={1: camera}, **measures)}
+        return {0: a_model(focal, error)}
 
     agree_on(monkeypatch, agreed)
     monkeypatch.setattr(pycolmap, "global_mapping", map_globally)
@@ -299,7 +306,7 @@ def test_the_focal_length_that_pairs_agree_on_is_the_true_one(tmp_path):
     opened.close()
     copy = calibrated(tmp_path / "features.db")
     assert copy != tmp_path / "features.db"
-    assert focal_guess._focal(copy) == pytest.approx(240.0, rel=0.02)
+    assert focal_guess.read_focal(copy) == pytest.approx(240.0, rel=0.02)
 
 
 @pytest.mark.parametrize(("placed", "tried"), [(6, 1), (5, 2)])
@@ -308,15 +315,49 @@ def test_a_far_focal_length_that_loses_frames_has_a_rival(placed, tried, tmp_pat
 
     def map_from(job: Job, path: Path) -> SimpleNamespace:
         started.append(path)
-        focal = focal_guess._focal(path)
-        measures = {"num_reg_images": lambda: placed, "compute_mean_reprojection_error": lambda: 0.5}
-        return SimpleNamespace(cameras={1: SimpleNamespace(mean_focal_length=lambda: focal)}, **measures)
+        return a_model(focal_guess.read_focal(path), placed=placed)
 
     agree_on(monkeypatch, 240.0)
-    monkeypatch.setattr(colmap, "_map_from", map_from)
+    monkeypatch.setattr(mapping, "_map_from", map_from)
     job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
     assert _map_globally(job, tmp_path / "features.db", lambda *progress: None) is not None
     assert len(started) == tried
+
+
+@pytest.mark.parametrize(
+    ("found", "held", "kept"),
+    [
+        ((1000.0, 0.5, 100), None, None),  # plausible
+        ((4800.0, 0.5, 100), (0.6, 110), 576.0),  # fewer points
+        ((4800.0, 0.6, 100), (0.5, 100), 576.0),
+        ((4800.0, 0.5, 100), (0.5, 90), None),  # the guess explains less: the lens is long
+        ((150.0, 0.5, 100), (0.5, 100), 576.0),  # nothing speaks for the implausible one
+    ],
+)
+def test_an_implausible_focal_length_must_explain_more_than_the_guess(found, held, kept, monkeypatch, tmp_path):
+    """``found``: focal length, error [px] and number of points; ``held``: error and number with the guess held."""
+    names, jobs = wide_database(tmp_path / "features.db"), []
+
+    def map_all(job: Job, *rest: object) -> SimpleNamespace:
+        jobs.append(job.focal)
+        return a_model(*found) if job.focal is None else a_model(job.focal, *held)
+
+    monkeypatch.setattr(mapping, "_map", map_all)
+    job = Job(str(tmp_path), names, str(tmp_path), "SIMPLE_RADIAL", None, False, False, None, False)
+    model, done = reconstruct(job, tmp_path / "features.db", lambda *progress: None)
+    assert jobs == ([None] if held is None else [None, 576.0])
+    assert done.focal == kept
+    assert focal_guess.focal_of(model) == (kept or found[0])
+
+
+@pytest.mark.parametrize(("drifts_to", "kept"), [(4800.0, 600.0), (700.0, 700.0)])
+def test_refinement_does_not_make_a_plausible_focal_length_implausible(drifts_to, kept, monkeypatch):
+    def adjust(job: Job, model: object) -> SimpleNamespace:
+        return a_model(drifts_to if job.focal is None else job.focal)
+
+    monkeypatch.setattr(mapping, "_adjusted", adjust)
+    job = Job("", [], "", "SIMPLE_RADIAL", None, False, False, None, True)
+    assert focal_guess.focal_of(refine(job, a_model(600.0), lambda *progress: None)) == kept
 
 
 def test_a_known_focal_length_is_kept(tmp_path):

@@ -16,6 +16,10 @@ from warpgs.files import DAMAGED_ARRAY
 MAX_BYTES = 1 << 30
 """Maximum size of a file of cameras and points [bytes]."""
 
+PLAUSIBLE_FOCAL = (0.4, 3.0)
+"""Range of the focal length over the longer side outside of which one that was found is doubtful: from 103° to 19°
+across, lenses of 14 to 108 mm on 35 mm film. COLMAP itself accepts 0.1 to 10."""
+
 MISLED = 0.7
 """Reprojection error without dynamic regions over that with them, below which dynamic objects misled the cameras."""
 
@@ -41,6 +45,7 @@ class Cameras:
         error: Mean reprojection error [px].
         angle: Median triangulation angle of the points [degrees].
         weak_features: Whether features of low contrast were used.
+        has_held_focal: Whether the focal length is a guess that was held, because the one found was implausible.
     """
 
     names: list[str]
@@ -50,6 +55,7 @@ class Cameras:
     error: float
     angle: float
     weak_features: bool = False
+    has_held_focal: bool = False
 
     @property
     def centers(self) -> Float[np.ndarray, "F 3"]:
@@ -76,7 +82,7 @@ class Cameras:
             poses=self.poses,
             points=self.points,
             quality=np.array([self.error, self.angle]),
-            weak_features=np.array(self.weak_features),
+            flags=np.array([self.weak_features, self.has_held_focal]),
         )
 
     @staticmethod
@@ -110,8 +116,8 @@ class Cameras:
         if len(fisheye := z["fisheye"].tolist()):
             lens = dataclasses.replace(lens, fisheye=(fisheye[0], fisheye[1], fisheye[2], fisheye[3]))
         error, angle = z["quality"].tolist()
-        weak = bool(z["weak_features"])
-        return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, weak)
+        flags = map(bool, z["flags"])
+        return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, *flags)
 
 
 def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from .cameras import Cameras
+from .cameras import PLAUSIBLE_FOCAL, Cameras
 
 DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
@@ -17,9 +17,6 @@ CROWDED_FRACTION, MANY_FRAMES = 0.3, 0.25
 MIN_OFF, MIN_CONFIRMED = 0.01, 0.2
 """Fraction of the pixels that do not move with the background, from which on it says something, and fraction of them
 that masks hold at least where cameras are right. Static foreground does not move with the background either."""
-
-MAX_FOCAL = 5.0
-"""Focal length over the longer side that is hardly found where cameras are right: a view of 11°."""
 
 NOTHING_MOVES = (
     "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
@@ -64,10 +61,16 @@ def doubts_of_masks(dynamic: Planes, estimated: bool, off: Planes | None = None)
 
 def doubts_of_lens(cameras: Cameras) -> list[str]:
     """Doubts about a focal length that was found."""
-    ratio = max(cameras.lens.focal) / max(cameras.lens.width, cameras.lens.height)
-    if ratio <= MAX_FOCAL:
+    lens, (least, most) = cameras.lens, PLAUSIBLE_FOCAL
+    ratio = max(lens.focal) / max(lens.width, lens.height)
+    if cameras.has_held_focal:
+        return [
+            f"the focal length is a guess, {ratio:.1f} times the longer side of the frames: the one that was found is "
+            "not plausible and explains less of them; give it (--focal PX)"
+        ]
+    if lens.fisheye is not None or least <= ratio <= most:
         return []
     return [
-        f"the focal length that was found is {ratio:.0f} times the longer side of the frames, longer than most "
-        "telephoto lenses': the cameras are probably wrong; give it (--focal PX)"
+        f"the focal length that was found is {ratio:.1f} times the longer side of the frames, which few lenses have: "
+        "the cameras may be wrong; give it (--focal PX)"
     ]

@@ -14,6 +14,8 @@ import cv2  # noqa: F401  before pycolmap, see ``colmap``
 import numpy as np
 import pycolmap
 
+from .cameras import PLAUSIBLE_FOCAL
+
 FAR = 1.6
 """Factor between the guess and what the pairs agree on from which on mapping starts from the latter."""
 
@@ -31,7 +33,7 @@ def calibrated(database: Path) -> Path:
     shutil.copyfile(database, copy)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = 0
-    is_far = pycolmap.calibrate_view_graph(copy, options) and not _are_near(_focal(copy), _focal(database), FAR)
+    is_far = pycolmap.calibrate_view_graph(copy, options) and not _are_near(read_focal(copy), read_focal(database), FAR)
     if is_far:
         return copy
     copy.unlink()
@@ -40,15 +42,28 @@ def calibrated(database: Path) -> Path:
 
 def confirms(model: Any, database: Path) -> bool:
     """Whether a reconstruction's focal length is still near that of the database that it started from."""
+    return _are_near(focal_of(model), read_focal(database), CONFIRMED)
+
+
+def is_plausible(model: Any) -> bool:
+    """Whether a reconstruction's focal length is plausible for a lens that is not a fisheye."""
     (camera,) = model.cameras.values()
-    return _are_near(float(camera.mean_focal_length()), _focal(database), CONFIRMED)
+    least, most = PLAUSIBLE_FOCAL
+    return bool(least <= focal_of(model) / max(camera.width, camera.height) <= most)
+
+
+def focal_of(model: Any) -> float:
+    """The focal length of a reconstruction's camera [px]."""
+    (camera,) = model.cameras.values()
+    return float(camera.mean_focal_length())
 
 
 def _are_near(a: float, b: float, factor: float) -> bool:
     return bool(abs(np.log(a / b)) < np.log(factor))
 
 
-def _focal(database: Path) -> float:
+def read_focal(database: Path) -> float:
+    """The focal length of the camera in a database [px]."""
     opened = pycolmap.Database.open(database)
     try:
         return float(opened.read_all_cameras()[0].mean_focal_length())

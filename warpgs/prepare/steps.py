@@ -93,6 +93,8 @@ class Steps:
     def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
         """The cameras of the first pass, refined with the matches outside of the masks."""
         settings = replace(self._settings, masks=masks.folder, weak_features=first.weak_features, refine=True)
+        if first.has_held_focal:
+            settings = replace(settings, focal=first.lens.focal[0])
 
         def make(path: Path) -> str:
             if self.options.camera == "still":
@@ -100,7 +102,7 @@ class Steps:
             try:
                 found = self._reconstruct(first.names, settings)
                 if len(found.names) == len(first.names):
-                    return _save(found, path, first.names)
+                    return _save(replace(found, has_held_focal=first.has_held_focal), path, first.names)
                 reason = "fewer frames were registered"
             except NoCamerasError as error:
                 reason = str(error)

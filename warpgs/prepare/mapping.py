@@ -1,0 +1,173 @@
+"""COLMAP's mapping: from the matches in static regions to a reconstruction, and its refinement."""
+
+import copy
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401  before pycolmap, see ``colmap``
+import pycolmap
+
+from .features import Job, Report, match, static_database
+from .focal_guess import calibrated, confirms, focal_of, is_plausible, read_focal
+from .matches import all_pairs, revisit_pairs
+
+FALLBACK_FRAMES = 250
+"""Number of frames up to which all pairs are matched if matching along the sequence has lost some frames."""
+
+ENOUGH = 0.9
+"""Fraction of the frames with cameras below which another way to find them is tried."""
+
+GLOBAL_TRACKS = 500
+"""Tracks per frame that global mapping starts from, the longest; of 50 frames of 480×270 with 2,250 features each it
+places as many as from all tracks, in 28 instead of 71 s of processor time. From 200, it fails with little parallax."""
+
+MIN_OBSERVED = 30
+"""Number of points that a frame must see to have a camera, as in incremental mapping."""
+
+MIN_PARALLEL = 1_000
+"""Number of residuals from which on bundle adjustment uses all cores; COLMAP's 50,000 leave most videos to one."""
+
+TOLERANCE = 1e-6
+"""Relative change of the cost at which the last bundle adjustment ends. With COLMAP's default, 0, it goes on for 100
+iterations: 86 frames of 512×384 took 2.2 s instead of 0.5 s, with the same reprojection error and camera centres."""
+
+MAX_ERROR, MIN_TRIANGULATION_ANGLE = 4.0, 1.5
+"""Limits for the points that are kept while cameras are refined [px, degrees]; incremental mapping has the same."""
+
+
+def reconstruct(job: Job, database: Path, report: Report) -> tuple[Any, Job]:
+    """The reconstruction, or None, and the job with the focal length that was held, if one was.
+
+    Where the frames hardly tell the focal length, bundle adjustment may end anywhere. If that is implausible, they are
+    mapped again with COLMAP's guess held, and the reconstruction that explains more is kept: some lenses are long.
+    """
+    model = _map(job, database, report)
+    if model is None or not job.guesses_focal or is_plausible(model):
+        return model, job
+    held = replace(job, focal=read_focal(database))
+    return max(((_map(held, database, report), held), (model, job)), key=lambda found: explained(found[0]))
+
+
+def explained(model: Any) -> float:
+    """How much of the matches a reconstruction explains: MSAC's score (Torr and Zisserman 2000) of its observations."""
+    points = () if model is None else model.points3D.values()
+    return sum(point.track.length() * max(MAX_ERROR**2 - point.error**2, 0.0) for point in points)
+
+
+def _map(job: Job, database: Path, report: Report) -> Any:
+    """The reconstruction with the most frames, by global, else incremental mapping, else with all pairs; or None."""
+    count, attempts = len(job.names), [_map_globally(job, database, report)]
+    if _size(attempts[0]) < ENOUGH * count:
+        attempts.append(_map_incrementally(job, database, report))
+        if max(map(_size, attempts)) < ENOUGH * count <= ENOUGH * FALLBACK_FRAMES:
+            match(job, all_pairs(count), report)
+            attempts.append(_map_incrementally(job, static_database(job), report))
+    return max(attempts, key=_size)
+
+
+def _size(model: Any) -> int:
+    return 0 if model is None else int(model.num_reg_images())
+
+
+def _pipeline_options(job: Job) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.ba_refine_focal_length = job.finds_focal
+    options.ba_refine_extra_params = job.params is None
+    return options
+
+
+def _map_globally(job: Job, database: Path, report: Report) -> Any:
+    report("cameras", 0, len(job.names))
+    start = calibrated(database) if job.guesses_focal else database
+    model = _map_from(job, start)
+    if start == database:
+        return model
+    is_confirmed = _size(model) >= ENOUGH * len(job.names) and confirms(model, start)
+    start.unlink()  # a copy
+    if is_confirmed:
+        return model
+    return max(model, _map_from(job, database), key=explained)
+
+
+def _map_from(job: Job, database: Path) -> Any:
+    """The reconstruction by global mapping that starts from the database's focal length."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS
+    options.mapper.ba_skip_fixed_rotation_stage = True  # saves a stage; camera centres as before
+    _set_adjustment(options.mapper.bundle_adjustment, job)
+    try:
+        models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"), options)
+    except (RuntimeError, ValueError):  # it raises if it finds no geometry
+        return None
+    model = max(models.values(), key=_size, default=None)
+    return None if model is None else _supported(model)
+
+
+def _set_adjustment(adjustment: Any, job: Job) -> None:
+    """What bundle adjustment refines, and from which size on it uses all cores."""
+    adjustment.refine_focal_length = job.finds_focal
+    adjustment.refine_extra_params = job.params is None
+    adjustment.ceres.min_num_residuals_for_cpu_multi_threading = MIN_PARALLEL
+
+
+def _supported(model: Any) -> Any:
+    """The reconstruction without frames that see too few of its points: global mapping places every frame."""
+    for image in [*model.images.values()]:
+        if image.has_pose and image.num_points3D < MIN_OBSERVED:
+            model.deregister_frame(image.frame_id)
+    return model
+
+
+def _map_incrementally(job: Job, database: Path, report: Report) -> Any:
+    placed = [1]
+
+    def count() -> None:
+        placed[0] = min(placed[0] + 1, len(job.names))  # a second reconstruction counts from there
+        report("cameras, by incremental mapping", placed[0], len(job.names))
+
+    report("cameras, by incremental mapping", 0, len(job.names))
+    models = pycolmap.incremental_mapping(
+        database, job.folder, _empty(job, "mapping"), _pipeline_options(job), next_image_callback=count
+    )
+    return max(models.values(), key=_size, default=None)
+
+
+def refine(job: Job, model: Any, report: Report) -> Any:
+    """The reconstruction with points triangulated again from static matches, revisits included, and adjusted.
+
+    A plausible focal length that adjustment makes implausible is held instead.
+    """
+    if job.thorough:
+        match(job, revisit_pairs(model, job.files), report)
+    report("refinement", 0, 1)
+    refined = _adjusted(job, copy.deepcopy(model))
+    if job.guesses_focal and is_plausible(model) and not is_plausible(refined):
+        refined = _adjusted(replace(job, focal=focal_of(model)), model)
+    return refined
+
+
+def _adjusted(job: Job, model: Any) -> Any:
+    """The reconstruction, which is changed, with points from static matches after bundle adjustment."""
+    options = _pipeline_options(job)
+    model = pycolmap.triangulate_points(
+        model, static_database(job), job.folder, _empty(job, "refinement"), clear_points=True, options=options
+    )
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.print_summary = False
+    adjustment.ceres.solver_options.function_tolerance = TOLERANCE
+    _set_adjustment(adjustment, job)
+    for _ in range(2):
+        pycolmap.bundle_adjustment(model, adjustment)
+        pycolmap.ObservationManager(model).filter_all_points3D(MAX_ERROR, MIN_TRIANGULATION_ANGLE)
+    model.normalize()  # adjustment keeps the distance of two cameras, however wrong it was
+    return model
+
+
+def _empty(job: Job, name: str) -> Path:
+    folder = Path(job.work) / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
