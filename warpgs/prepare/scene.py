@@ -16,7 +16,6 @@ from .cameras import Cameras
 from .contact_sheet import choose_evenly, overlay_mask, write_contact_sheet
 from .frames import Frames
 from .images import brighten, read_images
-from .masks import Masks
 from .sphere import points_around
 
 FACTORS = (1, 2)
@@ -40,38 +39,38 @@ def write_capture(
     root: Path,
     frames: Frames,
     cameras: Cameras,
-    masks: Masks,
+    dynamic: Sequence[Bool[np.ndarray, "H W"]],
     *,
+    estimated: bool,
     holdout: int,
-    notes: list[str],
     quiet: bool = True,
-) -> str:
-    """Writes the capture, and the contact sheet masks.png; returns a summary.
+) -> tuple[str, list[str]]:
+    """Writes the capture, and the contact sheet masks.png; returns a summary, and notes for the user.
 
     Args:
         root: Folder of the capture.
         frames: All frames that were taken.
         cameras: Cameras of the registered frames.
-        masks: Masks of these frames.
+        dynamic: [H, W] dynamic mask of each undistorted frame of the cameras.
+        estimated: Whether the masks are estimates.
         holdout: Every N-th frame is for evaluation; 0 for none.
-        notes: Messages for the user are appended to it.
         quiet: Whether to show no progress.
 
     Raises:
         ValueError: If too few static points remain, or no frame for evaluation.
         OSError: If a file cannot be written; the message names it.
     """
-    dynamic = masks.read_dynamic(cameras)
-    cameras = _with_static_points(cameras, dynamic, notes)
+    notes = [] if cameras.have_parallax else [NO_PARALLAX]
+    cameras = _with_static_points(cameras, dynamic)
     writer.held_out(cameras.names, holdout)  # fails before anything is written
     omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
     if omitted:
         notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
-    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, masks.estimated)
+    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, estimated)
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
     write_contact_sheet(root / "masks.png", painted, cameras.names)
-    return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points"
+    return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points", notes
 
 
 def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
@@ -81,12 +80,11 @@ def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
     return [root / "dataset.json", root / "metadata.json", root / "scene.json", root / "points.npy", *frames]
 
 
-def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]], notes: list[str]) -> Cameras:
-    if not cameras.have_parallax:
-        notes.append(NO_PARALLAX)
-        points = points_around(cameras.undistorted(), dynamic)
-    else:
+def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
+    if cameras.have_parallax:
         points = cameras.points[static_points(cameras.undistorted(), dynamic)]
+    else:
+        points = points_around(cameras.undistorted(), dynamic)
     if len(points) < MIN_STATIC_POINTS:
         raise ValueError(
             f"only {len(points)} static points are left: nearly everything moves, or the masks are inverted "

@@ -203,18 +203,20 @@ class Steps:
 
         def make() -> str:
             self._require_space(IMAGE_BYTES)
-            root, notes, quiet = self.journal.root, self.journal.notes, self.journal.quiet
-            holdout = self.options.holdout
-            summary = write_capture(root, self.frames, cameras, masks, holdout=holdout, notes=notes, quiet=quiet)
-            notes += self._doubts(cameras, masks)
+            root, holdout, quiet = self.journal.root, self.options.holdout, self.journal.quiet
+            dynamic, estimated = masks.read_dynamic(cameras), masks.estimated
+            summary, notes = write_capture(
+                root, self.frames, cameras, dynamic, estimated=estimated, holdout=holdout, quiet=quiet
+            )
+            self.journal.notes += [*notes, *self._doubts(cameras, dynamic, estimated)]
             return summary
 
         self.journal.step(name, make, lambda: capture_files(self.journal.root, cameras.names))
 
-    def _doubts(self, cameras: Cameras, masks: Masks) -> list[str]:
+    def _doubts(self, cameras: Cameras, dynamic: Sequence[np.ndarray], estimated: bool) -> list[str]:
         background = self.journal.work / BACKGROUND
         off = Masks.load(background).read_dynamic(cameras) if background.is_dir() else None
-        found = doubts_of_masks(masks.read_dynamic(cameras), masks.estimated, off)
+        found = doubts_of_masks(dynamic, estimated, off)
         is_known = self.options.camera == "still" or self.options.focal or self.options.intrinsics
         return found if is_known else [*found, *doubts_of_lens(cameras)]
 
