@@ -4,13 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.prepare import boards
 from warpgs.data.check import check_capture
 from warpgs.prepare.cameras import Cameras
-from warpgs.prepare.doubts import doubts_of_lens, doubts_of_masks
+from warpgs.prepare.doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from warpgs.prepare.options import Options
 from warpgs.prepare.pipeline import prepare
+from warpgs.prepare.posed_frames import PosedFrames
 
 
 def columns(*counts: int) -> list[np.ndarray]:
@@ -70,6 +72,16 @@ def test_a_focal_length_that_was_held_for_the_second_pass_is_noted(tmp_path, mon
     assert [note.split(" of the frames")[0] for note in notes] == [
         f"the focal length is a guess, {ratio:.1f} times the longer side"
     ]
+
+
+@pytest.mark.parametrize(("num_wrong", "noted"), [(0, False), (6, True)])
+def test_cameras_that_do_not_explain_the_motion_in_the_images_are_doubtful(num_wrong, noted):
+    images, _ = boards.record(12)
+    poses, roll = boards.poses(12), Rotation.from_rotvec((0.0, 0.0, 0.1)).as_matrix()
+    poses[: 2 * num_wrong : 2] = roll @ poses[: 2 * num_wrong : 2]  # every second one
+    found = doubts_of_motion(PosedFrames(images, boards.lens(), poses, boards.points()))
+    assert len(found) == noted
+    assert not noted or found[0].endswith("or most of it moves; look at masks.png")
 
 
 def mark_left(frames: object, *rest: object) -> list[np.ndarray]:

@@ -6,6 +6,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from .cameras import PLAUSIBLE_FOCAL, Cameras
+from .flow import Flows
+from .flow_depth import MAX_RESIDUAL
+from .images import brighten
+from .parallel import map_frames
+from .posed_frames import PosedFrames
+from .triangulation import triangulate
 
 DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
@@ -17,6 +23,10 @@ CROWDED_FRACTION, MANY_FRAMES = 0.3, 0.25
 MIN_OFF, MIN_CONFIRMED = 0.01, 0.2
 """Fraction of the pixels that do not move with the background, from which on it says something, and fraction of them
 that masks hold at least where cameras are right. Static foreground does not move with the background either."""
+
+NUM_CHECKED, MIN_FITTING = 16, 0.5
+"""Number of frames whose optical flow is compared with the cameras, and fraction of the pixels of nearly every frame
+that right cameras explain (docs/design/motion-masks.md)."""
 
 NOTHING_MOVES = (
     "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
@@ -57,6 +67,29 @@ def doubts_of_masks(dynamic: Planes, estimated: bool, off: Planes | None = None)
                 "static foreground, or cameras were found that follow it; look at masks.png"
             )
     return found
+
+
+def doubts_of_motion(frames: PosedFrames, quiet: bool = True) -> list[str]:
+    """Doubts about cameras that the optical flow between neighbouring frames does not confirm.
+
+    Args:
+        frames: The frames, of half the working size.
+        quiet: Whether to show no progress.
+    """
+    flows = Flows(brighten(frames.images), frames.expected_flow)
+
+    def fitting(frame: int) -> float:
+        residual = triangulate(frames.observations(frame, flows), frames.focal).residual
+        return float((residual < MAX_RESIDUAL).mean())  # unknown ones are NaN
+
+    checked = np.unique(np.linspace(0, len(frames.poses) - 1, NUM_CHECKED).round().astype(int)).tolist()
+    num_bad = sum(fraction < MIN_FITTING for fraction in map_frames(fitting, checked, "check of the cameras", quiet))
+    if num_bad < MANY_FRAMES * len(checked):
+        return []
+    return [
+        f"in {num_bad} of {len(checked)} frames that were compared with their neighbours, the cameras explain less "
+        "than half of the image: they may be wrong, or most of it moves; look at masks.png"
+    ]
 
 
 def doubts_of_lens(cameras: Cameras) -> list[str]:

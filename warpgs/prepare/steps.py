@@ -15,14 +15,15 @@ from .background_motion import SIDE, off_background
 from .cameras import Cameras, NoCamerasError
 from .checks import check_count
 from .depth import DEPTHS, add_depth, depth_files
-from .doubts import doubts_of_lens, doubts_of_masks
+from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from .frames import Frames, take_frames
 from .given_masks import find_given_masks, read_dynamic
 from .images import read_images, resize_to_side
 from .intrinsics import read_intrinsics
 from .journal import Journal
-from .masks import MASKERS, Masks, find_masks, mask_files, write_masks
+from .masks import MASKERS, WORKING_SIDE, Masks, find_masks, mask_files, write_masks
 from .options import Options
+from .posed_frames import load_posed_frames
 from .scene import capture_files, write_capture
 from .sfm import Settings, recover_cameras
 
@@ -217,6 +218,8 @@ class Steps:
         background = self.journal.work / BACKGROUND
         off = Masks.load(background).read_dynamic(cameras) if background.is_dir() else None
         found = doubts_of_masks(dynamic, estimated, off)
+        frames = load_posed_frames(self.frames.folder, cameras, WORKING_SIDE).halved
+        found += doubts_of_motion(frames, self.journal.quiet)
         is_known = self.options.camera == "still" or self.options.focal or self.options.intrinsics
         return found if is_known else [*found, *doubts_of_lens(cameras)]
 
