@@ -7,7 +7,7 @@ python examples/fit_image.py photo.jpg --width 480 --gaussians 20000 --steps 100
 import argparse
 from pathlib import Path
 
-import warpgs  # before torch, whose threads it sets for the CPU (docs/design/cpu-shards.md)
+import warpgs  # before torch, whose threads it sets for the CPU (docs/design/cpu.md)
 
 # isort: split
 import skimage

@@ -94,7 +94,7 @@ def make_composite_bwd(
     num_sums = C + NUM_MOMENTS + (NUM_ABSOLUTE_SUMS if absgrad else 0)
     sums_vector, lane_add = make_lane_add(num_sums, columns if vectorized else 1)
 
-    # No grid-stride loop of Warp; docs/design/registers.md lists the kernels that are faster without it.
+    # No grid-stride loop of Warp; docs/design/lane-groups.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
     def composite_bwd(
         first: int,
