@@ -23,7 +23,7 @@ from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]
 """Preset of the trial. Shorter trials mislead, because one deformed set of Gaussians learns more slowly than two
-(docs/design/missing-masks.md)."""
+(docs/design/motion-masks.md)."""
 
 MIN_RELATIVE_LENGTH = 2.0
 """Minimum number of iterations of the run, relative to one of the two trainings."""
