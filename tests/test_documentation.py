@@ -194,6 +194,12 @@ def test_every_page_is_in_the_navigation_of_the_site():
     assert sorted(listed) == sorted(str(page.relative_to(ROOT / "docs")) for page in PAGES[1:])
 
 
+def test_design_notes_have_at_most_40_lines():
+    notes = sorted((ROOT / "docs" / "design").glob("*.md"))
+    assert notes
+    assert [name(note) for note in notes if len(note.read_text().splitlines()) > 40] == []
+
+
 SITE = ("mkdocs", "material", "mkdocstrings")
 
 
