@@ -52,6 +52,11 @@ class Camera:
         """(width, height)."""
         return self.width, self.height
 
+    @property
+    def focal(self) -> Float[Tensor, ""]:
+        """Mean focal length of both axes [px], which differ if pixels are not square."""
+        return self.K.diagonal()[:2].mean()
+
     def to(self, device: torch.device | str) -> "Camera":
         """A copy on another device."""
         return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))

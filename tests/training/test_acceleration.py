@@ -57,6 +57,11 @@ def test_accelerations_are_measured_in_pixels_at_the_depth_of_the_gaussian(pixel
     assert measured(accelerated(pixels, depth)).item() == pytest.approx(expected, rel=2e-3, abs=1e-6)
 
 
+def test_pixels_that_are_not_square_count_by_the_mean_of_their_sides():
+    camera = dataclasses.replace(CAMERA, K=CAMERA.K * torch.tensor([[1.0], [0.5], [1.0]]))
+    assert measured(accelerated(2.0), camera).item() == pytest.approx(measured(accelerated(1.5)).item(), rel=1e-4)
+
+
 def test_the_term_is_the_mean_over_gaussians():
     paths = torch.cat([accelerated(p) for p in (1.0, 2.0, 5.0)], 1)
     parts = [measured(accelerated(p)).item() for p in (1.0, 2.0, 5.0)]

@@ -161,6 +161,20 @@ def test_static_gaussians_of_a_cloud_of_several_scans_are_visible():
     assert static.scales.min() > 0.25 * DEPTH / 46.0
 
 
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+def test_what_cameras_resolve_is_a_quarter_of_the_mean_side_of_a_pixel(monkeypatch, aspect):
+    capture = make_capture(random_points(9))
+    sides = torch.tensor([[1.0], [aspect], [1.0]])
+    capture = capture.with_cameras({n: dataclasses.replace(c, K=c.K * sides) for n, c in capture.cameras.items()})
+    start = Mock(wraps=gaussians_at)
+    monkeypatch.setattr(initialize, "gaussians_at", start)
+    initialize.initial_scene(CONFIG, capture, generator())
+    focal_x, focal_y, _ = capture.cameras["0"].K.diagonal().tolist()
+    assert start.call_args.kwargs["resolution"] == pytest.approx(
+        0.25 * capture.median_depth / (0.5 * (focal_x + focal_y)), rel=1e-5
+    )
+
+
 def test_a_place_that_holds_most_points_does_not_change_the_sizes_elsewhere():
     points = random_points(50)
     crowded = torch.cat([points, points[:1].expand(5_000, 3)])

@@ -63,7 +63,7 @@ def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
         return paths.sum()
     with torch.no_grad():
         depth = camera.depths(now)
-        pixels = torch.where(depth > 0.0, camera.K[0, 0] / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)
+        pixels = torch.where(depth > 0.0, camera.focal / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)
     squared = ((before - 2.0 * now + after) * pixels[:, None]).square().sum(1)
     dynamic_fraction = (~inputs.view.static_mask).float().mean()
     return (squared / (squared + 1.0).sqrt()).mean() * dynamic_fraction

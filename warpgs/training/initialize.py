@@ -58,7 +58,7 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
 def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
     """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
     points, colors = _colored_points(config, capture, generator)
-    focal = torch.stack([capture.cameras[name].K[0, 0] for name in capture.train]).median()
+    focal = torch.stack([capture.cameras[name].focal for name in capture.train]).median()
     resolution = RESOLUTION * capture.median_depth / float(focal)
     return gaussians_at(points, colors, config.model, resolution=resolution)
 

@@ -140,11 +140,11 @@ def test_with_every_strategy_a_resumed_run_ends_with_the_same_bits(data, tmp_pat
 FOCAL = 50.0
 
 
-def camera_at(z, focal=FOCAL):
-    """A camera at a place of the z axis, on which it looks."""
+def camera_at(z, focal=FOCAL, aspect=1.0):
+    """A camera at a place of the z axis, on which it looks, whose pixels are wider than high by an aspect."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = -z
-    return Camera(viewmat, torch.tensor([[focal, 0.0, 8.0], [0.0, focal, 6.0], [0.0, 0.0, 1.0]]), 16, 12)
+    return Camera(viewmat, torch.tensor([[focal, 0.0, 8.0], [0.0, focal * aspect, 6.0], [0.0, 0.0, 1.0]]), 16, 12)
 
 
 def observed(views, depths=(2.0, 4.0, 8.0)):
@@ -168,6 +168,11 @@ def test_the_resolution_of_a_gaussian_is_that_of_the_nearest_view_that_showed_it
 
 def test_a_longer_lens_counts_like_a_nearer_camera():
     strategy = observed([(camera_at(0.0), [0]), (camera_at(0.0, 2.0 * FOCAL), [0])])
+    assert strategy.resolution[0].item() == pytest.approx(2.0 * FOCAL / 2.0)
+
+
+def test_pixels_that_are_not_square_count_by_the_mean_of_their_sides():
+    strategy = observed([(camera_at(0.0, aspect=3.0), [0])])
     assert strategy.resolution[0].item() == pytest.approx(2.0 * FOCAL / 2.0)
 
 

@@ -64,7 +64,7 @@ class Strategy:
             camera: Its camera.
             radii: [N, 2] ``Rendering.radii``; 0 = culled.
         """
-        shown = torch.where(radii[:, 0] > 0, camera.K[0, 0] / camera.depths(splats.means), 0.0)
+        shown = torch.where(radii[:, 0] > 0, camera.focal / camera.depths(splats.means), 0.0)
         torch.maximum(self.resolution, shown, out=self.resolution)
 
     def after_step(
