@@ -192,6 +192,13 @@ def test_the_deformation_has_offsets_of_position_rotation_and_scale():
     assert relative_error(offsets, expected) < 2e-6
 
 
+def test_offsets_of_positions_are_multiples_of_the_length_that_counts_as_1():
+    field = make_field(MlpDeformation)
+    offsets = field(random_means(), TIME)
+    field.units[:3] = 3.0
+    assert torch.equal(field(random_means(), TIME), offsets * torch.tensor([3.0] * 3 + [1.0] * 7))
+
+
 @pytest.mark.parametrize("degree", range(4))
 def test_the_appearance_has_a_residual_of_every_coefficient_up_to_its_degree(degree):
     residuals, logits = make_field(AppearanceField, appearance_degree=degree)(random_means(), TIME)

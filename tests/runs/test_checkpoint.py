@@ -83,6 +83,13 @@ def test_a_scene_round_trips_bit_for_bit(tmp_path):
     assert tiny.differences(dict(read.state_dict()), dict(saved.state_dict())) == []
 
 
+def test_offsets_of_version_0_3_are_in_scene_units(tmp_path):
+    saved = {name: tensor for name, tensor in tensors_of(scene()).items() if name != "scene.deformation.units"}
+    checkpoint.save(tmp_path / "a.safetensors", saved, METADATA)
+    read = checkpoint.load_scene(checkpoint.load(tmp_path / "a.safetensors"), tiny.MODEL)
+    assert read.deformation.units.tolist() == [1.0] * 10
+
+
 @pytest.mark.parametrize("counts", [(0, 0), (1, 0), (0, 1)])
 def test_an_empty_branch_round_trips(tmp_path, counts):
     checkpoint.save(tmp_path / "a.safetensors", tensors_of(scene(*counts)), METADATA)

@@ -9,7 +9,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
-from warpgs.config import LossConfig, ModelConfig, TrainConfig
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.fields import make_deformation
 from warpgs.training import dynamic_points, initialize
@@ -548,6 +548,18 @@ def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config,
     capture = make_capture(100.0 * random_points(50))
     max_scale = dynamic_gaussians(capture, ALIGNMENT, config).scales.max()
     assert (max_scale < 1.0001 * dynamic_points.MAX_SCALE * capture.view_size) == is_bounded
+
+
+@pytest.mark.parametrize("deformation", ["mlp", "splines"])
+@pytest.mark.parametrize("unit", ["pixel", "extent"])
+def test_offsets_are_in_view_sizes_or_as_in_the_paper_in_scene_units(deformation, unit):
+    model = dataclasses.replace(CONFIG.model, deformation=deformation)
+    config = dataclasses.replace(CONFIG, model=model, densify=DensifyConfig(unit=unit, split_size=0.01))
+    capture = make_capture(points_at([12, 2], [20, 20]))
+    field = initialize.initial_scene(config, capture, generator()).deformation
+    units = (field.network if deformation == "splines" else field).units
+    length = {"pixel": capture.view_size, "extent": 1.0}[unit]
+    assert units.tolist() == pytest.approx([length] * 3 + [1.0] * 7)
 
 
 def test_if_everything_is_assumed_dynamic_the_points_become_dynamic_gaussians():

@@ -16,7 +16,7 @@ from tests.scenes import (
     relative_error,
     select,
 )
-from warpgs.config import LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
@@ -132,6 +132,7 @@ LOSS = LossConfig(
 NOTHING = LossConfig(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
 NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
 SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, appearance_from=100)
+VIEW_SIZE = 3.0
 STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
 """First iteration of each stage."""
 
@@ -147,7 +148,7 @@ def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **opti
     assert plan.phase.stage == stage
     views = Views(capture, torch.device("cpu"), 1 << 30, loss.mask_margin)
     trusts = DepthTrust(*torch.tensor(trust)[:, None])
-    return scene, plan, Step(config, scene, views, ALIGNMENTS, trusts, capture.view_size)
+    return scene, plan, Step(config, scene, views, ALIGNMENTS, trusts, VIEW_SIZE)
 
 
 def terms_of(stage, loss=LOSS, schedule=SCHEDULE):
@@ -186,7 +187,7 @@ def view_depth():
 def expected_depth(layer, region, min_alpha=0.5):
     known = region & (layer.alpha > min_alpha)
     assert known.any()
-    return ((layer.depth.double() - view_depth()) * known).abs().mean()
+    return ((layer.depth.double() - view_depth()) * known).abs().mean() / VIEW_SIZE
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -242,13 +243,24 @@ def test_the_means_of_opacities_and_standard_deviations_can_be_terms():
     terms, _ = terms_of("stage2", dataclasses.replace(LOSS, opacity=3.0, scale=5.0))
     assert {"opacity", "scale"}.isdisjoint(terms_of("stage2")[0])
     assert relative_error(terms["opacity"], 3.0 * SPLATS.opacities.mean()) < 1e-5
-    assert relative_error(terms["scale"], 5.0 * SPLATS.scales.mean()) < 1e-5
+    assert relative_error(terms["scale"], 5.0 * SPLATS.scales.mean() / VIEW_SIZE) < 1e-5
 
 
-def terms_with_trust(weight, margin):
-    _, plan, step = prepared("stage1", trust=(weight, margin))
+def terms_with_trust(weight, margin, loss=LOSS, **options):
+    _, plan, step = prepared("stage1", loss, trust=(weight, margin), **options)
     step(plan, Sample(0, 0.0, PURPLE, 0))
     return step.take_means().terms
+
+
+def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units():
+    loss = dataclasses.replace(LOSS, scale=5.0)
+    in_views, in_scene = (
+        terms_with_trust(1.0, 0.0, loss, densify=DensifyConfig(unit=unit, split_size=0.01))
+        for unit in ("pixel", "extent")
+    )
+    lengths = {"depth", "depth_dynamic", "scale"}
+    ratios = {name: in_scene[name] / in_views[name] for name in in_views}
+    assert ratios == pytest.approx({name: VIEW_SIZE if name in lengths else 1.0 for name in ratios}, rel=1e-5)
 
 
 def test_depth_terms_are_multiplied_by_the_trust_in_the_view():

@@ -30,7 +30,8 @@ class LossConfig:
     dynamic_background: Literal["black", "random"] = "random"
     """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
     depth: float = 2.0
-    """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14)."""
+    """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14) [view sizes; scene units
+    if ``densify.unit`` is extent (paper)]."""
     depth_dynamic: float = 1.0
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
@@ -54,7 +55,7 @@ class LossConfig:
     opacity: float = 0.0
     """Weight of the mean opacity of all Gaussians."""
     scale: float = 0.0
-    """Weight of the mean standard deviation of all Gaussians along their axes [scene units]."""
+    """Weight of the mean standard deviation of all Gaussians along their axes [view sizes]."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.0
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

@@ -109,6 +109,10 @@ class TrainConfig:
         """How all images of the run are rendered."""
         return RenderSettings(antialias=self.antialias, max_alpha=self.max_alpha)
 
+    def length_unit(self, view_size: float) -> float:
+        """Length of 1 in the loss, the deformation and the noise [scene units], from a capture's view size."""
+        return view_size if self.densify.unit == "pixel" else 1.0
+
 
 def validate(config: TrainConfig) -> None:
     """Refuses numbers with which training would fail later.

@@ -20,7 +20,8 @@ class SplineDeformation(nn.Module):
 
     Attributes:
         homes: [K, 3] canonical positions of the objects [scene units].
-        paths: [K, C, 3] control points of their positions over time, from 0 to 1 [scene units].
+        paths: [K, C, 3] control points of their positions over time, from 0 to 1, in the units of the network's offsets
+            of positions.
     """
 
     homes: Tensor
@@ -45,4 +46,4 @@ class SplineDeformation(nn.Module):
         f = time * pieces - first
         weights = torch.cat([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
         points = self.paths.index_select(1, first.long() + torch.arange(4, device=time.device))
-        return (points * weights[:, None]).sum(1)
+        return (points * weights[:, None]).sum(1) * self.network.units[:3]

@@ -307,6 +307,9 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
         name.removeprefix("scene."): tensor for name, tensor in checkpoint.tensors.items() if name.startswith("scene.")
     }
     path = checkpoint.path
+    for part in ("deformation", "deformation.network"):  # offsets of version 0.3 and earlier are in scene units
+        if config.deformation in ("mlp", "splines") and f"{part}.trunk.values" in state:
+            state.setdefault(f"{part}.units", torch.ones(10, dtype=torch.float32))
     try:
         # Rows of three: the size of the file bounds their number, whatever shape it claims.
         static, dynamic = state["static.means"].view(-1, 3), state["dynamic.means"].view(-1, 3)

@@ -14,6 +14,7 @@ from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced
 from warpgs.model.gaussians import SH_C0, Gaussians
+from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import DEFAULTS, render
@@ -52,7 +53,11 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
         static = _gaussians_at_points(config, capture, generator)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
+        scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
+    for module in scene.deformation.modules():
+        if isinstance(module, MlpDeformation):
+            module.units[:3] = config.length_unit(capture.view_size)
+    return scene
 
 
 def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:

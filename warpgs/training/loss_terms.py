@@ -44,7 +44,7 @@ def squared(inputs: LossInputs) -> Float[Tensor, ""]:
 def _depth_error(
     inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"], margin: Float[Tensor, ""]
 ) -> Float[Tensor, ""]:
-    """The error of a layer's depth in a region, times the weight of the view's depth."""
+    """The error of a layer's depth in a region, in ``LossInputs.unit``, times the weight of the view's depth."""
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
@@ -52,7 +52,7 @@ def _depth_error(
     # The op skips pixels with an opacity of at most a half.
     alpha = layer.alpha if inputs.config.depth_gate else torch.ones_like(layer.alpha)
     error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region, margin)
-    return error * inputs.depth_trust.weight
+    return error * inputs.depth_trust.weight / inputs.unit
 
 
 def depth(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -74,8 +74,8 @@ def opacity(inputs: LossInputs) -> Float[Tensor, ""]:
 
 
 def scale(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The mean standard deviation (Kheradmand et al. 2024, Eq. 10)."""
-    return inputs.splats.scales.sum() / max(1, inputs.splats.scales.numel())
+    """The mean standard deviation (Kheradmand et al. 2024, Eq. 10), in ``LossInputs.unit``."""
+    return inputs.splats.scales.sum() / (max(1, inputs.splats.scales.numel()) * inputs.unit)
 
 
 TERMS: dict[str, LossTerm] = {

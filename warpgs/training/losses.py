@@ -41,6 +41,7 @@ class LossInputs(NamedTuple):
         depth_trust: How much the view's depth is trusted. None like ``alignment``.
         paths: [3, K, 3] positions of some dynamic Gaussians one frame before a moment near that of the view, then, and
             one frame after; None unless ``LossConfig.acceleration`` and the deformation are in use.
+        unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
     """
 
     config: LossConfig
@@ -51,6 +52,7 @@ class LossInputs(NamedTuple):
     alignment: Float[Tensor, "2"] | None
     depth_trust: DepthTrust | None
     paths: Float[Tensor, "3 K 3"] | None = None
+    unit: float = 1.0
 
 
 class LossTerm(NamedTuple):

@@ -1,6 +1,7 @@
 """One training step: render the three images, compare them with the ground truth, take one step of Adam."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -78,7 +79,8 @@ class Step:
         views: Training views.
         alignments: [T, 2] scale and offset of each view's inverse depth; may be changed in place.
         depth_trust: [T] how much the depth of each view is trusted.
-        unit: See ``optimizer.learning_rates`` [scene units].
+        unit: The capture's view size, or whatever else a run was begun with; see ``optimizer.learning_rates`` [scene
+            units].
 
     Attributes:
         scene: What is trained.
@@ -142,6 +144,10 @@ class Step:
         else:
             self._graphs.run(plan.phase, partial(self._run, plan.phase))
 
+    def after_step(self, generator: Callable[[str, torch.device], torch.Generator]) -> None:
+        """What density control does after every step of Adam; see ``Strategy.after_step``."""
+        self.density.after_step(self.scene, self.optimizer, self.config.length_unit(self.unit), generator)
+
     def release_graphs(self) -> None:
         """Frees the memory of the CUDA graphs; from then on, iterations are eager."""
         self._graphs = None
@@ -172,7 +178,8 @@ class Step:
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         paths = self._paths(view) if phase.use_deformation and config.acceleration > 0 else None
-        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, paths)
+        length = self.config.length_unit(self.unit)
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, paths, length)
         terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()

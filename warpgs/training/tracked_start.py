@@ -64,7 +64,8 @@ def start_from_tracks(
     gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_size)
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
-    deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])))
+    units = deformation.network.units[:3].cpu()
+    deformation.paths.copy_(torch.from_numpy(np.stack([track.path.c for track in tracks])) / units)
     return gaussians
 
 

@@ -133,7 +133,7 @@ class Trainer:
             plan = self.protocol.at(self.iteration)
             self.views.announce(self._sampler.views(self.iteration, self.rollbacks))
             self.step(plan, self._sample(plan))
-            self.step.density.after_step(self.scene, self.step.optimizer, self._generator)
+            self.step.after_step(self._generator)
             if plan.actions:
                 self._adapt(plan, logger)
             self.iteration += 1

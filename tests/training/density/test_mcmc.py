@@ -91,16 +91,17 @@ def positions_after(data, folder, iteration=0, rollbacks=0, noise=5e5, is_traine
     before = static.means.detach().clone()
     for group in trainer.step.optimizer.param_groups:
         group["lr"].fill_(1e-3 if group["name"] == "static.means" else 7.0)
-    trainer.step.density.after_step(trainer.scene, trainer.step.optimizer, trainer._generator)
+    trainer.step.after_step(trainer._generator)
     return before, static.means.detach()
 
 
-def test_noise_is_proportional_to_the_learning_rate_of_positions(data, tmp_path):
+def test_noise_is_proportional_to_the_learning_rate_of_positions_and_the_covariance_in_view_sizes(data, tmp_path):
     before, after = positions_after(data, tmp_path)
-    gaussians = trainer_with(data, tmp_path / "again").scene.static
+    trainer = trainer_with(data, tmp_path / "again")
+    gaussians, unit = trainer.scene.static, trainer.capture.view_size
     gaussians.logit_opacities.data[:] = -9.0
     normal = torch.randn(before.shape, generator=random_numbers(CONFIG.seed, "noise", 0, 0))
-    assert relative_error(after - before, noisy(gaussians, normal, 5e5 * 1e-3)) < 1e-3
+    assert relative_error(after - before, noisy(gaussians, normal, 5e5 * 1e-3 / unit**2)) < 1e-3
 
 
 @pytest.mark.parametrize("off", [{"noise": 0.0}, {"is_trained": False}], ids=str)

@@ -60,13 +60,16 @@ class McmcStrategy(Strategy):
             respawn(gaussians, at.optimizer, is_dead, added, config.min_opacity, generator)
 
     def after_step(
-        self, scene: SplitScene, optimizer: Adam, generator: Callable[[str, torch.device], torch.Generator]
+        self, scene: SplitScene, optimizer: Adam, unit: float, generator: Callable[[str, torch.device], torch.Generator]
     ) -> None:
-        """Adds noise to the positions that are trained, in proportion to their learning rate."""
+        """Adds noise to the positions that are trained, in proportion to their learning rate and covariance.
+
+        The covariance is in unit²: a learning rate is a length, and noise grows like one with the scene.
+        """
         rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
         random = generator("noise", scene.static.means.device)
         for branch, gaussians in (("static", scene.static), ("dynamic", scene.dynamic)):
             means = gaussians.means
             normal = torch.randn(means.shape, dtype=means.dtype, device=means.device, generator=random)
             if means.requires_grad:
-                add_noise(gaussians, normal, self.config.noise * rates[f"{branch}.means"])
+                add_noise(gaussians, normal, self.config.noise * rates[f"{branch}.means"] / unit**2)

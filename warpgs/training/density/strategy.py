@@ -68,13 +68,14 @@ class Strategy:
         torch.maximum(self.resolution, shown, out=self.resolution)
 
     def after_step(
-        self, scene: SplitScene, optimizer: Adam, generator: Callable[[str, torch.device], torch.Generator]
+        self, scene: SplitScene, optimizer: Adam, unit: float, generator: Callable[[str, torch.device], torch.Generator]
     ) -> None:
         """Changes Gaussians, but not their numbers, after every step of Adam, alike on all ranks.
 
         Args:
             scene: Changed in place.
             optimizer: Its optimizer, after the step.
+            unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
             generator: Makes the generator of random numbers for a purpose on a device; they are the same on all ranks.
         """
 
