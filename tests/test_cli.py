@@ -127,6 +127,14 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["export", "--fromat", "ply"], "warpgs export: there is no option --fromat; did you mean --format?"),
         (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
         (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),
+        (
+            ["train", "--densify.dense_fraction=1"],
+            "warpgs train: there is no option --densify.dense-fraction; it is --densify.split-size now\n",
+        ),
+        (
+            ["train", "--densify.no-depth-gradients"],
+            "warpgs train: there is no option --densify.no-depth-gradients any more: omit it\n",
+        ),
         (["train", "--quiet"], "warpgs train: there is no option --quiet; warpgs train --help lists all"),
         (["render", "r", "--zzz"], "warpgs render: there is no option --zzz; warpgs render --help lists all"),
         (["\x1b[2J"], "warpgs: there is no command \\x1b[2J; warpgs --help lists all"),

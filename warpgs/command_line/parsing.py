@@ -79,8 +79,16 @@ def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Option
 
 
 @contextlib.contextmanager
-def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Iterator[None]:
+def one_line_errors(
+    options: type, arguments: Sequence[str], prog: str, former: Callable[[str], str] = lambda name: ""
+) -> Iterator[None]:
     """Refuses options that do not exist, and turns tyro's boxes about other wrong options into errors of one line.
+
+    Args:
+        options: A dataclass of options.
+        arguments: The command line.
+        prog: The program and its command.
+        former: Says what became of an option of earlier versions; empty if there never was one of that name.
 
     Raises:
         ValueError: If an option is wrong.
@@ -90,7 +98,7 @@ def one_line_errors(options: type, arguments: Sequence[str], prog: str) -> Itera
         name = argument.split("=")[0].replace("_", "-")
         if name.startswith("--") and name not in known and not name.startswith("--tyro"):
             # Without the dashes, which would make all short options similar.
-            close = suggestion(name[2:], [option[2:] for option in known], "--{}".format)
+            close = former(name) or suggestion(name[2:], [option[2:] for option in known], "--{}".format)
             raise ValueError(f"there is no option {name}{close or f'; {prog} --help lists all'}")
     box, text = io.StringIO(), _Like(sys.stdout)
     try:

@@ -43,6 +43,16 @@ ALWAYS = {
 Others may be missing. With the default of one of these, a run would be resumed as another run."""
 
 
+def former_option(name: str) -> str:
+    """The end of the message that there is no option ``name``: what became of it; empty if no version had it."""
+    *section, field = name.lstrip("-").replace("-", "_").split(".")
+    if field in RENAMED:
+        return f"; it is --{'.'.join([*section, RENAMED[field]]).replace('_', '-')} now"
+    if field.removeprefix("no_") in REMOVED.get(".".join(section), ()):
+        return " any more: omit it"
+    return ""
+
+
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Writes config.json into a run folder, with absolute paths.
 

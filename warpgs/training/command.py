@@ -63,11 +63,18 @@ def main(arguments: Sequence[str], prog: str = "train.py") -> int:
     """
 
     def start() -> int:
-        with one_line_errors(TrainConfig, arguments, prog):
+        with one_line_errors(TrainConfig, arguments, prog, _former):
             config = parse(arguments, prog)
         return run(config)
 
     return run_command(start, prog, ADVICE)
+
+
+def _former(name: str) -> str:
+    """See ``former_option``."""
+    from warpgs.runs.config_file import former_option  # imports torch, which --help does not need
+
+    return former_option(name)
 
 
 def run(config: TrainConfig) -> int:
