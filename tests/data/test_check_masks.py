@@ -11,6 +11,7 @@ from tests.data import layouts
 from tests.data.captures import edit_json, stop_time
 from warpgs.data import check
 from warpgs.data.check import check_capture, quick_findings
+from warpgs.data.findings import few_of
 from warpgs.data.loaders import load_capture
 
 
@@ -152,12 +153,20 @@ def cut_images(root, count):
         path.write_bytes(path.read_bytes()[:100])
 
 
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(1, "a"), (3, "a, b, c"), (4, "a, b, c, d"), (5, "a, b, c and 2 others"), (26, "a, b, c and 23 others")],
+)
+def test_a_finding_names_few_of_many_frames(count, text):
+    assert few_of(list("abcdefghijklmnopqrstuvwxyz"[:count])) == text
+
+
 def test_an_error_of_several_frames_is_one_line_with_their_files(root, monkeypatch):
-    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 2)
+    monkeypatch.setattr("warpgs.data.findings.MAX_NAMED", 1)
     cut_images(root, 4)
     (text,) = [f.text for f in check_capture(root).findings if f.level == "error"]
     assert "shot000.png is truncated" in text
-    assert text.endswith("(the same of 3 more files: shot001.png, shot002.png and 1 more)")
+    assert text.endswith("(the same of 3 more files: shot001.png and 2 others)")
 
 
 def test_an_error_of_all_frames_is_one_line_with_their_number(root):

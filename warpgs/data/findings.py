@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -9,6 +10,15 @@ from typing import Any, Literal
 from warpgs.errors import visible
 
 Level = Literal["error", "warning", "note"]
+
+MAX_NAMED = 3
+"""Number of frames that a finding names where there are many."""
+
+
+def few_of(names: Sequence[str]) -> str:
+    """Names in a sentence: all of a few, else the first ``MAX_NAMED`` and the number of the others."""
+    others = len(names) - MAX_NAMED
+    return ", ".join(names) if others < 2 else f"{', '.join(names[:MAX_NAMED])} and {others} others"
 
 
 @dataclass(frozen=True)

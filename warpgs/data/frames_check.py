@@ -6,10 +6,10 @@ from pathlib import Path
 
 from .capture import MASKS_REMEDY, Capture
 from .check_sample import Content
-from .findings import Finding
+from .findings import Finding, few_of
 
 MAX_ERRORS = 20
-"""Maximum number of kinds of errors, and of files of one kind, that are named."""
+"""Maximum number of kinds of errors that are named."""
 
 FILE = re.compile(r"(?i).*?\.(png|jpe?g|exr|npy)(?=[: ])")
 
@@ -70,9 +70,8 @@ def _errors(errors: Sequence[str], num_read: int) -> Iterator[str]:
         kinds.setdefault(error.removeprefix(_file_in(error)), []).append(error)
     for first, *others in list(kinds.values())[:MAX_ERRORS]:
         names = [Path(_file_in(error)).name for error in others]
-        more = f" and {len(names) - MAX_ERRORS} more" if len(names) > MAX_ERRORS else ""
-        of = f" {len(others)} more files: {', '.join(names[:MAX_ERRORS])}{more}"
-        same = f"all {num_read} frames" if len(others) + 1 == num_read else of.strip()
+        of = f"{len(others)} more files: {few_of(names)}"
+        same = f"all {num_read} frames" if len(others) + 1 == num_read else of
         yield f"{first} (the same of {same})" if others else first
     if len(kinds) > MAX_ERRORS:
         yield f"{sum(map(len, list(kinds.values())[MAX_ERRORS:]))} more frames cannot be read"

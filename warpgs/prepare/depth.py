@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from warpgs.data.findings import few_of
 from warpgs.data.images import read_mask
 from warpgs.data.writer import write_depth
 
@@ -74,7 +75,7 @@ def add_depth(
     write_contact_sheet(root / "depth.png", shown, cameras.names)
     known = [float(np.isfinite(plane).mean()) for plane in planes]
     unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
-    notes = [f"depth is unknown everywhere in {', '.join(unknown)}"] if unknown else []
+    notes = [f"depth is unknown everywhere in {few_of(unknown)}"] if unknown else []
     return f"known on {np.mean(known):.0%} of the pixels", notes
 
 

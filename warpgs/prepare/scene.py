@@ -9,6 +9,7 @@ from jaxtyping import Bool, UInt8
 
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
+from warpgs.data.findings import few_of
 from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
 
@@ -65,7 +66,7 @@ def write_capture(
     writer.held_out(cameras.names, holdout)  # fails before anything is written
     omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
     if omitted:
-        notes.append(f"omitted, because no camera was found for them: {', '.join(omitted)}")
+        notes.append(f"omitted, because no camera was found for them: {few_of(omitted)}")
     shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
     write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, estimated)
     painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
