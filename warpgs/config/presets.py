@@ -150,3 +150,18 @@ QUICK = dataclasses.replace(
 
 PRESETS = {"paper": PAPER, "best": BEST, "patient": PATIENT, "quick": QUICK}
 """Defaults by name."""
+
+FAR = 10.0
+"""Factor of the default, above which a learning rate may be why a training diverges."""
+
+
+def far_rates(config: TrainConfig) -> str:
+    """The end of a message on a training that diverged: the rates far above their defaults; empty if none is."""
+    default = PRESETS[config.preset].optim if config.preset else TrainConfig().optim
+    given, usual = dataclasses.asdict(config.optim), dataclasses.asdict(default)
+    far = [
+        f"--optim.{name.replace('_', '-')} is {given[name]:g}, by default {value:g}"
+        for name, value in usual.items()
+        if isinstance(value, float) and value > 0.0 and (given[name] or 0.0) > FAR * value
+    ]
+    return f"; {', '.join(far)}" if far else ""

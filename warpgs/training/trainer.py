@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from warpgs.config import TrainConfig
+from warpgs.config.presets import far_rates
 from warpgs.data.capture import Capture
 from warpgs.data.exposure import exposure_gains
 from warpgs.model.poses import PoseCorrections
@@ -261,7 +262,7 @@ class Trainer:
             raise ValueError(
                 f"the loss or a parameter is not finite after iteration {failed_at}, even after {self.rollbacks} "
                 f"returns to a checkpoint; {saved[-1] if saved else 'no checkpoint'} holds the last valid state"
-                + ("; a new run with --model.no-half trains the networks in single precision" if half else "")
+                + (far_rates(self.config) or ("; a new run with --model.no-half trains in single precision" * half))
             )
         self.restore_newest(logger.log)
         logger.begin(self.iteration)

@@ -152,6 +152,14 @@ def test_a_run_ends_when_it_has_lost_the_last_static_gaussian(trainer):
         trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
 
 
+def test_where_rates_are_far_above_their_defaults_that_error_names_them_instead_of_the_capture(trainer):
+    make_transparent(trainer.scene.static)
+    optim = dataclasses.replace(trainer.config.optim, means=100.0)
+    trainer.config = dataclasses.replace(trainer.config, optim=optim)
+    with pytest.raises(ValueError, match=r"pixels are static; --optim\.means is 100, by default 0\.00065$"):
+        trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+
+
 def test_dynamic_gaussians_that_are_all_lost_are_added_again_at_once(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path / "run")
     trainer._add_dynamic_gaussians()
@@ -206,9 +214,9 @@ def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer
     before, trainer.scene.dynamic = (len(trainer.scene.static), 7), Gaussians.empty(0, 1)
     if is_needed:
         with pytest.raises(ValueError, match=r"but 0\.1% of the training pixels are dynamic"):
-            require_branches(before, trainer.scene, views)
+            require_branches(before, trainer.scene, views, trainer.config)
     else:
-        assert require_branches(before, trainer.scene, views) == (
+        assert require_branches(before, trainer.scene, views, trainer.config) == (
             "the last dynamic Gaussian was removed, as transparent, oversized or rarely seen; 0.09% of the training "
             "pixels are dynamic"
         )
@@ -216,4 +224,4 @@ def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer
 
 def test_a_branch_that_never_had_gaussians_has_lost_none(trainer):
     trainer.scene.dynamic = Gaussians.empty(0, 1)
-    assert require_branches((len(trainer.scene.static), 0), trainer.scene, trainer.views) is None
+    assert require_branches((len(trainer.scene.static), 0), trainer.scene, trainer.views, trainer.config) is None

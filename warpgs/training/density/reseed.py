@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from warpgs.config import RenderSettings, TrainConfig
+from warpgs.config.presets import far_rates
 from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
@@ -35,13 +36,14 @@ MIN_REGION = 1e-3
 """Fraction of the training pixels above which a run does not go on without the Gaussians that show them."""
 
 
-def require_branches(before: tuple[int, int], scene: SplitScene, views: Views) -> str | None:
+def require_branches(before: tuple[int, int], scene: SplitScene, views: Views, config: TrainConfig) -> str | None:
     """A warning if a branch has lost its last Gaussian and hardly any pixel needs it; None if no branch has.
 
     Args:
         before: Numbers of static and dynamic Gaussians before the scene was changed.
         scene: The scene after that.
         views: Its training views.
+        config: Of the run; the error names learning rates that are far from their defaults.
 
     Raises:
         ValueError: If more than ``MIN_REGION`` of the training pixels need it.
@@ -56,6 +58,8 @@ def require_branches(before: tuple[int, int], scene: SplitScene, views: Views) -
     removed = f"the last {branch} Gaussian was removed, as transparent, oversized or rarely seen"
     if share < MIN_REGION:
         return f"{removed}; {share:.2%} of the training pixels are {branch}"
+    if rates := far_rates(config):
+        raise ValueError(f"{removed}, but {share:.1%} of the training pixels are {branch}{rates}")
     hint = f"; if everything is {other}, train with --assume {other}" if share < 0.5 else ""
     raise ValueError(
         f"{removed}, but {share:.1%} of the training pixels are {branch}: warpgs check may find what is wrong with the "

@@ -117,5 +117,5 @@ class Strategy:
                 self.actions[action](at)
         if before[1] > 0 == len(at.scene.dynamic):
             reseed(at)
-        if lost := require_branches(before, at.scene, at.views):
+        if lost := require_branches(before, at.scene, at.views, at.config):
             at.log(f"warning: {lost}")
