@@ -21,7 +21,7 @@ from warpgs.training import command as training
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-OWN_TESTS = {"extending.md", "capture-format.md"}
+OWN_TESTS = {"extending.md"}
 """Pages whose Python has tests of its own."""
 
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -103,6 +103,12 @@ def test_complete_commands_of_a_page_are_accepted(page):
             training.parse(rest)
         else:
             parse(COMMANDS[command].load(), rest, f"warpgs {command}")
+
+
+def test_the_command_of_the_job_for_slurm_is_accepted():
+    (line,) = command_lines((ROOT / "examples" / "sweep_on_slurm.sh").read_text())
+    _, command, *rest = shlex.split(line)
+    parse(COMMANDS[command].load(), rest, f"warpgs {command}")
 
 
 def test_there_are_commands_and_snippets():

@@ -1,6 +1,8 @@
 """docs/capture-format.md: its example is a capture, and its tables name what the reader takes."""
 
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,17 +15,17 @@ from warpgs.data.check import check_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import load_capture
 
-TEXT = (Path(__file__).parents[2] / "docs" / "capture-format.md").read_text()
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "capture-format.md").read_text()
 
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("example")
-    (source,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    folder = tmp_path_factory.mktemp("example") / "example"
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        exec(source, {})
-    return folder / "example"
+        patch.setattr(sys, "argv", ["write_a_capture.py", "--out", str(folder)])
+        runpy.run_path(str(ROOT / "examples" / "write_a_capture.py"), run_name="__main__")
+    return folder
 
 
 def test_the_example_is_fit_to_train_on(example):
