@@ -13,8 +13,9 @@ import pytest
 import rich
 import torch
 
+from warpgs.config.builtin import parse_builtin
 from warpgs.data import studio
-from warpgs.data.builtin import builtin_folder, parse_builtin
+from warpgs.data.builtin_folder import builtin_folder
 from warpgs.data.degraded_depth import DegradedDepth
 from warpgs.data.loaders import load_capture, recognize
 from warpgs.data.studio import StudioSize, studio_capture, trace

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
+from warpgs.cache import cache_folder
 from warpgs.data import synthetic
 from warpgs.data.bodies import as_tensors, even_samples
-from warpgs.data.builtin_cache import cache_folder, content_folder
+from warpgs.data.builtin_cache import content_folder
 from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 

@@ -1,15 +1,12 @@
 """Where built-in captures are kept: each is made on its first use, in the user's cache."""
 
-import atexit
 import hashlib
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from warpgs.cache import cache_folder
 from warpgs.command_line.screen import show_error
 from warpgs.files import complete_or_absent
 
@@ -38,26 +35,3 @@ def content_folder(cache_dir: Path | None, content: Any) -> Path:
     if cache_dir is None:
         cache_dir = cache_folder("built-in captures")
     return cache_dir / hashlib.blake2b(json.dumps(content).encode(), digest_size=6).hexdigest()
-
-
-def cache_folder(content: str) -> Path:
-    """The user's cache of warpgs; if it cannot be written a folder that is removed at exit, with a warning.
-
-    Args:
-        content: What is to be kept there, for the warning.
-    """
-    try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "warpgs"
-        folder.mkdir(parents=True, exist_ok=True)
-        reason = "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
-    except (OSError, RuntimeError) as error:  # RuntimeError: a user without a home
-        reason = str(error)
-    if not reason:
-        return folder
-    folder = Path(tempfile.mkdtemp(prefix="warpgs-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    show_error(
-        f"warpgs: no cache for {content} ({reason}): they are kept in {folder} until the program ends; "
-        "set XDG_CACHE_HOME to a folder that can be written"
-    )
-    return folder

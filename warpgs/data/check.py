@@ -6,9 +6,9 @@ Training runs the cheap part of the same checks before it begins, so that both s
 import time
 from pathlib import Path
 
+from warpgs.config.builtin import is_builtin
 from warpgs.files import read_json
 
-from .builtin import is_builtin
 from .capture import Assumption, Capture
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth

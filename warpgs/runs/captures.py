@@ -3,7 +3,8 @@
 import torch
 
 from warpgs.config import TrainConfig
-from warpgs.data.builtin import builtin_folder, is_builtin, require_factor
+from warpgs.config.builtin import is_builtin, require_factor
+from warpgs.data.builtin_folder import builtin_folder
 from warpgs.data.capture import Background, Capture
 from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.data.synthetic import builtin_capture

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig, validate
-from warpgs.data.builtin import is_builtin
+from warpgs.config.builtin import is_builtin
 from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
 

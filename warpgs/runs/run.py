@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 
 from warpgs.config import TrainConfig
-from warpgs.data.builtin import is_builtin
+from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Capture
 from warpgs.errors import command, similar_path
 from warpgs.files import partial_path

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.config import TrainConfig, scaled
+from warpgs.config.builtin import is_builtin, parse_builtin
 from warpgs.config.presets import PRESETS
-from warpgs.data.builtin import is_builtin, parse_builtin
 from warpgs.errors import one_line, visible
 from warpgs.runs.config_file import NAME as CONFIG_NAME
 from warpgs.runs.config_file import parse_config

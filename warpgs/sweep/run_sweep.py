@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.command_line.screen import show_error
+from warpgs.config.builtin import is_builtin
 from warpgs.config.presets import PRESETS
-from warpgs.data.builtin import builtin_folder, is_builtin
+from warpgs.data.builtin_folder import builtin_folder
 from warpgs.errors import FAILED, not_one_of, one_line
 from warpgs.evaluation.lpips import locate
 from warpgs.files import read_json, write_json

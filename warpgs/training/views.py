@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from warpgs.cache import cache_folder
 from warpgs.cameras import Camera
-from warpgs.data.builtin_cache import cache_folder
 from warpgs.data.capture import Capture
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Protocol
 
 from warpgs.config import MaskPerturbation
-from warpgs.data.builtin import NAMES, PREFIX, builtin_folder, is_builtin
+from warpgs.config.builtin import NAMES, PREFIX, is_builtin
+from warpgs.data.builtin_folder import builtin_folder
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.masks import check_perturbation
@@ -89,7 +90,7 @@ def load_capture(
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
     Args:
-        root: Folder of the capture, or a built-in one (``data/builtin.py``).
+        root: Folder of the capture, or a built-in one (``config/builtin.py``).
         dataset: Key of ``LOADERS``; recognized from the files if None.
         factor: Downscaling factor of the images; the dataset's default if None.
         vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.

@@ -1,4 +1,4 @@
-"""Captures that the package renders itself, by name: ``--data 'builtin:studio?depth=network&frames=12'``."""
+"""Names of the captures that the package renders itself: ``--data 'builtin:studio?depth=network&frames=12'``."""
 
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
@@ -57,30 +57,3 @@ def require_factor(data: Path | str, factor: int | None) -> None:
     """Raises ValueError if a downscaling factor is wanted that built-in captures lack."""
     if factor not in (None, 1):
         raise ValueError(f"{data} has images of one size: omit --factor {factor}")
-
-
-def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = None) -> Path:
-    """The folder of a built-in capture, which is created on the first call.
-
-    Args:
-        data: Its name.
-        quiet: Whether to hide that it is made.
-        factor: Downscaling factor that is wanted; there is only 1.
-
-    Raises:
-        ValueError: If there is no such capture, or it lacks the factor.
-        OSError: If it cannot be written.
-    """
-    name, depth, num_frames = parse_builtin(data)
-    require_factor(data, factor)
-    if name == "room":
-        from .synthetic import builtin_capture  # imports torch
-
-        return builtin_capture(quiet=quiet)
-    if name == "balls":
-        from .balls import balls_capture
-
-        return balls_capture(quiet=quiet)
-    from .studio import StudioSize, studio_capture
-
-    return studio_capture(depth, size=StudioSize(num_frames=num_frames), quiet=quiet)
