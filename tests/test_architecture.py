@@ -20,6 +20,7 @@ ORDER = [
     "rendering",
     "visualize",
     "data",
+    "captures",
     "runs",
     "video",
     "evaluation",

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.data.findings import Finding
+from warpgs.captures.findings import Finding
 from warpgs.errors import (
     ADVICE,
     CLOSED,

@@ -33,8 +33,8 @@ class Command(NamedTuple):
 COMMANDS = {
     "sample": Command(".prepare.command:Sample", "write a short video to try prepare on"),
     "prepare": Command(".prepare.command:Prepare", "make a capture from a video or a folder of frames"),
-    "import": Command(".data.command:Import", "copy a capture of any layout into the layout of prepare"),
-    "check": Command(".data.command:Check", "check whether a capture is fit to train on"),
+    "import": Command(".captures.command:Import", "copy a capture of any layout into the layout of prepare"),
+    "check": Command(".captures.command:Check", "check whether a capture is fit to train on"),
     "train": Command(".config:TrainConfig", "train on a capture or on the built-in scene"),
     "sweep": Command(".sweep.command:Sweep", "train many runs and make one table"),
     "eval": Command(".evaluation.command:Eval", "evaluate a run: PSNR, SSIM, LPIPS, smoothness, FPS"),

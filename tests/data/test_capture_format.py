@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from tests import tiny
+from warpgs.captures.check import check_capture
 from warpgs.data import camera_files, writer
-from warpgs.data.check import check_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import load_capture
 

@@ -7,9 +7,9 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_json
+from warpgs.captures.check import check_capture
+from warpgs.captures.import_capture import import_capture
 from warpgs.config import TrainConfig
-from warpgs.data.check import check_capture
-from warpgs.data.import_capture import import_capture
 from warpgs.data.loaders import load_capture
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.time_source import TimeSource, with_steps

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.prepare import boards
-from warpgs.data.check import check_capture
+from warpgs.captures.check import check_capture
 from warpgs.prepare.cameras import Cameras
 from warpgs.prepare.doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from warpgs.prepare.options import Options

@@ -13,7 +13,7 @@ import pytest
 
 from tests.campaign.damage import replace_by_fifo
 from tests.prepare import boards
-from warpgs.data.check import check_capture
+from warpgs.captures.check import check_capture
 from warpgs.data.lens import Lens, undistort
 from warpgs.data.loaders import load_capture
 from warpgs.prepare import pipeline

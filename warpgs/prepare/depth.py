@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.data.findings import few_of
+from warpgs.captures.findings import few_of
 from warpgs.data.images import read_mask
 from warpgs.data.writer import write_depth
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from warpgs.captures.findings import few_of
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
-from warpgs.data.findings import few_of
 from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
 

@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from warpgs.captures.check import quick_findings
+from warpgs.captures.findings import Finding
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
-from warpgs.data.check import quick_findings
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.data.findings import Finding
 from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views

@@ -8,7 +8,7 @@ import pytest
 import tyro
 
 from tests.prepare import boards
-from warpgs.data.command import Check
+from warpgs.captures.command import Check
 
 HEAVY = ("torch", "numpy", "cv2", "warp", "scipy")
 
@@ -50,6 +50,6 @@ def test_the_dataset_and_factor_given_are_used(root, capsys):
 
 def test_importing_the_command_imports_no_heavy_package():
     """Otherwise ``warpgs --help`` would be slow."""
-    code = f"import warpgs.data.command, sys; print([name for name in {HEAVY} if name in sys.modules])"
+    code = f"import warpgs.captures.command, sys; print([name for name in {HEAVY} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

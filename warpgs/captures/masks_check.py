@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .capture import Capture, Frame
-from .dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
+
 from .findings import Finding
 from .motion_check import Motion, confirm_masks
 

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from tests.data import captures, layouts
+from warpgs.captures.check import check_capture
+from warpgs.captures.import_capture import import_capture, time_steps
 from warpgs.cli import main
 from warpgs.data import loaders
 from warpgs.data.capture import Capture
-from warpgs.data.check import check_capture
-from warpgs.data.import_capture import import_capture, time_steps
 from warpgs.data.loaders import describe_layout, load_capture, recognize
 from warpgs.data.writer import plain_ids
 
@@ -154,7 +154,7 @@ def test_a_target_that_fills_meanwhile_is_not_replaced(tmp_path, monkeypatch):
         (tmp_path / "copy").mkdir()
         (tmp_path / "copy/mine").write_text("mine")
 
-    monkeypatch.setattr("warpgs.data.import_capture._write_index", write)
+    monkeypatch.setattr("warpgs.captures.import_capture._write_index", write)
     with pytest.raises(OSError, match="copy"):
         import_capture(layouts.write_colmap(tmp_path / "source"), tmp_path / "copy")
     assert [path.name for path in (tmp_path / "copy").iterdir()] == ["mine"]

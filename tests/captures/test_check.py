@@ -15,15 +15,15 @@ import torch
 from tests.data import captures, layouts
 from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
+from warpgs.captures.check import check_capture, quick_findings
+from warpgs.captures.depth_check import DEPTH_PROBLEMS
+from warpgs.captures.frames_check import check_counts
+from warpgs.captures.motion_check import motion_between
+from warpgs.captures.points_check import check_points
 from warpgs.data import loaders
-from warpgs.data.check import check_capture, quick_findings
 from warpgs.data.depth_alignment import sample_points
-from warpgs.data.depth_check import DEPTH_PROBLEMS
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.data.frames_check import check_counts
 from warpgs.data.loaders import load_capture
-from warpgs.data.motion_check import motion_between
-from warpgs.data.points_check import check_points
 from warpgs.training.stored_views import ViewReader
 
 
@@ -393,6 +393,6 @@ def test_depth_that_is_no_nearer_to_the_points_than_a_constant_is_not_praised(ro
         depth = torch.where(position < 0.06, 3.0, torch.where(position > 0.94, 5.0, 4.0))
         return found._replace(depth=depth.to(found.depth))
 
-    monkeypatch.setattr("warpgs.data.depth_check.sample_points", one_depth)
+    monkeypatch.setattr("warpgs.captures.depth_check.sample_points", one_depth)
     said = "0.0% off at the points (median), but a constant is 0.0% off: the points do not tell whether depth is right"
     assert f"aligned depth is {said}" in texts(check_capture(root), "note")

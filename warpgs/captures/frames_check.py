@@ -4,7 +4,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from .capture import MASKS_REMEDY, Capture
+from warpgs.data.capture import MASKS_REMEDY, Capture
+
 from .check_sample import Content
 from .findings import Finding, few_of
 

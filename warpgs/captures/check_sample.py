@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from .capture import Capture, Frame
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.read_ahead import ReadAhead
+from warpgs.data.resized import reduced_capture, reduced_frame
+from warpgs.data.sampling import evenly_spaced
+
 from .masks_check import DynamicCounts, dynamic_counts
 from .motion_check import pairs_to_compare
-from .read_ahead import ReadAhead
-from .resized import reduced_capture, reduced_frame
-from .sampling import evenly_spaced
 
 COMPARED_SIDE = 1024
 """Frames that are compared are scaled down to this larger side [px]."""

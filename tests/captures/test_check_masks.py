@@ -9,9 +9,9 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, stop_time
-from warpgs.data import check
-from warpgs.data.check import check_capture, quick_findings
-from warpgs.data.findings import few_of
+from warpgs.captures import check
+from warpgs.captures.check import check_capture, quick_findings
+from warpgs.captures.findings import few_of
 from warpgs.data.loaders import load_capture
 
 
@@ -59,8 +59,8 @@ def test_masks_that_mark_nothing_are_a_warning_in_the_same_words_before_training
 
 def test_masks_are_judged_by_all_frames_if_those_that_are_compared_are_suspect(root, monkeypatch):
     """In every frame that training looks at first, everything moves; in the others, masks are right."""
-    monkeypatch.setattr("warpgs.data.check_sample.MAX_SAMPLES", 4)
-    monkeypatch.setattr("warpgs.data.check_sample.MIN_SAMPLES", 4)
+    monkeypatch.setattr("warpgs.captures.check_sample.MAX_SAMPLES", 4)
+    monkeypatch.setattr("warpgs.captures.check_sample.MIN_SAMPLES", 4)
     convert_masks(root, lambda mask, k: np.zeros_like(mask) if k in (0, 5, 10, 15) else mask)
     assert not of_masks(quick_findings(load_capture(root)), "error")
 
@@ -162,7 +162,7 @@ def test_a_finding_names_few_of_many_frames(count, text):
 
 
 def test_an_error_of_several_frames_is_one_line_with_their_files(root, monkeypatch):
-    monkeypatch.setattr("warpgs.data.findings.MAX_NAMED", 1)
+    monkeypatch.setattr("warpgs.captures.findings.MAX_NAMED", 1)
     cut_images(root, 4)
     (text,) = [f.text for f in check_capture(root).findings if f.level == "error"]
     assert "shot000.png is truncated" in text
@@ -177,7 +177,7 @@ def test_an_error_of_all_frames_is_one_line_with_their_number(root):
 
 
 def test_frames_with_more_kinds_of_errors_than_are_shown_are_counted(root, monkeypatch):
-    monkeypatch.setattr("warpgs.data.frames_check.MAX_ERRORS", 1)
+    monkeypatch.setattr("warpgs.captures.frames_check.MAX_ERRORS", 1)
     cut_images(root, 3)
     (root / "rgb/1x/shot015.png").write_bytes(b"text")
     errors = [f.text for f in check_capture(root).findings if f.level == "error"]

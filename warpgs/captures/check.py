@@ -7,19 +7,19 @@ import time
 from pathlib import Path
 
 from warpgs.config.builtin import is_builtin
+from warpgs.data.capture import Assumption, Capture
+from warpgs.data.loaders import describe_layout, load_capture, missing_capture
+from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
-from .capture import Assumption, Capture
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
 from .findings import Finding, Report
 from .frames_check import check_counts, check_files
-from .loaders import describe_layout, load_capture, missing_capture
 from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
 from .motion_check import check_motion, motions_of
 from .points_check import check_points
 from .turning_check import check_turning
-from .writer import REPORT
 
 READ_SECONDS = 15.0
 """Time after which only frames that are compared are still read [s]: a check takes at most 30 s on two cores."""

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.sampling import evenly_spaced
 
-from .capture import Capture, Frame
 from .findings import Finding, Level
-from .sampling import evenly_spaced
 
 MIN_SIDE, MAX_ASPECT = 16, 16
 """Minimum side [px] and maximum ratio of the sides: OpenCV's optical flow crashes on images beyond them."""

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 
-from .capture import Capture, Frame
-from .depth_alignment import (
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.depth_alignment import (
     MAX_ERROR,
     MAX_ERROR_OF_CONSTANT,
     DepthProblem,
@@ -18,7 +18,8 @@ from .depth_alignment import (
     relative_errors,
     sample_points,
 )
-from .depth_unit import fit_unit
+from warpgs.data.depth_unit import fit_unit
+
 from .findings import Finding
 
 DEPTH_PROBLEMS: dict[DepthProblem, str] = {

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from .capture import Capture, Frame
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.turning import MIN_MATCHES, Matches, Turning, find_turning
+
 from .findings import Finding
-from .turning import MIN_MATCHES, Matches, Turning, find_turning
 
 COMPARED_SIDE = 512
 """Images are scaled down to this longer side [px]."""

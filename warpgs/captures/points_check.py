@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from warpgs.cameras import Camera
+from warpgs.data.capture import Capture, Frame
 
-from .capture import Capture, Frame
 from .findings import Finding
 
 MIN_VISIBLE_FRACTION = 0.2

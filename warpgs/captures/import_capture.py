@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.command_line.progress import progress
+from warpgs.data import writer
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.lens import Lens
+from warpgs.data.loaders import describe_layout, load_capture
+from warpgs.data.units import SceneUnits, depth_range
 from warpgs.errors import command
 from warpgs.files import complete_or_absent
-
-from . import writer
-from .capture import Capture, Frame
-from .lens import Lens
-from .loaders import describe_layout, load_capture
-from .units import SceneUnits, depth_range
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks that are written."""

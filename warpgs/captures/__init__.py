@@ -1,0 +1,1 @@
+"""Captures as a whole: ``warpgs check`` and ``warpgs import``."""
