@@ -21,8 +21,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from .cameras import Camera
+    from .captures.opening import load_capture
     from .config import RenderSettings
-    from .data.loaders import load_capture
     from .model.splats import Splats
     from .rendering import render
     from .runs.run import open_run
@@ -48,7 +48,7 @@ _HOMES = {
     "Progress": "training.callbacks",
     "RenderSettings": "config",
     "Splats": "model.splats",
-    "load_capture": "data.loaders",
+    "load_capture": "captures.opening",
     "open_run": "runs.run",
     "render": "rendering",
     "train": "training.train",

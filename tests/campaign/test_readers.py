@@ -13,12 +13,12 @@ import pytest
 from tests.campaign.damage import Hang, damage, refusal
 from tests.data import layouts
 from tests.data.captures import read_all, write_array, write_capture, write_json, write_png
+from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.data.archive import Archive
 from warpgs.data.colmap_files import read_model
 from warpgs.data.exr import read_exr_channel
 from warpgs.data.images import decode
-from warpgs.data.loaders import load_capture
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
 from warpgs.files import read_array

@@ -15,15 +15,15 @@ import torch
 from tests.data import captures, layouts
 from tests.data.captures import edit_json, look_away, stop_time, write_array
 from tests.prepare import boards
+from warpgs.captures import opening
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.depth_check import DEPTH_PROBLEMS
 from warpgs.captures.frames_check import check_counts
 from warpgs.captures.motion_check import motion_between
+from warpgs.captures.opening import load_capture
 from warpgs.captures.points_check import check_points
-from warpgs.data import loaders
 from warpgs.data.depth_alignment import sample_points
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.data.loaders import load_capture
 from warpgs.training.stored_views import ViewReader
 
 
@@ -114,7 +114,7 @@ def test_a_path_that_does_not_exist_is_no_capture_to_report_on(tmp_path):
 
 
 def test_a_built_in_capture_is_checked_by_its_name(root, monkeypatch):
-    monkeypatch.setattr(loaders, "builtin_folder", lambda name, **_: root)
+    monkeypatch.setattr(opening, "builtin_folder", lambda *_: root)
     assert check_capture(Path("builtin:studio")).is_fit
     monkeypatch.undo()
     (finding,) = check_capture(Path("builtin:nothing")).findings

@@ -12,7 +12,7 @@ from tests.data.captures import edit_json, stop_time
 from warpgs.captures import check
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.findings import few_of
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 
 
 @pytest.fixture

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 from tests.data import captures, layouts
+from warpgs.captures import opening
 from warpgs.captures.check import check_capture
 from warpgs.captures.import_capture import import_capture, time_steps
+from warpgs.captures.opening import load_capture
 from warpgs.cli import main
-from warpgs.data import loaders
 from warpgs.data.capture import Capture
-from warpgs.data.loaders import describe_layout, load_capture, recognize
+from warpgs.data.loaders import describe_layout, recognize
 from warpgs.data.writer import plain_ids
 
 DATASETS = {name: lambda root, name=name: captures.write_capture(root, name) for name in captures.FACTORS}
@@ -285,12 +286,12 @@ def test_a_camera_that_is_not_json_does_not_keep_a_layout_from_being_recognized(
     assert describe_layout(root) == "nerfds, a guess that --dataset hypernerf overrides"
 
 
-def test_the_layout_of_a_built_in_capture_is_that_of_its_folder(tmp_path, monkeypatch):
-    root = write_sizes(tmp_path / "toy", ["1x", "4x"], ["1x"])
-    monkeypatch.setattr(loaders, "builtin_folder", lambda name: root)
-    assert describe_layout(Path("builtin:studio")) == "nerfds, a guess that --dataset hypernerf overrides"
-    captures.edit_json(root / "dataset.json", layout="hypernerf")
-    assert describe_layout(Path("builtin:studio")) == "hypernerf"
+def test_a_built_in_capture_is_imported_by_its_name(tmp_path, monkeypatch):
+    root, lines = layouts.write_llff(tmp_path / "source"), []
+    monkeypatch.setattr(opening, "builtin_folder", lambda *_: root)
+    import_capture(Path("builtin:studio"), tmp_path / "copy", log=lines.append)
+    assert lines[0].startswith("builtin:studio is read as llff: ")
+    assert load_capture(tmp_path / "copy").train
 
 
 def test_a_layout_without_masks_is_not_a_guess(tmp_path):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.files import write_array, write_png
 
 SIZE = (40, 24)

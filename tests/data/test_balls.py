@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from warpgs.captures.opening import load_capture
 from warpgs.data import balls
 from warpgs.data.balls import BallsSize, balls_capture
-from warpgs.data.loaders import load_capture, recognize
+from warpgs.data.loaders import recognize
 
 SMALL = BallsSize(side=24, num_frames=6, num_val=4)
 

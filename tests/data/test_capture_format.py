@@ -11,9 +11,9 @@ import torch
 
 from tests import tiny
 from warpgs.captures.check import check_capture
+from warpgs.captures.opening import load_capture
 from warpgs.data import camera_files, writer
 from warpgs.data.lens import Lens
-from warpgs.data.loaders import load_capture
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "capture-format.md").read_text()

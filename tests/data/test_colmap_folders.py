@@ -8,7 +8,8 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import refused, write_array, write_png
-from warpgs.data.loaders import load_capture, recognize
+from warpgs.captures.opening import load_capture
+from warpgs.data.loaders import recognize
 
 
 def smaller_model(folder, count):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import refused
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 
 
 @pytest.fixture

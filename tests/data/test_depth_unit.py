@@ -11,7 +11,7 @@ from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json
 from tests.prepare import boards
 from warpgs.captures.check import check_capture, quick_findings
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 
 COUNT = 16
 

@@ -10,8 +10,8 @@ from PIL import Image, ImageOps
 
 from tests.data import layouts
 from tests.data.captures import edit_json, refused, write_array, write_capture, write_json, write_png
+from warpgs.captures.opening import load_capture
 from warpgs.data.exif import INVERSE, orientation_of, upright
-from warpgs.data.loaders import load_capture
 
 QUARTER_TURNS = [5, 6, 7, 8]
 UPRIGHT_AFTER = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}

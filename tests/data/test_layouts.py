@@ -13,11 +13,12 @@ from PIL import Image
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json, write_png
+from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation
 from warpgs.data.colmap import lens_of
 from warpgs.data.images import is_transparent
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import blender, load_capture, recognize
+from warpgs.data.loaders import blender, recognize
 from warpgs.data.loaders.posed import plain_names
 
 LAYOUTS = pytest.mark.parametrize("layout", layouts.ALL)

@@ -9,7 +9,7 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, refused, write_capture, write_json, write_png
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.data.loaders.listed import find_file
 from warpgs.data.loaders.posed import plain_names
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.data.captures import edit_json, refused, write_array, write_json
+from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation
-from warpgs.data.loaders import load_capture
 from warpgs.data.writer import FINISHED, STATE, WORK
 
 

@@ -14,12 +14,12 @@ import torch
 from tests.data import captures
 from tests.data.captures import CENTER, SCALE, SIZE, edit_json, image_of, write_array, write_capture, write_json
 from warpgs.cameras import Camera
+from warpgs.captures.opening import load_capture, open_capture
 from warpgs.config import MaskPerturbation
 from warpgs.config.presets import PRESETS
 from warpgs.data import loaders
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, recognize
-from warpgs.runs.run import open_capture
+from warpgs.data.loaders import LOADERS, LoadOptions, recognize
 
 DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.data import layouts
 from tests.data.captures import edit_json, refused, write_array, write_json
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 
 FX, FY, (CX, CY) = 44.0, 46.0, layouts.CENTER
 K = [[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.errors import error_line
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.data.missing import PUBLISHED, published
 
 NERFDS = "https://github.com/JokerYan/NeRF-DS"

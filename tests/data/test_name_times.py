@@ -9,8 +9,8 @@ from tests.data import layouts
 from tests.data.captures import edit_json, write_json
 from warpgs.captures.check import check_capture
 from warpgs.captures.import_capture import import_capture
+from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
-from warpgs.data.loaders import load_capture
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.files import natural_order

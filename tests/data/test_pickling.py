@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tests.data import captures, layouts
-from warpgs.data.loaders import LoadOptions, load_capture, load_with
+from warpgs.captures.opening import load_capture
+from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.data.resized import reduced_capture
 
 

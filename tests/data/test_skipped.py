@@ -10,7 +10,7 @@ from tests.data import layouts
 from tests.data.captures import edit_json, write_capture, write_json, write_png
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.import_capture import import_capture
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 
 LAYOUTS = pytest.mark.parametrize("layout", layouts.ALL)
 

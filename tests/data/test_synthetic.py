@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from warpgs.cache import cache_folder
+from warpgs.captures.opening import load_capture
 from warpgs.data import synthetic
 from warpgs.data.bodies import as_tensors, even_samples
 from warpgs.data.builtin_cache import content_folder
-from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
 
 SMALL = BuiltinScene(width=48, height=28, num_frames=4, num_samples=2, num_points=200)

@@ -7,9 +7,9 @@ import torch
 from tests.data import captures
 from tests.data.captures import edit_json, image_of
 from warpgs.cameras import Camera
+from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Frame
 from warpgs.data.lens import Lens
-from warpgs.data.loaders import load_capture
 from warpgs.data.taken import MARGIN, taken_frame, without_distortion
 
 BARREL = Lens(48, 32, (50.0, 47.0), (25.3, 15.1), (-0.12, 0.03, 0.004), (0.01, -0.006))

@@ -10,10 +10,9 @@ import torch
 
 from tests import tiny
 from tests.data import captures, layouts
+from warpgs.captures.opening import load_capture, open_capture
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.loaders import load_capture
-from warpgs.runs.captures import open_capture
 from warpgs.training.initialize import initial_scene
 from warpgs.training.point_cloud import random_points
 from warpgs.training.trainer import Trainer

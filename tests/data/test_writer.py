@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tests.data.captures import edit_json
+from warpgs.captures.opening import load_capture
 from warpgs.data import writer
 from warpgs.data.lens import Lens
-from warpgs.data.loaders import load_capture
 from warpgs.data.units import SceneUnits
 
 SIZE = (12, 8)

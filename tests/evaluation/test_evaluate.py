@@ -21,9 +21,9 @@ import torch
 from tests import tiny
 from tests.data.captures import write_png
 from warpgs.cameras import Camera
+from warpgs.captures.opening import load_capture, open_capture
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
-from warpgs.data.loaders import load_capture
 from warpgs.data.taken import taken_frame
 from warpgs.evaluation import evaluate, evaluate_run
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
@@ -31,7 +31,7 @@ from warpgs.evaluation.lpips import Lpips
 from warpgs.files import write_json
 from warpgs.rendering import Layer, Rendering
 from warpgs.runs import checkpoint
-from warpgs.runs.run import open_capture, open_run
+from warpgs.runs.run import open_run
 from warpgs.runs.trained import TrainedScene
 from warpgs.training.train import train
 from warpgs.video.camera_paths import training_path

@@ -11,9 +11,10 @@ import torch
 from tests.export import scenes
 from tests.export.pages import read_page
 from tests.export.test_gltf import decoded as gltf_of
+from warpgs.captures import opening
+from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.data.capture import Capture
-from warpgs.data.loaders import load_capture
 from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
 from warpgs.export.command import Export
@@ -24,7 +25,6 @@ from warpgs.export.standard import read_standard
 from warpgs.export.start_camera import start_view
 from warpgs.export.writers import WRITERS
 from warpgs.runs import checkpoint
-from warpgs.runs import run as runs
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.video import camera_paths
@@ -127,8 +127,8 @@ def test_a_page_has_the_name_of_the_run_folder_as_its_title(run, monkeypatch):
 
 @pytest.mark.parametrize("options", [{"max_gaussians": 9}, {}])
 def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
-    opened, open_capture = [], runs.open_capture
-    monkeypatch.setattr(runs, "open_capture", lambda *arguments: opened.append(arguments) or open_capture(*arguments))
+    opened, read = [], opening.open_capture
+    monkeypatch.setattr(opening, "open_capture", lambda *arguments: opened.append(arguments) or read(*arguments))
     export(run, tmp_path, format="html", keys=1, **options)
     assert len(opened) == 1
 
@@ -136,7 +136,7 @@ def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
 def test_a_page_with_too_many_gaussians_is_refused_before_anything_is_baked(run, tmp_path, monkeypatch):
     monkeypatch.setattr(page, "MAX_GAUSSIANS", 3)
     monkeypatch.setattr(page, "bake", lambda *_: pytest.fail("baked"))
-    monkeypatch.setattr(runs, "open_capture", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr(opening, "open_capture", lambda *_: pytest.fail("opened"))
     with pytest.raises(ValueError, match="a page holds at most 3 static Gaussians"):
         export(run, tmp_path, format="html")
 

@@ -12,10 +12,11 @@ import pytest
 from tests.data import captures, layouts
 from tests.data.captures import edit_json
 from tests.prepare import boards
+from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.data import images
 from warpgs.data.images import decode, read_depth
-from warpgs.data.loaders import load_capture, recognize
+from warpgs.data.loaders import recognize
 from warpgs.data.writer import STATE, WORK
 from warpgs.prepare import add, masks
 from warpgs.prepare.add import AddOptions, add_parts

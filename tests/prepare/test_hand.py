@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.prepare import boards
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.prepare.pipeline import prepare
 
 HAND = os.environ.get("WARPGS_HAND")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.prepare import boards
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.prepare import pipeline, steps
 from warpgs.prepare.add import AddOptions, add_parts
 from warpgs.prepare.matches import has_features

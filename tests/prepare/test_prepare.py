@@ -14,8 +14,8 @@ import pytest
 from tests.campaign.damage import replace_by_fifo
 from tests.prepare import boards
 from warpgs.captures.check import check_capture
+from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import load_capture
 from warpgs.prepare import pipeline
 from warpgs.prepare.cameras import Cameras, NoCamerasError
 from warpgs.prepare.given_masks import read_dynamic

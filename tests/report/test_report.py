@@ -15,10 +15,10 @@ import pytest
 
 from tests.data.captures import edit_json
 from tests.errors import error_line
+from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
-from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.report.charts import HEIGHT, MAX_POINTS, MAX_VALUES, WIDTH, Series, chart
 from warpgs.report.command import Report

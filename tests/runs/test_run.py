@@ -10,9 +10,9 @@ import torch
 
 from tests import tiny
 from tests.scenes import error
+from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation, ModelConfig, RenderSettings, Schedule, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
-from warpgs.data.loaders import load_capture
 from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs

@@ -1,6 +1,8 @@
 """Playback: captured frames equal rendered frames. (On a real GPU: tests/training/test_cuda_training.py.)"""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -30,6 +32,15 @@ def captured(monkeypatch):
 @pytest.fixture
 def trained():
     return scenes.trained_scene()
+
+
+@pytest.mark.parametrize("module", ["runs.run", "video.render_run"])
+def test_what_plays_a_scene_imports_no_loader_and_no_ray_tracer(module):
+    code = f"import sys, warpgs.{module}; print(*(name for name in sys.modules if name.startswith('warpgs.')))"
+    imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "warpgs.runs.trained" in imported
+    assert [name for name in imported if name.startswith("warpgs.captures.") or "loaders" in name] == []
+    assert [name for name in imported if name.startswith("warpgs.synthetic.") or "raytrace" in name] == []
 
 
 def translated(camera, by, time):

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from tests import tiny
+from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, validate
 from warpgs.data.balls import BallsSize, balls_capture
 from warpgs.data.capture import background_color
-from warpgs.data.loaders import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.export.clouds import Clouds
 from warpgs.export.start_camera import start_view

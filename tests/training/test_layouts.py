@@ -6,7 +6,7 @@ import pytest
 
 from tests import tiny
 from tests.data import layouts
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.training.fitting import fitted
 
 pytestmark = pytest.mark.usefixtures("quickly")

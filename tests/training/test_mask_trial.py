@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from tests import tiny, two_ranks
+from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.data.dynamic_regions import MIN_FRAMES
-from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import builtin_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.training import mask_trial

@@ -11,11 +11,11 @@ import torch
 
 from tests import tiny
 from warpgs.cameras import Camera
+from warpgs.captures.opening import load_capture
 from warpgs.config import LossConfig
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.data.loaders import load_capture
 from warpgs.training import object_depth as module
 from warpgs.training import objects
 from warpgs.training.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth, without_rims

@@ -23,10 +23,10 @@ import warpgs
 from tests import tiny
 from tests.data.captures import edit_json, look_away, stop_time
 from warpgs import cli
+from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.images import read_image
-from warpgs.data.loaders import load_capture
 from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
@@ -324,7 +324,7 @@ def test_without_depth_training_says_so_and_needs_no_pretraining(config, tmp_pat
 @pytest.mark.parametrize("is_builtin", [True, False])
 def test_of_built_in_captures_neither_the_files_nor_advice_on_them_is_said(config, tmp_path, monkeypatch, is_builtin):
     shutil.copytree(config.data, tmp_path / "flat", ignore=shutil.ignore_patterns("depth"))
-    monkeypatch.setattr("warpgs.runs.captures.builtin_folder", lambda *_: tmp_path / "flat")
+    monkeypatch.setattr("warpgs.captures.opening.builtin_folder", lambda *_: tmp_path / "flat")
     lines = []
     data = Path("builtin:balls") if is_builtin else tmp_path / "flat"
     warpgs.train(dataclasses.replace(config, data=data, out=tmp_path / "run"), log=lines.append)

@@ -14,7 +14,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import generator
-from warpgs.data.loaders import load_capture
+from warpgs.captures.opening import load_capture
 from warpgs.training.view_cache import SPARE_BYTES, Pixels, ViewCache
 from warpgs.training.views import Views
 

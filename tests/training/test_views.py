@@ -8,8 +8,8 @@ import torch
 
 from tests import tiny
 from tests.data.captures import ids_of, write_capture
+from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
-from warpgs.data.loaders import load_capture
 from warpgs.model.poses import PoseCorrections
 from warpgs.training.stored_views import mask_border
 from warpgs.training.views import Views

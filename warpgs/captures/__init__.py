@@ -1,1 +1,1 @@
-"""Captures as a whole: ``warpgs check`` and ``warpgs import``."""
+"""Captures as a whole: opened by folder, built-in name or config; ``warpgs check`` and ``warpgs import``."""

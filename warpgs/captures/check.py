@@ -8,7 +8,7 @@ from pathlib import Path
 
 from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Assumption, Capture
-from warpgs.data.loaders import describe_layout, load_capture, missing_capture
+from warpgs.data.loaders import describe_layout, missing_capture
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
@@ -18,6 +18,7 @@ from .findings import Finding, Report
 from .frames_check import check_counts, check_files
 from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
 from .motion_check import check_motion, motions_of
+from .opening import capture_folder, load_capture
 from .points_check import check_points
 from .turning_check import check_turning
 
@@ -49,7 +50,7 @@ def check_capture(
     sample = Sample(capture)
     contents = read_contents(capture, sample, deadline)
     findings = [
-        Finding("note", "layout", f"read as {describe_layout(root, dataset)}"),
+        Finding("note", "layout", f"read as {describe_layout(capture_folder(root), dataset)}"),
         *check_counts(capture),
         *check_files(capture, contents),
     ]

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from warpgs.captures.opening import load_capture
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
@@ -20,7 +21,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
 from warpgs.data.lens import Lens, undistort
-from warpgs.data.loaders import LOADERS, LoadOptions, load_capture, missing_capture, recognize, require_finished
+from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.units import SceneUnits, read_units

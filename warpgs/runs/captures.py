@@ -1,40 +1,12 @@
 """The capture that a run is trained on."""
 
-import torch
-
 from warpgs.config import TrainConfig
-from warpgs.config.builtin import is_builtin, require_factor
-from warpgs.data.builtin_folder import builtin_folder
 from warpgs.data.capture import Background, Capture
-from warpgs.data.loaders import LoadOptions, load_with
-from warpgs.data.synthetic import builtin_capture
 
 from .checkpoint import Metadata
 
 MAX_TIME_CHANGE = 1e-6
 """Difference of times that is rounding, not another capture."""
-
-
-def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
-    """The capture of a config, over its background; without one the built-in scene, rendered on the first call.
-
-    Raises:
-        ValueError: If a file of the capture is missing or damaged; the message names it.
-        OSError: If the built-in scene cannot be written.
-    """
-    if config.data is not None and is_builtin(config.data):
-        root = builtin_folder(config.data, quiet, config.factor)
-    elif config.data is not None:
-        root = config.data
-    else:
-        require_factor("builtin:room", config.factor)
-        root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    options = LoadOptions(config.factor, config.masks, undistort=config.undistort, depth=config.depth)
-    capture = load_with(root, config.dataset, options, config.vrig_factor)
-    capture.is_builtin = config.data is None or is_builtin(config.data)
-    if config.background == "capture" or config.background == "mean":
-        return capture
-    return capture.over(config.background)
 
 
 def require_same_times(capture: Capture, metadata: Metadata) -> None:

@@ -21,7 +21,6 @@ from warpgs.model.trunk import in_single_precision
 from warpgs.ops.mlp import limit_of_multiprocessors
 
 from . import checkpoint
-from .captures import open_capture
 from .config_file import NAME, read_config, write_config
 from .trained import TrainedScene
 
@@ -134,6 +133,8 @@ class Run:
                 f"the capture of {self.folder}, {data}, does not exist; if it was moved, give it by --data"
                 f"{similar_path(data)}"
             )
+        from warpgs.captures.opening import open_capture  # imports all loaders and the ray tracer
+
         return open_capture(self.config, quiet)
 
     def open_corrected_capture(self, quiet: bool = False) -> Capture:

@@ -17,7 +17,6 @@ from warpgs.rendering import Rendering, render, require_camera
 from warpgs.runtime.checks import as_number
 from warpgs.runtime.graphs import GraphCache
 
-from .captures import open_capture
 from .checkpoint import Metadata
 
 MAX_GRAPHS = 4
@@ -90,6 +89,8 @@ class TrainedScene:
         Raises:
             ValueError: If a file of the capture is missing or damaged; the message names it.
         """
+        from warpgs.captures.opening import open_capture  # imports all loaders and the ray tracer
+
         return open_capture(self.config, quiet)
 
     @torch.no_grad()

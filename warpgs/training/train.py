@@ -8,6 +8,7 @@ from pathlib import Path
 
 from warpgs.captures.check import quick_findings
 from warpgs.captures.findings import Finding
+from warpgs.captures.opening import capture_folder, open_capture
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import unknown_depth
@@ -21,7 +22,7 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
-from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_folder, open_capture
+from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_folder
 
 from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
@@ -172,7 +173,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views, num_aligned = len(trainer.views), trainer.num_aligned
     config, name = trainer.config, trainer.capture.name
-    layout = "" if config.data is None else f" (read as {describe_layout(config.data, config.dataset)})"
+    layout = "" if config.data is None else f" (read as {describe_layout(capture_folder(config.data), config.dataset)})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
     views = f"{num_views} view{'s' * (num_views != 1)}"

@@ -4,15 +4,11 @@ To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` an
 Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
 """
 
-import os
-import reprlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from warpgs.config import MaskPerturbation
-from warpgs.config.builtin import NAMES, PREFIX, is_builtin
-from warpgs.data.builtin_folder import builtin_folder
+from warpgs.config.builtin import NAMES, PREFIX
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.masks import check_perturbation
@@ -38,7 +34,6 @@ __all__ = [
     "Loader",
     "describe_layout",
     "is_capture",
-    "load_capture",
     "load_with",
     "recognize",
     "require_capture",
@@ -53,7 +48,7 @@ class Loader(Protocol):
         ...
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         ...
 
 
@@ -77,47 +72,14 @@ FALLBACK = "hypernerf"
 """Dataset of a folder that no loader recognizes; the errors of its loader name what is missing."""
 
 
-def load_capture(
-    root: Path | str,
-    dataset: str | None = None,
-    *,
-    factor: int | None = None,
-    vrig_factor: int | None = None,
-    perturbation: MaskPerturbation | None = None,
-    cache_frames: int = LoadOptions.cache_frames,
-    undistort: bool = LoadOptions.undistort,
-) -> Capture:
-    """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
-
-    Args:
-        root: Folder of the capture, or a built-in one (``config/builtin.py``).
-        dataset: Key of ``LOADERS``; recognized from the files if None.
-        factor: Downscaling factor of the images; the dataset's default if None.
-        vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.
-        perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
-        cache_frames: Number of frames to keep in memory.
-        undistort: Whether to undistort frames, masks and depth; if not, they are those of the files, and cameras are
-            pinholes of the lens's focal length with the principal point at the centre of the image.
-
-    Raises:
-        ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
-    """
-    if not isinstance(root, str | os.PathLike):
-        raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
-    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
-    return load_with(root, dataset, options, vrig_factor)
-
-
-def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_factor: int | None = None) -> Capture:
-    """``load_capture`` with its arguments as options, which has one more: whether to read depth."""
+def load_with(root: Path, dataset: str | None, options: LoadOptions, vrig_factor: int | None = None) -> Capture:
+    """Opens the capture in a folder; arguments and errors as for ``load_capture`` (captures/opening.py)."""
     if dataset is not None and dataset not in LOADERS:
         raise ValueError(not_one_of("dataset", dataset, LOADERS))
     factor = options.factor
     if factor is not None and factor < 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
     check_perturbation(options.perturbation)
-    is_made = is_builtin(root)
-    root = builtin_folder(root, factor=factor) if is_made else Path(root)
     if dataset is None:
         require_capture(root)
     elif not root.exists():
@@ -128,7 +90,6 @@ def load_with(root: Path | str, dataset: str | None, options: LoadOptions, vrig_
         options = replace(options, factor=vrig_factor)
     capture = loader.load(root, options)
     _require_sides(root, capture)
-    capture.is_builtin = is_made
     return capture
 
 
@@ -191,14 +152,12 @@ def require_finished(root: Path) -> None:
 
 def recognize(root: Path) -> str:
     """The layout of a capture, as a key of ``LOADERS``: ``layout`` in its dataset.json, or that of its files."""
-    root = builtin_folder(root) if is_builtin(root) else root
     recognized = (name for name, loader in LOADERS.items() if loader.recognizes(root))
     return _named_layout(root) or next(recognized, FALLBACK)
 
 
 def describe_layout(root: Path, dataset: str | None = None) -> str:
-    """The layout that ``load_capture`` reads a capture in, for the middle of messages; says if it is a guess."""
-    root = builtin_folder(root) if is_builtin(root) else root
+    """The layout that ``load_with`` reads a capture in, for the middle of messages; says if it is a guess."""
     name, other = dataset or recognize(root), {"nerfds": "hypernerf", "hypernerf": "nerfds"}
     if dataset or _named_layout(root) or name not in other or not is_ambiguous(root):
         return name

@@ -40,7 +40,7 @@ class BlenderLoader:
         return (root / TRAIN).is_file()
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
         indices = [Transforms(path, options.undistort) for path in (root / TRAIN, evaluated) if path is not None]
         train, *others = (_frames(index, index.path.stem.split("_")[1]) for index in indices)

@@ -37,7 +37,7 @@ class ColmapLoader:
         return has_model and not any((root / other).exists() for other in others)
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         found, notes = largest_model(root)
         if found is None:
             raise ValueError(f"{root} has no folder images/ with a COLMAP model in {PLACES}")

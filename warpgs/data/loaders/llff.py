@@ -54,7 +54,7 @@ class LlffLoader:
         return (root / INDEX).is_file() and (dynamic or not _models(root))
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         poses, bounds, sizes, notes = _read_poses(root / INDEX)
         paths = _images(_image_folder(root, options.factor))
         if len(paths) != len(poses):

@@ -35,7 +35,7 @@ class MegaSamLoader:
         return any(any(root.glob(f"*{suffix}")) for suffix in SUFFIXES)
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         path = _file(root)
         arrays = read_npz(path, ARRAYS)
         images, depths, K, matrices = (arrays[name] for name in ARRAYS)

@@ -41,7 +41,7 @@ class NerfstudioLoader:
         return (root / INDEX).is_file()
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         transforms = Transforms(root / INDEX, options.undistort)
         entries = sorted(transforms.frames, key=lambda entry: natural_order(transforms.image_name(entry)))
         images = [transforms.image(entry) for entry in entries]

@@ -57,7 +57,7 @@ class VipeLoader:
         return any((root / f"rgb/{path.stem}.mp4").is_file() for path in (root / "pose").glob("*.npz"))
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
-        """Opens a capture; errors as for ``load_capture``."""
+        """Opens a capture; errors as for ``load_with``."""
         name = _video_name(root)
         poses, scaled = _poses(root / f"pose/{name}.npz")
         video = VideoFrames(root / f"rgb/{name}.mp4")

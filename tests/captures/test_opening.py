@@ -3,8 +3,8 @@
 import dataclasses
 
 from tests import tiny
+from warpgs.captures.opening import open_capture
 from warpgs.config.masks import MaskPerturbation
-from warpgs.runs.captures import open_capture
 
 
 def test_the_masks_of_a_run_are_damaged_as_its_config_says(tmp_path):

@@ -1,0 +1,72 @@
+"""Captures opened by their folder, by the name of a built-in one, or as a config says."""
+
+import os
+import reprlib
+from pathlib import Path
+
+import torch
+
+from warpgs.config import MaskPerturbation, TrainConfig
+from warpgs.config.builtin import is_builtin, require_factor
+from warpgs.data.builtin_folder import builtin_folder
+from warpgs.data.capture import Capture
+from warpgs.data.loaders import LoadOptions, load_with
+from warpgs.data.synthetic import builtin_capture
+
+
+def capture_folder(data: Path | str, quiet: bool = False, factor: int | None = None) -> Path:
+    """The folder of a capture; a built-in one is created on the first call, with the errors of ``builtin_folder``."""
+    return builtin_folder(data, quiet, factor) if is_builtin(data) else Path(data)
+
+
+def load_capture(
+    root: Path | str,
+    dataset: str | None = None,
+    *,
+    factor: int | None = None,
+    vrig_factor: int | None = None,
+    perturbation: MaskPerturbation | None = None,
+    cache_frames: int = LoadOptions.cache_frames,
+    undistort: bool = LoadOptions.undistort,
+) -> Capture:
+    """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
+
+    Args:
+        root: Folder of the capture, or a built-in one (``config/builtin.py``).
+        dataset: Key of ``LOADERS`` (``data/loaders``); recognized from the files if None.
+        factor: Downscaling factor of the images; the dataset's default if None.
+        vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.
+        perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
+        cache_frames: Number of frames to keep in memory.
+        undistort: Whether to undistort frames, masks and depth; if not, they are those of the files, and cameras are
+            pinholes of the lens's focal length with the principal point at the centre of the image.
+
+    Raises:
+        ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
+    """
+    if not isinstance(root, str | os.PathLike):
+        raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
+    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
+    capture = load_with(capture_folder(root, factor=factor), dataset, options, vrig_factor)
+    capture.is_builtin = is_builtin(root)
+    return capture
+
+
+def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
+    """The capture of a config, over its background; without one the built-in scene, rendered on the first call.
+
+    Raises:
+        ValueError: If a file of the capture is missing or damaged; the message names it.
+        OSError: If the built-in scene cannot be written.
+    """
+    if config.data is not None:
+        root = capture_folder(config.data, quiet, config.factor)
+    else:
+        require_factor("builtin:room", config.factor)
+        root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
+    options = LoadOptions(config.factor, config.masks, undistort=config.undistort, depth=config.depth)
+    capture = load_with(root, config.dataset, options, config.vrig_factor)
+    capture.is_builtin = config.data is None or is_builtin(config.data)
+    if config.background == "capture" or config.background == "mean":
+        return capture
+    return capture.over(config.background)
