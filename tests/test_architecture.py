@@ -20,6 +20,7 @@ ORDER = [
     "rendering",
     "visualize",
     "data",
+    "synthetic",
     "captures",
     "runs",
     "video",
@@ -130,8 +131,9 @@ def test_there_are_kernels():
 
 @pytest.mark.parametrize("name", OPS)
 def test_every_file_of_kernels_has_an_op_a_reference_and_a_test(name):
-    for path in ("warpgs/ops/{}.py", "tests/reference/{}.py", "tests/ops/test_{}.py"):
-        assert (ROOT / path.format(name)).is_file(), path.format(name)
+    room = "synthetic" if name == "raytrace" else "ops"
+    for path in (f"warpgs/{room}/{name}.py", f"tests/reference/{name}.py", f"tests/{room}/test_{name}.py"):
+        assert (ROOT / path).is_file(), path
 
 
 @pytest.mark.parametrize("path", [p for p in FILES if "warpgs" in p.relative_to(ROOT).parts], ids=lambda p: p.stem)

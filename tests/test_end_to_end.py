@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from warpgs.data.synthetic import BuiltinScene, builtin_capture
+from warpgs.synthetic.room import BuiltinScene, builtin_capture
 
 SCRIPT = str(Path(__file__).parent.parent / "train.py")
 SCENE = BuiltinScene(width=120, height=68, num_frames=30, num_samples=4, num_points=2000)

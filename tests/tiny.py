@@ -15,9 +15,9 @@ from torch import Tensor
 
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
 from warpgs.data.loaders import LoadOptions, load_with
-from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
+from warpgs.synthetic.room import BuiltinScene, builtin_capture
 from warpgs.training.interrupt import Interrupt
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import GROUPS

@@ -104,7 +104,7 @@ def shade(scene, lamp_points, body, p, d, *, mirrors=True):
 
 
 def raytrace(scene, lamp, samples, viewmat, K, size):
-    """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.ops.raytrace; ``scene`` has the fields of ``Bodies``."""
+    """(image [H, W, 3], depth [H, W], body [H, W]) as warpgs.synthetic.raytrace; ``scene`` has the fields of Bodies."""
     width, height = size
     row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([column, row], -1).reshape(-1, 2).to(viewmat.dtype)

@@ -398,7 +398,7 @@ def test_a_node_that_cannot_keep_a_built_in_capture_costs_no_cell(request, tmp_p
     import warp
 
     import warpgs.runtime.launch  # noqa: F401  # initializes Warp
-    from warpgs.data.builtin_folder import builtin_folder
+    from warpgs.synthetic.folder import builtin_folder
 
     monkeypatch.setenv("WARP_CACHE_PATH", str(Path(warp.config.kernel_cache_dir).parent))  # else they compile kernels
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "head"))

@@ -13,7 +13,6 @@ import torch
 from tests import tiny
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, validate
-from warpgs.data.balls import BallsSize, balls_capture
 from warpgs.data.capture import background_color
 from warpgs.evaluation import evaluate_run
 from warpgs.export.clouds import Clouds
@@ -21,6 +20,7 @@ from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
+from warpgs.synthetic.balls import BallsSize, balls_capture
 from warpgs.training import fitting
 from warpgs.training.command import parse
 from warpgs.training.fitting import fitted, mean_color

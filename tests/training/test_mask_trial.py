@@ -14,8 +14,8 @@ from tests import tiny, two_ranks
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.data.dynamic_regions import MIN_FRAMES
-from warpgs.data.synthetic import builtin_capture
 from warpgs.evaluation import evaluate_run
+from warpgs.synthetic.room import builtin_capture
 from warpgs.training import mask_trial
 from warpgs.training.mask_trial import held_out_psnr, with_trusted_masks
 from warpgs.training.train import train

@@ -11,9 +11,9 @@ from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
 from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.config.presets import PRESETS
-from warpgs.data.balls import RADIUS, BallsSize, _balls, balls_capture
 from warpgs.data.capture import Capture, Frame
 from warpgs.rendering import render
+from warpgs.synthetic.balls import RADIUS, BallsSize, _balls, balls_capture
 from warpgs.training import tracks as module
 from warpgs.training.fitting import fitted
 from warpgs.training.silhouettes import Region

@@ -27,11 +27,11 @@ from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.images import read_image
-from warpgs.data.synthetic import BuiltinScene, builtin_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
+from warpgs.synthetic.room import BuiltinScene, builtin_capture
 from warpgs.training import initialize, view_cache
 from warpgs.training import train as script
 

@@ -8,10 +8,10 @@ import torch
 
 from warpgs.config import MaskPerturbation, TrainConfig
 from warpgs.config.builtin import is_builtin, require_factor
-from warpgs.data.builtin_folder import builtin_folder
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import LoadOptions, load_with
-from warpgs.data.synthetic import builtin_capture
+from warpgs.synthetic.folder import builtin_folder
+from warpgs.synthetic.room import builtin_capture
 
 
 def capture_folder(data: Path | str, quiet: bool = False, factor: int | None = None) -> Path:

@@ -16,8 +16,8 @@ from jaxtyping import UInt8
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.data.bodies import Body, as_tensors, euler, even_samples
-from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
+from warpgs.synthetic.bodies import Body, as_tensors, euler, even_samples
+from warpgs.synthetic.raytrace import CUBE, SPHERE, TORUS, raytrace
 from warpgs.video.encodings import ENCODINGS
 from warpgs.video.writer import Video
 from warpgs.visualize.images import to_bytes

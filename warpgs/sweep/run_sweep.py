@@ -11,11 +11,11 @@ from typing import Any
 from warpgs.command_line.screen import show_error
 from warpgs.config.builtin import is_builtin
 from warpgs.config.presets import PRESETS
-from warpgs.data.builtin_folder import builtin_folder
 from warpgs.errors import FAILED, not_one_of, one_line
 from warpgs.evaluation.lpips import locate
 from warpgs.files import read_json, write_json
 from warpgs.locks import lock_folder
+from warpgs.synthetic.folder import builtin_folder
 
 from .board import Board
 from .cells import (

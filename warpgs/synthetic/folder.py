@@ -20,7 +20,7 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
     name, depth, num_frames = parse_builtin(data)
     require_factor(data, factor)
     if name == "room":
-        from .synthetic import builtin_capture  # imports torch
+        from .room import builtin_capture  # imports torch
 
         return builtin_capture(quiet=quiet)
     if name == "balls":

@@ -16,13 +16,13 @@ from jaxtyping import Float, UInt8
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
+from warpgs.data.capture import Color
 from warpgs.files import write_json, write_png
-from warpgs.ops.raytrace import SPHERE, raytrace
 from warpgs.visualize.images import averaged, to_bytes
 
 from .bodies import Body, as_tensors, euler
-from .builtin_cache import cached, content_folder
-from .capture import Color
+from .cache import cached, content_folder
+from .raytrace import SPHERE, raytrace
 
 VERSION = 1
 """Increase it when the content changes, so that cached captures are not used any more."""
@@ -126,7 +126,7 @@ def write_balls(folder: Path, size: BallsSize, quiet: bool = False) -> None:
 
 
 def balls_capture(cache_dir: Path | None = None, size: BallsSize | None = None, quiet: bool = False) -> Path:
-    """The folder of the capture, which is created on the first call; see ``builtin_capture`` of synthetic.py."""
+    """The folder of the capture, which is created on the first call; see ``builtin_capture`` of room.py."""
     size = size or BallsSize()
     folder = content_folder(cache_dir, ["balls", VERSION, asdict(size)]) / "balls"
     return cached(folder, lambda partial: write_balls(partial, size, quiet), quiet)

@@ -14,10 +14,10 @@ import torch
 
 from warpgs.captures.opening import load_capture
 from warpgs.config.builtin import parse_builtin
-from warpgs.data import studio
-from warpgs.data.builtin_folder import builtin_folder
-from warpgs.data.degraded_depth import DegradedDepth
-from warpgs.data.studio import StudioSize, studio_capture, trace
+from warpgs.synthetic import studio
+from warpgs.synthetic.degraded_depth import DegradedDepth
+from warpgs.synthetic.folder import builtin_folder
+from warpgs.synthetic.studio import StudioSize, studio_capture, trace
 
 SMALL = StudioSize(width=64, height=36, num_frames=4, num_samples=2, num_points=200)
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from warpgs.captures.opening import load_capture
-from warpgs.data import balls
-from warpgs.data.balls import BallsSize, balls_capture
 from warpgs.data.loaders import recognize
+from warpgs.synthetic import balls
+from warpgs.synthetic.balls import BallsSize, balls_capture
 
 SMALL = BallsSize(side=24, num_frames=6, num_val=4)
 

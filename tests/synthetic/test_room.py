@@ -13,16 +13,16 @@ import torch
 
 from warpgs.cache import cache_folder
 from warpgs.captures.opening import load_capture
-from warpgs.data import synthetic
-from warpgs.data.bodies import as_tensors, even_samples
-from warpgs.data.builtin_cache import content_folder
-from warpgs.data.synthetic import BuiltinScene, builtin_capture, trace
+from warpgs.synthetic import room
+from warpgs.synthetic.bodies import as_tensors, even_samples
+from warpgs.synthetic.cache import content_folder
+from warpgs.synthetic.room import BuiltinScene, builtin_capture, trace
 
 SMALL = BuiltinScene(width=48, height=28, num_frames=4, num_samples=2, num_points=200)
 CPU = torch.device("cpu")
 
 
-NUM_STATIC = len(synthetic._static_bodies())
+NUM_STATIC = len(room._static_bodies())
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +74,8 @@ def test_masks_are_0_exactly_where_a_moving_body_covers_the_centre_of_a_pixel(fo
 @pytest.mark.parametrize("name", ["left_000000", "left_000001", "left_000003", "right_000002"])
 def test_the_mask_contains_the_centre_of_the_ball(capture, name):
     time = int(name[-1]) / 3
-    ball = synthetic._moving_bodies(time)[1]
-    center = (torch.tensor([ball.center]) - torch.tensor(synthetic.CENTER)) * synthetic.SCALE
+    ball = room._moving_bodies(time)[1]
+    center = (torch.tensor([ball.center]) - torch.tensor(room.CENTER)) * room.SCALE
     row, column, _, inside = capture.cameras[name].project(center)
     assert bool(inside)
     assert not capture.frame(name).static_mask[row, column]
@@ -94,14 +94,14 @@ def test_the_evaluation_camera_is_next_to_the_training_camera(capture):
     left, right = capture.cameras["left_000002"], capture.cameras["right_000002"]
     assert torch.equal(left.viewmat[:3, :3], right.viewmat[:3, :3])
     distance = (left.position - right.position).norm()
-    assert float(distance) == pytest.approx(synthetic.BASELINE * synthetic.SCALE, rel=1e-4)
+    assert float(distance) == pytest.approx(room.BASELINE * room.SCALE, rel=1e-4)
 
 
 def distances(points, body):
     """Distance of points from the surface of a static body; ellipsoids must be spheres."""
     local = ((points - torch.tensor(body.center)) @ body.rotation.float()).abs()
     half = torch.tensor(body.half_sizes)
-    if body.shape == synthetic.SPHERE:
+    if body.shape == room.SPHERE:
         return (local.norm(dim=1) - half[0]).abs()
     beyond = local - half
     return (beyond.clamp_min(0).norm(dim=1) + beyond.amax(1).clamp_max(0)).abs()
@@ -109,9 +109,9 @@ def distances(points, body):
 
 def test_points_lie_on_static_surfaces_up_to_their_noise(folder):
     points = torch.from_numpy(np.load(folder / "points.npy"))
-    distance = torch.stack([distances(points, body) for body in synthetic._static_bodies()]).amin(0)
+    distance = torch.stack([distances(points, body) for body in room._static_bodies()]).amin(0)
     assert points.shape == (200, 3)
-    assert float(distance.max()) < 5 * synthetic.POINT_NOISE
+    assert float(distance.max()) < 5 * room.POINT_NOISE
 
 
 def test_training_cameras_see_the_points(capture):
@@ -137,10 +137,10 @@ def test_the_scale_of_depth_drifts_from_frame_to_frame(capture):
 
 
 def test_shadows_move_over_static_pixels():
-    camera = synthetic._camera(0.0, SMALL, 0.0)
-    view = (synthetic._lamp(CPU), even_samples(4, CPU), camera.viewmat, camera.K, camera.size)
-    bodies = ([*synthetic._static_bodies(), *synthetic._moving_bodies(time)] for time in (0.0, 0.4))
-    early, late = (synthetic.raytrace(as_tensors(at_time, CPU), *view) for at_time in bodies)
+    camera = room._camera(0.0, SMALL, 0.0)
+    view = (room._lamp(CPU), even_samples(4, CPU), camera.viewmat, camera.K, camera.size)
+    bodies = ([*room._static_bodies(), *room._moving_bodies(time)] for time in (0.0, 0.4))
+    early, late = (room.raytrace(as_tensors(at_time, CPU), *view) for at_time in bodies)
     static = (early.bodies == late.bodies) & (early.bodies < NUM_STATIC)
     change = (early.image - late.image).abs().mean(-1)
     assert (change[static] > 0.1).sum() > 10
@@ -155,7 +155,7 @@ def test_the_capture_is_deterministic(folder, tmp_path):
 
 def test_a_cached_capture_is_not_written_again(tmp_path, monkeypatch):
     folder = builtin_capture(tmp_path, SMALL, quiet=True)
-    monkeypatch.setattr(synthetic, "write_builtin_capture", lambda *_: pytest.fail("written again"))
+    monkeypatch.setattr(room, "write_builtin_capture", lambda *_: pytest.fail("written again"))
     assert builtin_capture(tmp_path, SMALL, quiet=True) == folder
 
 
@@ -165,7 +165,7 @@ def test_an_interrupted_capture_is_never_used(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(synthetic, "write_builtin_capture", interrupt)
+        patch.setattr(room, "write_builtin_capture", interrupt)
         with pytest.raises(KeyboardInterrupt):
             builtin_capture(tmp_path, SMALL, quiet=True)
     assert list(tmp_path.rglob("dataset.json")) == []

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.ops.raytrace import CUBE, SPHERE, TORUS, raytrace
+from warpgs.data import writer
+from warpgs.data.lens import Lens
+from warpgs.data.units import SceneUnits
 from warpgs.visualize.images import to_bytes
 
-from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
-from .builtin_cache import cached, content_folder
-from .lens import Lens
-from .units import SceneUnits
+from .cache import cached, content_folder
+from .raytrace import CUBE, SPHERE, TORUS, raytrace
 
 CENTER, SCALE = (0.0, 0.0, 0.35), 0.4
 """Scene units are (p − CENTER) · SCALE."""

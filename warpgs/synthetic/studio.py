@@ -25,17 +25,17 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.ops.raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
+from warpgs.data import writer
+from warpgs.data.images import decode
+from warpgs.data.lens import Lens
+from warpgs.data.units import SceneUnits
 from warpgs.visualize.images import to_bytes
 
-from . import writer
 from .bodies import Body, as_tensors, euler, even_samples
-from .builtin_cache import cached, content_folder
+from .cache import cached, content_folder
 from .degraded_depth import DegradedDepth
-from .images import decode
-from .lens import Lens
-from .synthetic import BuiltinScene
-from .units import SceneUnits
+from .raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
+from .room import BuiltinScene
 
 Depth = Literal["exact", "network", "none"]
 

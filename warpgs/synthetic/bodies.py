@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.ops.raytrace import Bodies
+from warpgs.data.capture import Color
 
-from .capture import Color
+from .raytrace import Bodies
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Body:
     """A unit shape: scaled by ``half_sizes``, then rotated, then shifted to ``center``.
 
     Attributes:
-        shape: SPHERE, CUBE, TORUS or BLOB of ``ops/raytrace.py``.
+        shape: SPHERE, CUBE, TORUS or BLOB of ``synthetic/raytrace.py``.
         center: Its centre in the world.
         half_sizes: Scale along each axis of the body.
         colors: The two colours of its checkerboard.

@@ -2,10 +2,10 @@ import pytest
 import torch
 
 from tests.reference.raytrace import raytrace as reference
-from warpgs.data import studio
-from warpgs.data.bodies import as_tensors, even_samples
-from warpgs.data.synthetic import BuiltinScene, _camera, _lamp, _moving_bodies, _static_bodies
-from warpgs.ops.raytrace import raytrace
+from warpgs.synthetic import studio
+from warpgs.synthetic.bodies import as_tensors, even_samples
+from warpgs.synthetic.raytrace import raytrace
+from warpgs.synthetic.room import BuiltinScene, _camera, _lamp, _moving_bodies, _static_bodies
 
 CPU = torch.device("cpu")
 SCENE = BuiltinScene(width=37, height=21, num_samples=3)
