@@ -81,7 +81,7 @@ def test_cameras_that_do_not_explain_the_motion_in_the_images_are_doubtful(num_w
     poses[: 2 * num_wrong : 2] = roll @ poses[: 2 * num_wrong : 2]  # every second one
     found = doubts_of_motion(PosedFrames(images, boards.lens(), poses, boards.points()))
     assert len(found) == noted
-    assert not noted or found[0].endswith("or most of it moves; look at masks.png")
+    assert not noted or found[0].endswith("or most of the image moves; look at masks.png")
 
 
 def mark_left(frames: object, *rest: object) -> list[np.ndarray]:

@@ -259,7 +259,7 @@ def test_a_damaged_journal_is_refused(made, shots, tmp_path):
 
 
 def test_a_frame_without_a_camera_is_noted_and_omitted(tmp_path):
-    images = boards.record(10)[0]
+    images = boards.record(10, moves=False)[0]
     stray = cv2.resize(boards.texture(5, boards.COLORS[1], 256, (20, 60)), boards.SIZE)
     shots = boards.write_folder(tmp_path / "shots", [*images[:6], stray, *images[6:]])
     report = prepare(shots, tmp_path / "made", masks="none", depth="none")

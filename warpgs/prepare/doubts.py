@@ -25,8 +25,8 @@ MIN_OFF, MIN_CONFIRMED = 0.01, 0.2
 that masks hold at least where cameras are right. Static foreground does not move with the background either."""
 
 NUM_CHECKED, MIN_FITTING = 16, 0.5
-"""Number of frames whose optical flow is compared with the cameras, and fraction of the pixels of nearly every frame
-that right cameras explain (docs/design/motion-masks.md)."""
+"""Number of frames whose optical flow is compared with the cameras, and fraction of the pixels that it follows in
+nearly every frame that right cameras explain (docs/design/motion-masks.md)."""
 
 NOTHING_MOVES = (
     "nothing seems to move: objects of one flat colour are not found; give masks (--masks FOLDER) or a network "
@@ -80,7 +80,7 @@ def doubts_of_motion(frames: PosedFrames, quiet: bool = True) -> list[str]:
 
     def fitting(frame: int) -> float:
         residual = triangulate(frames.observations(frame, flows), frames.focal).residual
-        return float((residual < MAX_RESIDUAL).mean())  # unknown ones are NaN
+        return float((residual < MAX_RESIDUAL).sum() / max(1, (~np.isnan(residual)).sum()))
 
     checked = np.unique(np.linspace(0, len(frames.poses) - 1, NUM_CHECKED).round().astype(int)).tolist()
     num_bad = sum(fraction < MIN_FITTING for fraction in map_frames(fitting, checked, "check of the cameras", quiet))
@@ -88,7 +88,7 @@ def doubts_of_motion(frames: PosedFrames, quiet: bool = True) -> list[str]:
         return []
     return [
         f"in {num_bad} of {len(checked)} frames that were compared with their neighbours, the cameras explain less "
-        "than half of the image: they may be wrong, or most of it moves; look at masks.png"
+        "than half of the motion: they may be wrong, or most of the image moves; look at masks.png"
     ]
 
 
