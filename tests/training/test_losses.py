@@ -270,6 +270,16 @@ def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
     assert part["static"] == whole["static"]
 
 
+def test_what_follows_a_mask_that_is_not_trusted_has_no_loss():
+    _, plan, step = prepared("stage2")
+    step.views.mask_trust.zero_()
+    step(plan, Sample(0, 0.0, PURPLE, 0))
+    terms, trusted = step.take_means().terms, terms_with_trust(1.0, 0.0)
+    follow = {"static", "dynamic", "depth", "depth_dynamic"}
+    assert all(trusted[name] > 0.0 for name in follow)
+    assert {name for name, value in terms.items() if value == 0.0} == follow
+
+
 def test_a_margin_frees_small_errors_of_the_static_depth_alone():
     none, small, large = (terms_with_trust(1.0, margin) for margin in (0.0, 0.2, 1e3))
     assert 0.0 < small["depth"] < none["depth"]

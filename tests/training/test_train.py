@@ -523,3 +523,16 @@ def test_views_that_do_not_fit_on_the_device_are_announced(data, tmp_path, monke
     expected = "read from a file in" if free else "decoded in every iteration: there is no space for a file in"
     lines = described(data, tmp_path, resident_bytes=1000)
     assert any("--resident-bytes" in line and expected in line for line in lines)
+
+
+@pytest.mark.parametrize(("joint_from", "trust"), [(0, [1, 0, 1, 0, 1, 0]), (None, [1] * 6)])
+def test_masks_that_are_wrongly_empty_are_trusted_only_where_nothing_else_is_learned(data, tmp_path, joint_from, trust):
+    root = shutil.copytree(data, tmp_path / "capture")
+    for name in load_capture(root).train[1::2]:
+        path = root / f"resized_mask/1x/{name}.png.png"
+        cv2.imwrite(str(path), np.full_like(cv2.imread(str(path)), 255))
+    schedule = dataclasses.replace(tiny.SCHEDULE, joint_from=joint_from)
+    config = dataclasses.replace(tiny.CONFIG, data=root, out=tmp_path / "run", schedule=schedule)
+    lines = []
+    assert script.make_trainer(config, lines.append).views.mask_trust.tolist() == trust
+    assert any("3 of 6 masks mark nothing" in line for line in lines)

@@ -14,10 +14,11 @@ from warpgs.files import read_json
 
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
+from .empty_masks import check_empty_masks
 from .findings import Finding, Report
 from .frames_check import check_counts, check_files
 from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
-from .motion_check import check_motion, motions_of
+from .motion_check import Motion, check_motion, motions_of
 from .opening import capture_folder, load_capture
 from .points_check import check_points
 from .turning_check import check_turning
@@ -57,7 +58,7 @@ def check_capture(
     is_readable = not any(f.level == "error" and f.topic not in ("masks", "evaluation") for f in findings)
     motions = motions_of(sample.capture, sample.pairs) if is_readable else []
     if masks := _masks(capture, contents):
-        findings += [*check_masks(masks, capture, motions), *check_dynamic_depth(masks)]
+        findings += [*_judge(capture, masks, motions), *check_dynamic_depth([*masks.values()])]
     if is_readable:
         findings += [
             *check_points(sample.capture, sample.names),
@@ -82,10 +83,10 @@ def quick_findings(capture: Capture) -> list[Finding]:
     sample = Sample(capture)
     contents = {name: sample.look(name) for name in sample.names}
     findings = [*check_counts(capture)]
-    if (masks := _masks(capture, contents)) and are_suspect(masks):
+    if (masks := _masks(capture, contents)) and are_suspect([*masks.values()]):
         masks = _masks(capture, {name: sample.look(name) for name in capture.train})
         motions = motions_of(sample.capture, sample.pairs)
-        findings += [*check_masks(masks, capture, motions), *check_motion(motions, capture.conventions.masks)]
+        findings += [*_judge(capture, masks, motions), *check_motion(motions, capture.conventions.masks)]
     findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]
     return [f for f in findings if f.level != "note" or f.topic == "files"]
 
@@ -101,7 +102,13 @@ def _noted(root: Path) -> list[Finding]:
     return [Finding("warning", "preparation", f"warpgs prepare noted: {note}") for note in noted]
 
 
-def _masks(capture: Capture, contents: dict[str, Content]) -> list[DynamicCounts]:
+def _judge(capture: Capture, masks: dict[str, DynamicCounts], motions: list[Motion]) -> list[Finding]:
+    """What is to be said of masks by themselves."""
+    return [*check_masks([*masks.values()], capture, motions), *check_empty_masks(capture, masks)]
+
+
+def _masks(capture: Capture, contents: dict[str, Content]) -> dict[str, DynamicCounts]:
     """Counts of the dynamic pixels in the masks of training frames that were read; none if masks are not used."""
-    dynamic = [contents[name].dynamic for name in capture.train if name in contents]
-    return [counts for counts in dynamic if counts is not None] if capture.assumption == "masks" else []
+    dynamic = {name: contents[name].dynamic for name in capture.train if name in contents}
+    used = dynamic if capture.assumption == "masks" else {}
+    return {name: counts for name, counts in used.items() if counts is not None}

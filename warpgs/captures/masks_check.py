@@ -42,9 +42,9 @@ def dynamic_counts(frame: Frame) -> DynamicCounts:
 
 
 def are_suspect(masks: Sequence[DynamicCounts]) -> bool:
-    """Whether masks mark nothing as dynamic, or more than masks that are correct usually do."""
+    """Whether some masks mark nothing as dynamic, or all more than masks that are correct usually do."""
     fractions = [mask.fraction for mask in masks]
-    return max(fractions) == 0.0 or float(np.mean(fractions)) > MAX_DYNAMIC_FRACTION
+    return not all(mask.regions for mask in masks) or float(np.mean(fractions)) > MAX_DYNAMIC_FRACTION
 
 
 def check_masks(masks: Sequence[DynamicCounts], capture: Capture, motions: Sequence[Motion]) -> Iterator[Finding]:

@@ -20,7 +20,7 @@ def static(inputs: LossInputs) -> Float[Tensor, ""]:
     """The static image in the static region (Eq. 9)."""
     view, layer = inputs.view, inputs.rendering.static
     assert layer is not None
-    return losses.static_loss(layer.image, view.image, view.static_mask, inputs.config.ssim)
+    return losses.static_loss(layer.image, view.image, view.static_mask, inputs.config.ssim) * view.mask_trust
 
 
 def dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -28,7 +28,8 @@ def dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     view, layer = inputs.view, inputs.rendering.dynamic
     assert layer is not None
     images = (layer.image, view.image, view.static_mask)
-    return losses.dynamic_loss(*images, inputs.config.ssim, inputs.backgrounds[2], view.mask_border)
+    loss = losses.dynamic_loss(*images, inputs.config.ssim, inputs.backgrounds[2], view.mask_border)
+    return loss * view.mask_trust
 
 
 def joint(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -44,7 +45,7 @@ def squared(inputs: LossInputs) -> Float[Tensor, ""]:
 def _depth_error(
     inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"], margin: Float[Tensor, ""]
 ) -> Float[Tensor, ""]:
-    """The error of a layer's depth in a region, in ``LossInputs.unit``, times the weight of the view's depth."""
+    """The error of a layer's depth in a region of the mask, in ``LossInputs.unit``, times the view's trust."""
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
@@ -52,7 +53,7 @@ def _depth_error(
     # The op skips pixels with an opacity of at most a half.
     alpha = layer.alpha if inputs.config.depth_gate else torch.ones_like(layer.alpha)
     error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region, margin)
-    return error * inputs.depth_trust.weight / inputs.unit
+    return error * inputs.depth_trust.weight * inputs.view.mask_trust / inputs.unit
 
 
 def depth(inputs: LossInputs) -> Float[Tensor, ""]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from warpgs.captures.empty_masks import untrusted_masks
 from warpgs.config import TrainConfig
 from warpgs.config.presets import far_rates
 from warpgs.data.capture import Capture
@@ -84,6 +85,9 @@ class Trainer:
         self.views = Views(
             self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph
         )
+        if config.schedule.joint_from is not None:  # otherwise nothing else is learned from these frames in stage I
+            for name in untrusted_masks(self.capture):
+                self.views.mask_trust[self.capture.train.index(name)] = 0.0
         if not config.depth:
             initialize.require_no_depth(self.capture, self.views)
         self.iteration, self.rollbacks = 0, 0

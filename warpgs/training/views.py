@@ -31,6 +31,7 @@ class View(NamedTuple):
         static_mask: [H, W] M of the paper, true where static.
         mask_border: [H, W] true within the margin of a border of the mask; None without a margin.
         inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
+        mask_trust: Factor of the terms that follow the mask: 1, or 0 if the mask is not trusted.
     """
 
     camera: Camera
@@ -39,6 +40,7 @@ class View(NamedTuple):
     static_mask: Bool[Tensor, "H W"]
     mask_border: Bool[Tensor, "H W"] | None
     inverse_depth: Float[Tensor, "H W"]
+    mask_trust: Float[Tensor, ""]
 
 
 class Views:
@@ -67,6 +69,7 @@ class Views:
         cache: The file of those that are not resident, so that each is decoded once; None if all are.
         uses_graphs: Whether work on the selected view is captured in CUDA graphs; only if all views are of one size.
         index: [1] index of the selected view, on the device.
+        mask_trust: [T] ``View.mask_trust`` of each view, at first 1; on the device.
         num_pixels: Number of pixels of all views.
 
     Raises:
@@ -90,6 +93,7 @@ class Views:
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
         self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
         self.index = torch.zeros(1, dtype=torch.int64, device=device)
+        self.mask_trust = torch.ones(len(capture.train), dtype=torch.float32, device=device)
         sizes = [capture.cameras[name].size for name in capture.train]
         self.num_pixels = sum(width * height for width, height in sizes)
         have_one_size = len(set(sizes)) == 1
@@ -215,4 +219,5 @@ class Views:
             stored.static_mask,
             stored.mask_border,
             stored.inverse_depth.float(),
+            self.mask_trust.index_select(0, index)[0],
         )
