@@ -135,8 +135,11 @@ def static_database(job: Job) -> Path:
     shutil.copyfile(job.database, database)
     features = keep_static(database, None if job.masks is None else Path(job.masks), job.files)
     if features < MIN_FEATURES:
+        where, remedy = "", "record textured objects, in more light"
+        if job.masks is not None:
+            where, remedy = " in static regions", f"{remedy}, or check the masks, in which 0 must mean dynamic"
         raise NoCamerasError(
-            f"the frames have hardly any texture in static regions: {features:.0f} features per frame, at least "
-            f"{MIN_FEATURES} are needed; record textured objects, in more light, or check the masks"
+            f"the frames have hardly any texture{where}: {features:.0f} features per frame, at least {MIN_FEATURES} "
+            f"are needed; {remedy}"
         )
     return database
