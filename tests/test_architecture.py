@@ -11,7 +11,7 @@ from warpgs.ops.ssim import ssim
 
 ROOT = Path(__file__).parent.parent
 ORDER = [
-    "errors command_line config parsed files locks cache",
+    "errors command_line config parsed files locks cache posix",
     "kernels",
     "runtime",
     "ops",

@@ -20,7 +20,7 @@ from tests import elsewhere
 
 elsewhere.install()
 import warpgs
-from warpgs.command_line import posix
+from warpgs import posix
 from warpgs.cli import main
 from warpgs.viewer import serve
 

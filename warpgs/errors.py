@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import ParamSpec
 
-from .command_line import posix
+from . import posix
 from .command_line.screen import show_error
 
 P = ParamSpec("P")

@@ -26,7 +26,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 from jaxtyping import Float, Shaped, UInt
 
-from .command_line import posix
+from . import posix
 from .parsed import finite, parse_json
 
 MAX_JSON = 64 << 20

@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Sequence
 
-from warpgs.command_line.posix import end_with_parent, unblock_interrupts
 from warpgs.errors import run_command
+from warpgs.posix import end_with_parent, unblock_interrupts
 
 
 def main(arguments: Sequence[str], parent: int) -> int:

@@ -11,9 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any
 
-from warpgs.command_line.posix import block_termination
 from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
+from warpgs.posix import block_termination
 
 from .scheduler import ClusterGoneError, Result
 from .worker import GRACE_SECONDS, Job, run_job

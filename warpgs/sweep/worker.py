@@ -8,9 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from warpgs.command_line.posix import allow_interrupts, interrupt
 from warpgs.errors import one_line
 from warpgs.files import write_text
+from warpgs.posix import allow_interrupts, interrupt
 
 POLL_SECONDS = 0.2
 GRACE_SECONDS = 120.0

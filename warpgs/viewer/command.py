@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.command_line.parsing import RunFolder
-from warpgs.command_line.posix import share_free_memory
 from warpgs.command_line.screen import show, show_error
 from warpgs.errors import ending_at_once
+from warpgs.posix import share_free_memory
 
 
 @dataclass(frozen=True)

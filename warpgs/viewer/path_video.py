@@ -8,9 +8,9 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from warpgs.command_line.posix import interrupt
 from warpgs.command_line.progress import AS_LINES
 from warpgs.errors import one_line
+from warpgs.posix import interrupt
 from warpgs.runs.run import Run
 
 from .panel import set_value

@@ -9,9 +9,9 @@ import warnings
 from collections.abc import Callable
 from contextlib import suppress
 
-from warpgs.command_line.posix import lower_priority
 from warpgs.command_line.version import install_command
 from warpgs.errors import one_line
+from warpgs.posix import lower_priority
 from warpgs.runs import config_file
 
 from .command import View

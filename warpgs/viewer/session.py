@@ -12,8 +12,8 @@ import numpy as np
 import viser
 
 from warpgs.cameras import Camera
-from warpgs.command_line.posix import release_free_memory
 from warpgs.files import encode_png
+from warpgs.posix import release_free_memory
 
 from . import comparison
 from .adaptive_resolution import AdaptiveResolution

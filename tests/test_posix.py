@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from warpgs.command_line import posix
+from warpgs import posix
 
 
 def findings(code: str, path: str) -> str:
@@ -29,7 +29,7 @@ def findings(code: str, path: str) -> str:
 )
 def test_the_linter_refuses_calls_of_some_systems_outside_of_one_module(code):
     assert "TID251" in findings(code, "warpgs/runs/new.py")
-    assert "TID251" not in findings(code, "warpgs/command_line/posix.py")
+    assert "TID251" not in findings(code, "warpgs/posix.py")
 
 
 @pytest.mark.parametrize(
