@@ -17,7 +17,8 @@ from torch.distributed import TCPStore
 from warpgs.config import TrainConfig
 from warpgs.files import write_json
 from warpgs.runs.checkpoint import _hash
-from warpgs.training import command, mask_trial, ranks
+from warpgs.runtime import ranks
+from warpgs.training import command, mask_trial
 from warpgs.training import train as script
 from warpgs.training.step import Step
 from warpgs.training.trainer import Trainer

@@ -11,7 +11,8 @@ from tests import tiny, two_ranks
 from tests.scenes import relative_error
 from warpgs.config import TrainConfig
 from warpgs.runs import checkpoint
-from warpgs.training import optimizer, ranks
+from warpgs.runtime import ranks
+from warpgs.training import optimizer
 from warpgs.training import train as script
 from warpgs.training.step import Sample
 

@@ -9,7 +9,7 @@ import torch
 
 from tests import tiny
 from warpgs.ops.dropout import MAX_SEED
-from warpgs.training import ranks
+from warpgs.runtime import ranks
 from warpgs.training.optimizer import GROUPS
 from warpgs.training.sampling import Sampler
 from warpgs.training.schedule import Phase

@@ -12,8 +12,8 @@ from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
+from warpgs.runtime import ranks
 
-from . import ranks
 from .callbacks import Progress, render_and_compare
 from .fitting import fitted
 from .interrupt import Interrupt

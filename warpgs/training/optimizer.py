@@ -20,8 +20,7 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
-
-from . import ranks
+from warpgs.runtime import ranks
 
 BETAS = (0.9, 0.999)
 EPSILON = 1e-15

@@ -7,8 +7,8 @@ from itertools import count
 import torch
 
 from warpgs.ops.dropout import MAX_SEED
+from warpgs.runtime import ranks
 
-from . import ranks
 from .step import Sample
 
 

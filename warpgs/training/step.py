@@ -17,10 +17,10 @@ from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
+from warpgs.runtime import ranks
 from warpgs.runtime.graphs import GraphCache
 
 from . import optimizer as optim
-from . import ranks
 from .acceleration import sample_paths
 from .density import make_strategy
 from .loss_terms import TERMS

@@ -10,8 +10,8 @@ from torch import Tensor
 from warpgs.config import TrainConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.spline_deformation import SplineDeformation
+from warpgs.runtime import ranks
 
-from . import ranks
 from .dynamic_points import MAX_SCALE
 from .point_cloud import front_of_ball, gaussians_at, subsample
 from .tracks import Track

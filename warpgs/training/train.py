@@ -23,8 +23,8 @@ from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
 from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_folder
+from warpgs.runtime import ranks
 
-from . import ranks
 from .callbacks import Callback, HeldOut, Previewer
 from .fitting import fitted
 from .interrupt import Interrupt
@@ -77,7 +77,7 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
     SIGTERM and the first Ctrl-C let the current iteration finish and save a checkpoint; the second Ctrl-C stops at
     once.
 
-    Under torchrun its processes train one scene together (``ranks.py``). The first one writes the run folder and
+    Under torchrun its processes train one scene together (``runtime.ranks``). The first one writes the run folder and
     evaluates; in the others, ``log`` and ``callbacks`` are not called, and ``train`` returns when training has ended.
 
     Args:

@@ -17,8 +17,9 @@ from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 from warpgs.runs.captures import known_background, require_same_times
 from warpgs.runs.trained import TrainedScene
+from warpgs.runtime import ranks
 
-from . import initialize, ranks
+from . import initialize
 from . import optimizer as optim
 from .callbacks import Callback, Progress
 from .density.adaptation import Adaptation
@@ -46,8 +47,8 @@ class Trainer:
     All random numbers are a function of the seed, the iteration, the number of rollbacks and the rank, so that a
     resumed run continues exactly as the interrupted one would have.
 
-    Several ranks (``ranks.py``) train one scene: an iteration is one step of Adam over one view of each. Nothing in the
-    schedule depends on their number, as in gsplat, whose users shorten it by ``--steps_scaler``.
+    Several ranks (``runtime.ranks``) train one scene: an iteration is one step of Adam over one view of each. Nothing
+    in the schedule depends on their number, as in gsplat, whose users shorten it by ``--steps_scaler``.
 
     Args:
         config: Resolved config: schedule rescaled, device and background chosen.

@@ -10,7 +10,7 @@ from tests import tiny
 from tests.reference.covariance import covariance
 from tests.scenes import generator, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, trained
-from warpgs.training import ranks
+from warpgs.runtime import ranks
 from warpgs.training.density.mcmc import add_noise
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.sampling import random_numbers

@@ -11,7 +11,7 @@ from warpgs.config import DensifyConfig, RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.ops.adam import Adam
-from warpgs.training import ranks
+from warpgs.runtime import ranks
 from warpgs.training.schedule import Action
 
 from .adaptation import Adaptation
