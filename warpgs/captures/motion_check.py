@@ -13,12 +13,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_at, grey_levels
 from warpgs.data.sampling import evenly_spaced
 
 from .findings import Finding, Level
-
-MIN_SIDE, MAX_ASPECT = 16, 16
-"""Minimum side [px] and maximum ratio of the sides: OpenCV's optical flow crashes on images beyond them."""
 
 COMPARED_SIDE = 512
 """Images are scaled down to this longer side [px]."""
@@ -179,10 +177,10 @@ def _seen_from(
     centers = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV has pixel centres at whole numbers
     homography = _intrinsics(camera, size) @ other @ own.T @ np.linalg.inv(_intrinsics(frame.camera, reduced))
     homography = np.linalg.inv(centers) @ homography @ centers
-    plane = _grey(frame, reduced)
+    plane = grey_levels(frame, reduced)
     turned = cv2.warpPerspective(plane, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.warpPerspective(np.full_like(plane, 255), homography, size, flags=cv2.INTER_NEAREST)
-    return _even_contrast(turned), seen > 0
+    return even_contrast(turned), seen > 0
 
 
 def _reduced_size(camera: Camera) -> tuple[int, int]:
@@ -193,36 +191,6 @@ def _reduced_size(camera: Camera) -> tuple[int, int]:
 def _intrinsics(camera: Camera, size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
     """K of the camera's image in another size."""
     return np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K.double().numpy()
-
-
-def flow_between(
-    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]
-) -> tuple[Float[np.ndarray, "H W 2"], Bool[np.ndarray, "H W"]]:
-    """Optical flow (DIS) from one grey image to another, and whether the flow back is its opposite at its end.
-
-    Up to a pixel and 5 % of its length. Both sides of the images are at least ``MIN_SIDE``.
-    """
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    forward, backward = method.calc(first, second, None), method.calc(second, first, None)
-    height, width = first.shape
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    far = (1e4,) * 4
-    target = x + forward[..., 0], y + forward[..., 1]
-    returned = cv2.remap(backward, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=far)
-    return forward, np.linalg.norm(forward + returned, axis=-1) < 1.0 + 0.05 * np.linalg.norm(forward, axis=-1)
-
-
-def grey_at(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
-    """A frame in grey levels with even contrast, as optical flow wants it, resized to (width, height)."""
-    return _even_contrast(_grey(frame, size))
-
-
-def _grey(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
-    return cv2.resize(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-
-
-def _even_contrast(plane: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-    return cv2.createCLAHE(2.0, (8, 8)).apply(plane)
 
 
 def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:

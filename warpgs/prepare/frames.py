@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from warpgs.captures.motion_check import MAX_ASPECT, MIN_SIDE
 from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.loaders.name_times import times_of_names
+from warpgs.data.optical_flow import MAX_ASPECT, MIN_SIDE
 from warpgs.data.time_source import TimeSource
 from warpgs.errors import similar_path
 from warpgs.files import natural_order, read_json, write_json, write_png

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from warpgs.captures.motion_check import MIN_SIDE, flow_between, grey_at
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
+from warpgs.data.optical_flow import MIN_SIDE, flow_between, grey_at
 
 MIN_OVERLAP = 0.3
 """Overlap of regions of consecutive frames, relative to the smaller one, from which on they show the same object."""
