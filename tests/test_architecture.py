@@ -20,6 +20,7 @@ ORDER = [
     "rendering",
     "visualize",
     "data",
+    "views",
     "synthetic",
     "captures",
     "runs",

@@ -26,9 +26,9 @@ from warpgs.training.command import parse
 from warpgs.training.fitting import fitted, mean_color
 from warpgs.training.train import make_trainer, train
 from warpgs.training.trainer import Trainer
-from warpgs.training.views import Views
 from warpgs.video import frames
 from warpgs.video.command import Render
+from warpgs.views.views import Views
 
 WHITE = (1.0, 1.0, 1.0)
 

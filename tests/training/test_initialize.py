@@ -23,7 +23,7 @@ from warpgs.training.point_cloud import (
     unproject,
 )
 from warpgs.training.schedule import Protocol
-from warpgs.training.views import Views
+from warpgs.views.views import Views
 
 CAMERA = make_camera()
 NETWORK = ModelConfig(

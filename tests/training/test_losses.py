@@ -24,8 +24,8 @@ from warpgs.training.loss_terms import TERMS
 from warpgs.training.losses import DepthTrust, LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import Sample, Step
-from warpgs.training.stored_views import mask_border
-from warpgs.training.views import Views
+from warpgs.views.stored_views import mask_border
+from warpgs.views.views import Views
 
 HEIGHT, WIDTH = 21, 18
 BLACK = torch.zeros(3)

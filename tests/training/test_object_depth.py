@@ -22,7 +22,7 @@ from warpgs.training.object_depth import SIZE_ERROR, ObjectDepth, fill_object_de
 from warpgs.training.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
-from warpgs.training.views import Views
+from warpgs.views.views import Views
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 NUM = 30

@@ -32,8 +32,9 @@ from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.synthetic.room import BuiltinScene, builtin_capture
-from warpgs.training import initialize, view_cache
+from warpgs.training import initialize
 from warpgs.training import train as script
+from warpgs.views import view_cache
 
 SCRIPT = str(Path(__file__).parents[2] / "train.py")
 SMALL = BuiltinScene(width=64, height=36, num_frames=6, num_samples=2, num_points=400)

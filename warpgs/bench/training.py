@@ -25,7 +25,7 @@ from warpgs.training.losses import DepthTrust
 from warpgs.training.point_cloud import scene_box
 from warpgs.training.schedule import IterationPlan, Phase, Protocol
 from warpgs.training.step import Sample, Step
-from warpgs.training.views import Views
+from warpgs.views.views import Views
 
 from .report import print_rows
 from .scenes import SEED, in_disc, random_splats

@@ -12,9 +12,9 @@ from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import MIN_KNOWN_FRACTION
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.views.views import View, Views
 
 from .point_cloud import subsample, unproject
-from .views import View, Views
 
 MAX_PIXELS_PER_GAUSSIAN = 8
 """Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""

@@ -18,6 +18,7 @@ from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import DEFAULTS, render
+from warpgs.views.views import Views
 
 from .density.reseed import gaussians_in_box
 from .dynamic_points import MAX_SCALE, is_depth_known, unproject_pixels
@@ -27,7 +28,6 @@ from .point_cloud import color_points, gaussians_at, random_points, scene_box, s
 from .schedule import Protocol
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
-from .views import Views
 
 MAX_COLOR_VIEWS = 12
 """Maximum number of training views that tell the colours of points without colours."""

@@ -11,9 +11,9 @@ from warpgs.config import LossConfig
 from warpgs.model.splats import Splats
 from warpgs.ops.ssim import l1_and_ssim
 from warpgs.rendering import Rendering
+from warpgs.views.views import View
 
 from .schedule import IterationPlan, Phase
-from .views import View
 
 
 class DepthTrust(NamedTuple):

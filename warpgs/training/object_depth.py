@@ -29,11 +29,11 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import metric_depth, typical_error
 from warpgs.data.dynamic_regions import MIN_FRAMES, scaled_size
 from warpgs.data.masks import nearest_pixels
+from warpgs.views.views import View, Views
 
 from .dynamic_points import is_depth_known
 from .objects import MovingObject, find_all_objects, num_cut_off
 from .point_cloud import filled, front_of_ball
-from .views import View, Views
 
 AROUND = 0.015
 """Width of the rim around an object where static points bound its depth, as a fraction of the image's longer side."""

@@ -19,6 +19,7 @@ from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime import ranks
 from warpgs.runtime.graphs import GraphCache
+from warpgs.views.views import View, Views
 
 from . import optimizer as optim
 from .acceleration import sample_paths
@@ -27,7 +28,6 @@ from .loss_terms import TERMS
 from .losses import DepthTrust, LossInputs
 from .schedule import IterationPlan, Phase
 from .step_inputs import StepInputs
-from .views import View, Views
 
 STEPS = "iterations"
 """Name of the number of iterations among the sums of loss terms."""

@@ -18,6 +18,7 @@ from warpgs.runs import checkpoint
 from warpgs.runs.captures import known_background, require_same_times
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime import ranks
+from warpgs.views.views import Views
 
 from . import initialize
 from . import optimizer as optim
@@ -29,7 +30,6 @@ from .object_depth import fill_object_depth
 from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
-from .views import Views
 
 CHECK_EVERY = 50
 """Iterations between checks of the loss, which synchronize with the device."""

@@ -12,7 +12,7 @@ from warpgs.data.capture import Capture
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.training.schedule import IterationPlan
-from warpgs.training.views import Views
+from warpgs.views.views import Views
 
 
 @dataclass(frozen=True)

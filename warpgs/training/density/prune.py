@@ -14,7 +14,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import DEFAULTS, render
 from warpgs.training.schedule import Phase
-from warpgs.training.views import View, Views
+from warpgs.views.views import View, Views
 
 from .adaptation import Adaptation
 from .operations import remove

@@ -21,7 +21,7 @@ from warpgs.training import optimizer as optim
 from warpgs.training.dynamic_points import MAX_SCALE, DynamicPoints, to_canonical, unproject_pixels
 from warpgs.training.point_cloud import gaussians_at, random_points
 from warpgs.training.schedule import Phase
-from warpgs.training.views import View, Views
+from warpgs.views.views import View, Views
 
 from .adaptation import Adaptation
 

@@ -11,8 +11,8 @@ from tests.data.captures import ids_of, write_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
 from warpgs.model.poses import PoseCorrections
-from warpgs.training.stored_views import mask_border
-from warpgs.training.views import Views
+from warpgs.views.stored_views import mask_border
+from warpgs.views.views import Views
 
 CPU = torch.device("cpu")
 PLENTY = 1 << 30
