@@ -1,4 +1,4 @@
-"""What the site changes in its pages: the tables of options.md come from the dataclasses that commands parse."""
+"""Changes pages for the site: the tables of options.md come from the dataclasses that commands parse."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ from warpgs.config.presets import PRESETS
 MARKER = "<!-- options -->"
 
 FILE_ONLY = re.compile(r"(<!-- (?:options|nothing) -->)\n.*?<!-- end -->\n?", re.DOTALL)
-"""What is said where the file is read instead of the site, which has the tables of options, or nothing, there."""
+"""Text for readers of the file; the site has the tables of options, or nothing, there."""
 
 ROW, CODE = re.compile(r"^\|.*$", re.MULTILINE), re.compile(r"`[^`]+`")
 
@@ -56,12 +56,12 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def sections() -> Iterator[str]:
-    """The tables of all commands; those of ``train`` by group, followed by what its presets change."""
+    """The tables of all commands; those of ``train`` by group, followed by its presets."""
     for name, command in COMMANDS.items():
         yield f"## warpgs {name}\n\n{summary(command.load())}\n"
         if name == "train":
             yield f"Defaults are those of the preset `{SHOWN}`, which is the default for captures."
-            yield "[Below](#what-the-presets-change) are those of the others.\n"
+            yield "[Below](#presets) are those of the others.\n"
         groups: dict[str, list[Option]] = {}
         for option in options_of(name):
             groups.setdefault(group_of(option.name), []).append(option)
@@ -70,7 +70,7 @@ def sections() -> Iterator[str]:
                 yield f"### train --{group}.*\n\n{summary(type(getattr(PRESETS[SHOWN], group)))}\n"
             yield from table(("option", "default", "meaning"), [row(option) for option in members])
         if name == "train":
-            yield "### What the presets change\n\nOptions that are not listed are the same in all presets.\n"
+            yield "### Presets\n\nOptions that are not listed are the same in all presets.\n"
             yield from table(("option", *PRESETS), preset_rows())
 
 
