@@ -1,1 +1,1 @@
-"""The built-in captures, ray-traced: what is in them, how they are written and where they are kept."""
+"""The built-in captures, and the ray tracer that renders them."""
