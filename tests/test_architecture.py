@@ -26,6 +26,7 @@ ORDER = [
     "runs",
     "video",
     "evaluation",
+    "initialization",
     "training prepare",
     "bench export viewer report",
     "sweep",

@@ -13,9 +13,9 @@ from tests.scenes import make_camera
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig, scaled, validate
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
+from warpgs.initialization.fitting import fitted, fitted_bands
 from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
-from warpgs.training.fitting import fitted, fitted_bands
 
 
 def changed(name, value, config=PRESETS["paper"]):

@@ -13,8 +13,8 @@ from tests.data import captures, layouts
 from warpgs.captures.opening import load_capture, open_capture
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.training.initialize import initial_scene
-from warpgs.training.point_cloud import random_points
+from warpgs.initialization.initialize import initial_scene
+from warpgs.initialization.point_cloud import random_points
 from warpgs.training.trainer import Trainer
 
 FOLDERS = ("depth", "depths", "disp")

@@ -18,12 +18,12 @@ from warpgs.evaluation import evaluate_run
 from warpgs.export.clouds import Clouds
 from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
+from warpgs.initialization import fitting
+from warpgs.initialization.fitting import fitted, mean_color
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
 from warpgs.synthetic.balls import BallsSize, balls_capture
-from warpgs.training import fitting
 from warpgs.training.command import parse
-from warpgs.training.fitting import fitted, mean_color
 from warpgs.training.train import make_trainer, train
 from warpgs.training.trainer import Trainer
 from warpgs.video import frames

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from tests import tiny
+from tests.initialization.test_motion_fit import TIMES, UNEVEN, VIEW_SIZE, fit, max_error, new_deformation
 from tests.scenes import generator, relative_error
-from tests.training.test_motion_fit import TIMES, UNEVEN, VIEW_SIZE, fit, max_error, new_deformation
 from warpgs.config.presets import PRESETS
+from warpgs.initialization import motion_fit
 from warpgs.model.fields import FIELDS
 from warpgs.model.trunk import Trunk
 from warpgs.ops.encoding import ROW_ALIGNMENT, aligned
@@ -19,7 +20,6 @@ from warpgs.runs.checkpoint import Metadata
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS, capture
 from warpgs.runtime.profiling import profile
-from warpgs.training import motion_fit
 from warpgs.training.density import DENSITY
 from warpgs.training.density.prune import blend_weights
 from warpgs.training.density.reseed import lost_fraction, lost_pixels

@@ -7,7 +7,7 @@ import pytest
 from tests import tiny
 from tests.data import layouts
 from warpgs.captures.opening import load_capture
-from warpgs.training.fitting import fitted
+from warpgs.initialization.fitting import fitted
 
 pytestmark = pytest.mark.usefixtures("quickly")
 

@@ -18,10 +18,11 @@ from tests.scenes import (
 )
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.data.capture import Capture, Frame
+from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 from warpgs.training.loss_terms import TERMS
-from warpgs.training.losses import DepthTrust, LossTerm, dynamic_loss, image_loss, static_loss
+from warpgs.training.losses import LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import Sample, Step
 from warpgs.views.stored_views import mask_border

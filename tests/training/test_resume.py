@@ -15,8 +15,9 @@ from tests import tiny
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.evaluation import evaluate_run
+from warpgs.initialization import motion_fit
 from warpgs.runs import checkpoint
-from warpgs.training import command, motion_fit
+from warpgs.training import command
 from warpgs.training import train as script
 
 pytestmark = pytest.mark.usefixtures("quickly")

@@ -16,13 +16,13 @@ from warpgs.config import ModelConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.evaluation.evaluate import frame_rate
+from warpgs.initialization.point_cloud import scene_box
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.runs.run import Run
 from warpgs.runtime.graphs import WARM_UPS
 from warpgs.training.losses import DepthTrust
-from warpgs.training.point_cloud import scene_box
 from warpgs.training.schedule import IterationPlan, Phase, Protocol
 from warpgs.training.step import Sample, Step
 from warpgs.views.views import Views

@@ -8,24 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.config import LossConfig
+from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.splats import Splats
 from warpgs.ops.ssim import l1_and_ssim
 from warpgs.rendering import Rendering
 from warpgs.views.views import View
 
 from .schedule import IterationPlan, Phase
-
-
-class DepthTrust(NamedTuple):
-    """How much the aligned depth of views is trusted, by its error at the sparse points.
-
-    Attributes:
-        weight: Factor of the terms of depth, in [0, 1]; 0 = the depth is not used. See ``LossConfig.depth_tolerance``.
-        margin: Relative error of the static depth that is not penalized. See ``LossConfig.depth_margin``.
-    """
-
-    weight: Float[Tensor, "*T"]
-    margin: Float[Tensor, "*T"]
 
 
 class LossInputs(NamedTuple):

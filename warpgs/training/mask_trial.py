@@ -12,13 +12,13 @@ from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
+from warpgs.initialization.fitting import fitted
+from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.runtime import ranks
 
 from .callbacks import Progress, render_and_compare
-from .fitting import fitted
 from .interrupt import Interrupt
 from .logger import TrainingLogger, ignore
-from .objects import find_all_objects, num_cut_off
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]

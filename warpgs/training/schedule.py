@@ -125,7 +125,7 @@ class Protocol:
     """
 
     def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True, fits_motion: bool = False) -> None:
-        self.config = config
+        self.config = config if fits_motion else replace(config, schedule=replace(config.schedule, fit_motion=0))
         self.has_depth, self.fits_motion = has_depth, fits_motion
         schedule = config.schedule
         pretrain = schedule.pretrain if config.dap and has_depth and pretrains else 0

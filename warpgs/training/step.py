@@ -14,6 +14,7 @@ from torch.nn.functional import mse_loss
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data.capture import background_color
 from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
+from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
@@ -25,7 +26,7 @@ from . import optimizer as optim
 from .acceleration import sample_paths
 from .density import make_strategy
 from .loss_terms import TERMS
-from .losses import DepthTrust, LossInputs
+from .losses import LossInputs
 from .schedule import IterationPlan, Phase
 from .step_inputs import StepInputs
 

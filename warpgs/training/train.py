@@ -18,6 +18,7 @@ from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
+from warpgs.initialization.fitting import fitted
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
@@ -26,7 +27,6 @@ from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_f
 from warpgs.runtime import ranks
 
 from .callbacks import Callback, HeldOut, Previewer
-from .fitting import fitted
 from .interrupt import Interrupt
 from .logger import TrainingLogger, ignore
 from .mask_trial import with_trusted_masks

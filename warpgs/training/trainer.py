@@ -11,7 +11,9 @@ from warpgs.captures.empty_masks import untrusted_masks
 from warpgs.config import TrainConfig
 from warpgs.config.presets import far_rates
 from warpgs.data.capture import Capture
-from warpgs.data.exposure import exposure_gains
+from warpgs.initialization import alignment, initialize
+from warpgs.initialization.exposure import exposure_gains
+from warpgs.initialization.object_depth import fill_object_depth
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
@@ -20,13 +22,11 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.runtime import ranks
 from warpgs.views.views import Views
 
-from . import initialize
 from . import optimizer as optim
 from .callbacks import Callback, Progress
 from .density.adaptation import Adaptation
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
-from .object_depth import fill_object_depth
 from .sampling import Sampler, random_numbers
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
@@ -90,12 +90,12 @@ class Trainer:
             for name in untrusted_masks(self.capture):
                 self.views.mask_trust[self.capture.train.index(name)] = 0.0
         if not config.depth:
-            initialize.require_no_depth(self.capture, self.views)
+            alignment.require_no_depth(self.capture, self.views)
         self.iteration, self.rollbacks = 0, 0
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
-        found = initialize.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
+        found = alignment.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
         for tensor in found:
             ranks.copy_first_(tensor)
         self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss)
@@ -185,7 +185,7 @@ class Trainer:
         """Aligns the depth of the views to the rendered depth, in place, because CUDA graphs read it."""
         if not self.capture.metric_depth:
             settings = self.config.render_settings
-            found = initialize.align_to_rendering(self.alignments, self.views, self.scene, phase.sh_degree, settings)
+            found = alignment.align_to_rendering(self.alignments, self.views, self.scene, phase.sh_degree, settings)
             self.alignments.copy_(torch.where(self.depth_trust.weight[:, None] > 0, found, torch.nan))
 
     def _adaptation(self, plan: IterationPlan, logger: TrainingLogger) -> Adaptation:
@@ -209,7 +209,7 @@ class Trainer:
             steps = self.config.schedule.fit_motion
             logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
-        sources = (self.protocol, self.capture, self.views, self.alignments, self.scene.deformation)
+        sources = (self.protocol.config, self.capture, self.views, self.alignments, self.scene.deformation)
         found = initialize.dynamic_gaussians(
             *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
         )

@@ -11,12 +11,12 @@ from tests.reference.render import as_dict
 from tests.reference.render import render as reference
 from tests.scenes import error, select
 from warpgs.config import RenderSettings
+from warpgs.initialization.dynamic_points import DynamicPoints
+from warpgs.initialization.point_cloud import scene_box
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training import optimizer as optim
 from warpgs.training.density.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches, reseed
-from warpgs.training.dynamic_points import DynamicPoints
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.point_cloud import scene_box
 from warpgs.training.schedule import Phase
 
 PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False, densifies=False)

@@ -13,13 +13,18 @@ from torch import Tensor
 
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.config.presets import far_rates
-from warpgs.data.capture import Capture
+from warpgs.initialization.dynamic_points import (
+    MAX_SCALE,
+    DynamicPoints,
+    gaussians_in_box,
+    to_canonical,
+    unproject_pixels,
+)
+from warpgs.initialization.point_cloud import gaussians_at
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 from warpgs.training import optimizer as optim
-from warpgs.training.dynamic_points import MAX_SCALE, DynamicPoints, to_canonical, unproject_pixels
-from warpgs.training.point_cloud import gaussians_at, random_points
 from warpgs.training.schedule import Phase
 from warpgs.views.views import View, Views
 
@@ -113,12 +118,6 @@ def gaussians_that_show(
         x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
     return gaussians_at(canonical[kept], found.colors[kept], config.model, MAX_SCALE * view_size)
-
-
-def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generator: torch.Generator) -> Gaussians:
-    """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
-    positions = random_points(capture.points, count, generator)
-    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, MAX_SCALE * capture.view_size)
 
 
 def reseed(at: Adaptation) -> None:

@@ -7,11 +7,11 @@ import torch
 
 from tests.scenes import error, generator, relative_error
 from warpgs.config import ModelConfig, TrainConfig
+from warpgs.initialization import motion_fit
+from warpgs.initialization.dynamic_points import DynamicPoints, to_canonical
+from warpgs.initialization.motion_fit import MAX_ERROR, fit_motion
 from warpgs.model.fields import make_deformation
 from warpgs.model.trunk import Trunk
-from warpgs.training import motion_fit
-from warpgs.training.dynamic_points import DynamicPoints, to_canonical
-from warpgs.training.motion_fit import MAX_ERROR, fit_motion
 
 NUM_VIEWS, NUM_POINTS = 21, 40
 """Frames, and points on each of two objects in a frame."""

@@ -16,10 +16,10 @@ from warpgs.config import LossConfig
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.training import object_depth as module
-from warpgs.training import objects
-from warpgs.training.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth, without_rims
-from warpgs.training.objects import MIN_VISIBLE, find_objects
+from warpgs.initialization import object_depth as module
+from warpgs.initialization import objects
+from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth, without_rims
+from warpgs.initialization.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
 from warpgs.views.views import Views
@@ -396,7 +396,7 @@ def rim_of(static_mask: torch.Tensor, width: int) -> torch.Tensor:
 @pytest.fixture
 def blurred(monkeypatch) -> Capture:
     """A capture whose depth is half way to the wall in a rim of one pixel, as depth networks blur edges."""
-    monkeypatch.setattr("warpgs.training.object_depth.RIM", 2.5 / WIDTH)
+    monkeypatch.setattr("warpgs.initialization.object_depth.RIM", 2.5 / WIDTH)
 
     def with_rims(frame: Frame) -> Frame:
         half_way = 0.5 * (frame.inverse_depth + 1.0 / WALL)

@@ -8,13 +8,15 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
+from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import MIN_KNOWN_FRACTION
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.model.gaussians import Gaussians
 from warpgs.views.views import View, Views
 
-from .point_cloud import subsample, unproject
+from .point_cloud import gaussians_at, random_points, subsample, unproject
 
 MAX_PIXELS_PER_GAUSSIAN = 8
 """Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
@@ -116,6 +118,12 @@ def to_canonical(
         if not start.is_cuda and bool(reached.all()):
             break
     return found, reached[:, 0]
+
+
+def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generator: torch.Generator) -> Gaussians:
+    """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
+    positions = random_points(capture.points, count, generator)
+    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, MAX_SCALE * capture.view_size)
 
 
 @torch.no_grad()

@@ -12,13 +12,13 @@ from warpgs.captures.opening import load_capture
 from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
+from warpgs.initialization import tracks as module
+from warpgs.initialization.fitting import fitted
+from warpgs.initialization.silhouettes import Region
+from warpgs.initialization.tracked_start import MAX_FINAL_RATE, MAX_RATE
+from warpgs.initialization.tracks import _divided, find_tracks
 from warpgs.rendering import render
 from warpgs.synthetic.balls import RADIUS, BallsSize, _balls, balls_capture
-from warpgs.training import tracks as module
-from warpgs.training.fitting import fitted
-from warpgs.training.silhouettes import Region
-from warpgs.training.tracked_start import MAX_FINAL_RATE, MAX_RATE
-from warpgs.training.tracks import _divided, find_tracks
 
 SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
 UNITS = 1.3

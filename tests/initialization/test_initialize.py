@@ -11,10 +11,8 @@ from tests import tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
-from warpgs.model.fields import make_deformation
-from warpgs.training import dynamic_points, initialize
-from warpgs.training.logger import TrainingLogger
-from warpgs.training.point_cloud import (
+from warpgs.initialization import alignment, dynamic_points, initialize
+from warpgs.initialization.point_cloud import (
     color_points,
     distinct,
     gaussians_at,
@@ -22,6 +20,8 @@ from warpgs.training.point_cloud import (
     subsample,
     unproject,
 )
+from warpgs.model.fields import make_deformation
+from warpgs.training.logger import TrainingLogger
 from warpgs.training.schedule import Protocol
 from warpgs.views.views import Views
 
@@ -80,8 +80,8 @@ def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None, fits
     """The dynamic Gaussians of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
     views = views_of(capture)
     fits = initialize.fits_motion(config, capture, views, alignments) if fits is None else fits
-    protocol, deformation = Protocol(config, True, fits_motion=fits), deformation or torch.nn.Identity()
-    return initialize.dynamic_gaussians(protocol, capture, views, alignments, deformation, generator())
+    config, deformation = Protocol(config, True, fits_motion=fits).config, deformation or torch.nn.Identity()
+    return initialize.dynamic_gaussians(config, capture, views, alignments, deformation, generator())
 
 
 def constant_depth():
@@ -382,7 +382,7 @@ def test_metric_depth_is_not_aligned():
     capture = make_capture(points, inverse_depth=torch.full((HEIGHT, WIDTH), 0.25))
     for metric, expected in ((False, [torch.nan, torch.nan]), (True, [1.0, 0.0])):  # one value: nothing to fit
         capture.metric_depth = metric
-        found = initialize.align_to_points(capture, views_of(capture), smooth=True)
+        found = alignment.align_to_points(capture, views_of(capture), smooth=True)
         assert torch.equal(found.alignments.isnan(), torch.tensor([expected] * 3).isnan())
         assert metric == torch.equal(found.alignments, torch.tensor([expected] * 3))
     assert found.errors[:, 0].tolist() == pytest.approx([0.25] * 3)  # 3 m are 1 / 0.25 = 4 m in the files
@@ -391,7 +391,7 @@ def test_metric_depth_is_not_aligned():
 def test_metric_depth_that_is_unknown_is_not_used():
     capture = make_capture(random_points(9), inverse_depth=torch.full((HEIGHT, WIDTH), torch.nan))
     capture.metric_depth = True
-    found = initialize.align_to_points(capture, views_of(capture))
+    found = alignment.align_to_points(capture, views_of(capture))
     assert found.alignments.isnan().all()
 
 
@@ -607,7 +607,7 @@ def aligned(factor, signal=1.0):
         return (signal / depth + 0.4 * (1.0 - signal)) * noise
 
     capture = capture_of_grid(inverse_of)
-    return initialize.align_to_points(capture, views_of(capture))
+    return alignment.align_to_points(capture, views_of(capture))
 
 
 def test_exact_depth_is_trusted_whatever_the_tolerance():
@@ -636,19 +636,19 @@ def test_without_a_tolerance_every_view_is_trusted():
 
 def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
-    trust = initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03))
+    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03))
     assert error(trust.weight, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
 def test_the_margin_is_a_multiple_of_the_error_of_each_view():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.01, 0.4], [0.02, 0.4]])
-    trust = initialize.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_margin=3.0))
+    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_margin=3.0))
     assert error(trust.margin, torch.tensor([0.09, 0.06, 0.03, 0.06])) < 1e-7
     assert torch.equal(trust.weight, torch.ones(4))
 
 
 def test_without_points_nothing_is_refused():
-    found = initialize.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
+    found = alignment.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
     trust = found.trust(LossConfig(depth_tolerance=0.03, depth_margin=3.0))
     assert torch.equal(trust.weight, torch.ones(2))
     assert torch.equal(trust.margin, torch.zeros(2))
@@ -657,11 +657,11 @@ def test_without_points_nothing_is_refused():
 def test_depth_with_smooth_errors_is_brought_to_the_points():
     capture = capture_of_grid(lambda depth, column: (1.0 + 0.1 * torch.sin(column / 16.0)) / depth)
     views = views_of(capture)
-    plain = initialize.align_to_points(capture, views)
-    smooth = initialize.align_to_points(capture, views, smooth=True)
+    plain = alignment.align_to_points(capture, views)
+    smooth = alignment.align_to_points(capture, views, smooth=True)
     assert (smooth.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
     assert torch.equal(smooth.alignments, plain.alignments)
-    again = initialize.align_to_points(capture, views)  # of the depth as it is now
+    again = alignment.align_to_points(capture, views)  # of the depth as it is now
     assert (again.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
 
 
@@ -669,7 +669,7 @@ def test_depth_that_a_smooth_factor_makes_no_better_stays():
     capture = capture_of_grid(lambda depth, _: 1.0 / depth)
     views = views_of(capture)
     before = views[0].inverse_depth.clone()
-    initialize.align_to_points(capture, views, smooth=True)
+    alignment.align_to_points(capture, views, smooth=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))
 
 
@@ -688,14 +688,14 @@ def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch
 
     views = views_of(with_frames(capture, read))
     layer = SimpleNamespace(depth=depth, alpha=torch.ones(HEIGHT, WIDTH))
-    monkeypatch.setattr(initialize, "render", lambda *_, **__: SimpleNamespace(joint=layer))
+    monkeypatch.setattr(alignment, "render", lambda *_, **__: SimpleNamespace(joint=layer))
     before = torch.full((3, 2), 7.0)
     for most in (1, 1 << 20):
-        monkeypatch.setattr(initialize, "MAX_SAMPLES_ON_CPU", most)
+        monkeypatch.setattr(alignment, "MAX_SAMPLES_ON_CPU", most)
         if source == "points":
-            found, unknown = initialize.align_to_points(capture, views).alignments, torch.nan
+            found, unknown = alignment.align_to_points(capture, views).alignments, torch.nan
         else:
             scene = initialize.initial_scene(CONFIG, capture, generator())
-            found, unknown = initialize.align_to_rendering(before, views, scene, 0), 7.0
+            found, unknown = alignment.align_to_rendering(before, views, scene, 0), 7.0
         expected = torch.tensor([[1.0, 0.0], [unknown, unknown], [0.25, 0.0]])
         assert torch.allclose(found, expected, atol=2e-3, equal_nan=True)  # depth is stored in half precision

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .capture import Capture, Frame
+from warpgs.data.capture import Capture, Frame
 
 MIN_JUMP = 0.1
 """Minimum change of the logarithm of intensities between two frames that counts as a jump, about a third of a stop. The

@@ -7,7 +7,7 @@ import torch
 
 from tests.scenes import error, generator, make_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.exposure import MIN_JUMP, exposure_gains
+from warpgs.initialization.exposure import MIN_JUMP, exposure_gains
 
 CAMERA = make_camera()
 HEIGHT, WIDTH = CAMERA.height, CAMERA.width

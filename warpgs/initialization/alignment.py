@@ -1,0 +1,127 @@
+"""The alignment of the views' depth to the scene, and how much it is trusted."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.config import LossConfig, RenderSettings
+from warpgs.data import depth_alignment
+from warpgs.data.capture import Capture
+from warpgs.model.scene import SplitScene
+from warpgs.rendering import DEFAULTS, render
+from warpgs.views.views import Views
+
+MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
+"""Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
+it takes to launch its kernels."""
+
+
+class DepthTrust(NamedTuple):
+    """How much the aligned depth of views is trusted, by its error at the sparse points.
+
+    Attributes:
+        weight: Factor of the terms of depth, in [0, 1]; 0 = the depth is not used. See ``LossConfig.depth_tolerance``.
+        margin: Relative error of the static depth that is not penalized. See ``LossConfig.depth_margin``.
+    """
+
+    weight: Float[Tensor, "*T"]
+    margin: Float[Tensor, "*T"]
+
+
+class DepthAlignment(NamedTuple):
+    """Alignment of each view's inverse depth to the sparse points.
+
+    Attributes:
+        alignments: [T, 2] scale and offset; NaN where the points do not determine them.
+        errors: [T, 2] of aligned depth and of a constant depth; see ``depth_alignment.relative_errors``.
+        plain_errors: [T] of aligned depth without the smooth factor.
+    """
+
+    alignments: Float[Tensor, "T 2"]
+    errors: Float[Tensor, "T 2"]
+    plain_errors: Float[Tensor, " T"]
+
+    def trust(self, loss: LossConfig) -> DepthTrust:
+        """How much each view's depth is trusted; views with too few points have the median error of the others."""
+        errors = self.errors[:, 0]
+        errors = torch.where(errors.isfinite(), errors, depth_alignment.typical_error(errors))
+        weight = torch.ones_like(errors)
+        if loss.depth_tolerance:
+            refused = depth_alignment.is_unusable(self.errors)
+            weight = torch.where(refused, 0.0, 1.0 / (1.0 + (errors / loss.depth_tolerance) ** 2))
+        return DepthTrust(weight, loss.depth_margin * errors)
+
+
+def require_no_depth(capture: Capture, views: Views) -> None:
+    """Raises ValueError if a training view has depth: a capture is to be read without where the config is without."""
+    for name, view in zip(capture.train, views, strict=True):
+        if bool(view.inverse_depth.isfinite().any()):
+            raise ValueError(
+                f"{capture.name}: frame {name} was read with depth, but the config is without (depth=False); open the "
+                "capture with open_capture(config)"
+            )
+
+
+@torch.no_grad()
+def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> DepthAlignment:
+    """Aligns each view's inverse depth to the sparse points; metric depth stays as it is.
+
+    Args:
+        capture: The capture, with the points.
+        views: Its training views.
+        smooth: Whether to change the views' depth by a smooth factor as well, where that brings it nearer to points
+            that were held out.
+    """
+    smooth = smooth and not capture.metric_depth
+    alignments = torch.full((len(views), 2), torch.nan, dtype=torch.float32, device=views.device)
+    errors = torch.full((len(views), 2), torch.inf, dtype=torch.float32, device=views.device)
+    plain = errors[:, 0].clone()
+    points = capture.points.to(views.device)
+    for batch in _batches(views, len(points)):
+        samples = []
+        for view in views.each(batch):
+            samples.append(depth_alignment.sample_points(view.inverse_depth, view.static_mask, view.camera, points))
+        alignments[batch] = depth_alignment.align_to_points(samples, capture.metric_depth)
+        for index, part in zip(batch, samples, strict=True):
+            errors[index] = depth_alignment.relative_errors(part, alignments[index])
+            plain[index] = errors[index, 0]
+            if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
+                factor, error = depth_alignment.smooth_factor(part, alignments[index])
+                if error < errors[index, 0]:
+                    views.set_depth_factor(index, alignments[index], factor)
+                    errors[index, 0] = error
+    return DepthAlignment(alignments, errors, plain)
+
+
+@torch.no_grad()
+def align_to_rendering(
+    alignments: Float[Tensor, "T 2"],
+    views: Views,
+    scene: SplitScene,
+    sh_degree: int,
+    settings: RenderSettings = DEFAULTS,
+) -> Float[Tensor, "T 2"]:
+    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
+    splats = scene.static_splats(sh_degree)
+    settings = replace(settings, depth=True)
+    found = []
+    for batch in _batches(views, views.num_pixels // len(views)):
+        samples = []
+        for view in views.each(batch):
+            layer = render(splats, view.camera, settings=settings).joint
+            assert layer.depth is not None
+            sources = view.inverse_depth, view.static_mask, layer.depth, layer.alpha
+            samples.append(depth_alignment.sample_rendering(*sources))
+        found.append(depth_alignment.fit_scale_offset(samples))
+    aligned = torch.cat(found)
+    return torch.where(aligned.isfinite(), aligned, alignments)
+
+
+def _batches(views: Views, samples_per_view: int) -> list[list[int]]:
+    """Indices of all views, divided into those that are fitted at once."""
+    most = MAX_SAMPLES_ON_GPU if views.device.type == "cuda" else MAX_SAMPLES_ON_CPU
+    indices = torch.arange(len(views)).split(max(1, most // max(1, samples_per_view)))
+    return [batch.tolist() for batch in indices]

@@ -1,0 +1,124 @@
+"""The Gaussians that training starts from, of both branches."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.data.sampling import evenly_spaced
+from warpgs.model.gaussians import SH_C0, Gaussians
+from warpgs.model.mlp_deformation import MlpDeformation
+from warpgs.model.scene import SplitScene
+from warpgs.model.spline_deformation import SplineDeformation
+from warpgs.views.views import Views
+
+from .dynamic_points import MAX_SCALE, gaussians_in_box, is_depth_known, unproject_pixels
+from .motion_fit import MAX_POINTS, fit_motion
+from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .tracked_start import start_from_tracks
+from .tracks import find_tracks
+
+MAX_COLOR_VIEWS = 12
+"""Maximum number of training views that tell the colours of points without colours."""
+
+RESOLUTION = 0.25
+"""Distance of points, in pixels at the capture's median depth, below which clouds of several scans or models show one
+place. A Gaussian as small as the error between the scans would be culled and pruned."""
+
+
+def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
+    """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
+
+    If everything is assumed to be dynamic, there are no static Gaussians either.
+    """
+    center, half_size = scene_box(capture.points)
+    degree = config.model.sh_degree
+    static = Gaussians.empty(0, degree)
+    if capture.assumption != "dynamic":
+        static = _gaussians_at_points(config, capture, generator)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
+    for module in scene.deformation.modules():
+        if isinstance(module, MlpDeformation):
+            module.units[:3] = config.length_unit(capture.view_size)
+    return scene
+
+
+def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
+    """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
+    points, colors = _colored_points(config, capture, generator)
+    focal = torch.stack([capture.cameras[name].focal for name in capture.train]).median()
+    resolution = RESOLUTION * capture.median_depth / float(focal)
+    return gaussians_at(points, colors, config.model, resolution=resolution)
+
+
+def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """A random subset of the capture's points with colours in [0, 1]; see ``model.point_colors``."""
+    points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
+    if len(points) == 0:
+        points, colors = random_points(points, max_count, generator), None
+    chosen = subsample(points, max_count, generator)
+    points = points[chosen]
+    if config.model.point_colors == "grey":
+        return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, dtype=torch.float32, generator=generator)
+    if colors is not None:
+        return points, colors[chosen].float() / 255.0
+    views = []
+    for name in evenly_spaced(capture.train, MAX_COLOR_VIEWS):
+        frame = capture.frame(name)
+        mask = frame.static_mask
+        if mask is None or capture.assumption == "dynamic":
+            mask = torch.ones(frame.image.shape[:2], dtype=torch.bool)
+        views.append((frame.camera, frame.image, mask))
+    return points, color_points(points, views)
+
+
+def fits_motion(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
+    """Whether the deformation is fitted to points before stage I: where masks and depth show what moves."""
+    return config.schedule.fit_motion > 0 and capture.assumption == "masks" and is_depth_known(views, alignments)
+
+
+@torch.no_grad()
+def dynamic_gaussians(
+    config: TrainConfig,
+    capture: Capture,
+    views: Views,
+    alignments: Float[Tensor, "T 2"],
+    deformation: nn.Module,
+    generator: torch.Generator,
+    is_stopped: Callable[[], bool] = bool,
+) -> Gaussians | None:
+    """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
+
+    Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
+    points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
+    points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The
+    deformation is fitted unless ``schedule.fit_motion`` is 0, as a protocol's config has it where ``fits_motion`` is
+    false. The result is None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
+    """
+    max_count, degree = config.model.dynamic_points, config.model.sh_degree
+    if isinstance(deformation, SplineDeformation):
+        return start_from_tracks(find_tracks(capture), deformation, config, capture.view_size, generator)
+    if capture.assumption == "dynamic" and len(capture.points):
+        return _gaussians_at_points(config, capture, generator)
+    count = max(max_count, MAX_POINTS) if config.schedule.fit_motion else max_count
+    found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
+    if found is None:
+        return Gaussians.empty(0, degree)
+    if config.schedule.fit_motion and found.depth_known:
+        times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
+        fitted = fit_motion(deformation, found, times, capture.view_size, config, generator, is_stopped)
+        if fitted is None:
+            return None
+        found = fitted
+    found = found.chosen(subsample(found.positions, max_count, generator))
+    is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
+    if is_uniform or len(found.positions) == 0:
+        return gaussians_in_box(capture, max_count, config, generator)
+    largest = math.inf if found.depth_known else MAX_SCALE * capture.view_size
+    return gaussians_at(found.positions, found.colors, config.model, largest)
