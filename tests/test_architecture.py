@@ -1,6 +1,7 @@
 """Rules of the architecture, checked on the sources."""
 
 import ast
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import jaxtyping
@@ -84,6 +85,45 @@ def test_a_module_imports_only_from_its_layer_and_lower_ones(path):
             found = layer(parts)
             assert found is not None, name
             assert found <= own, name
+
+
+MODULES = {".".join(module_name(path)).removesuffix(".__init__"): path for path in FILES}
+
+
+def imported_modules(path: Path) -> set[str]:
+    """The modules of the package that a file imports, also inside functions."""
+    found = set()
+    for name in imports(path):
+        while name and name not in MODULES:
+            name = name.rpartition(".")[0]
+        found.add(name)
+    return found - {""}
+
+
+def circles(graph: Mapping[str, Collection[str]]) -> list[list[str]]:
+    """The groups of nodes that reach each other."""
+    reached = {start: reachable(graph, start) for start in graph}
+    groups = {tuple(sorted(b for b in reached[a] if a in reached[b])) for a in graph}
+    return sorted(list(group) for group in groups if group)
+
+
+def reachable(graph: Mapping[str, Collection[str]], start: str) -> set[str]:
+    """The nodes at the ends of all paths from a node."""
+    found: set[str] = set()
+    ahead = [*graph[start]]
+    while ahead:
+        if (node := ahead.pop()) not in found:
+            found.add(node)
+            ahead += graph[node]
+    return found
+
+
+def test_circles_are_found_and_chains_are_none():
+    assert circles({"a": ["b"], "b": ["c"], "c": ["a", "d"], "d": [], "e": ["a"]}) == [["a", "b", "c"]]
+
+
+def test_no_modules_import_each_other_in_a_circle_also_not_inside_functions():
+    assert circles({name: imported_modules(path) for name, path in MODULES.items()}) == []
 
 
 @PATHS

@@ -16,33 +16,57 @@ class Command(NamedTuple):
     """A command.
 
     Attributes:
-        home: Its dataclass of options, as module:class; its method ``run`` does what the options ask for. The class is
-            imported when the command is used, so that ``warpgs --help`` is fast.
+        options: Its dataclass of options, as module:class. Its module imports nothing heavy, so that --help is fast.
+        function: Does what the options ask for, as module:function; imported when the command line is right.
         summary: What it does, for the list of commands.
     """
 
-    home: str
+    options: str
+    function: str
     summary: str
 
     def load(self) -> Any:
         """The dataclass of options."""
-        module, name = self.home.split(":")
-        return getattr(importlib.import_module(module, __package__), name)
+        return _imported(self.options)
+
+    def run(self, options: Any) -> object:
+        """Does what the options ask for; may return the exit code."""
+        with ending_at_once():
+            function = _imported(self.function)
+        return function(options)
+
+
+def _imported(name: str) -> Any:
+    """A class or function, by module:name."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module, __package__), attribute)
 
 
 COMMANDS = {
-    "sample": Command(".prepare.command:Sample", "write a short video to try prepare on"),
-    "prepare": Command(".prepare.command:Prepare", "make a capture from a video or a folder of frames"),
-    "import": Command(".captures.command:Import", "copy a capture of any layout into the layout of prepare"),
-    "check": Command(".captures.command:Check", "check whether a capture is fit to train on"),
-    "train": Command(".config:TrainConfig", "train on a capture or on the built-in scene"),
-    "sweep": Command(".sweep.command:Sweep", "train many runs and make one table"),
-    "eval": Command(".evaluation.command:Eval", "evaluate a run: PSNR, SSIM, LPIPS, smoothness, FPS"),
-    "view": Command(".viewer.command:View", "look around in a run in the browser"),
-    "render": Command(".video.command:Render", "render a run to images and a video"),
-    "export": Command(".export.command:Export", "export a run for other programs"),
-    "report": Command(".report.command:Report", "write one HTML file about runs"),
-    "bench": Command(".bench.command:Bench", "measure rendering times"),
+    "sample": Command(
+        ".prepare.options:Sample", ".prepare.command:run_sample", "write a short video to try prepare on"
+    ),
+    "prepare": Command(
+        ".prepare.options:Prepare", ".prepare.command:run_prepare", "make a capture from a video or a folder of frames"
+    ),
+    "import": Command(
+        ".captures.options:Import",
+        ".captures.command:run_import",
+        "copy a capture of any layout into the layout of prepare",
+    ),
+    "check": Command(
+        ".captures.options:Check", ".captures.command:run_check", "check whether a capture is fit to train on"
+    ),
+    "train": Command(".config:TrainConfig", ".training.command:run", "train on a capture or on the built-in scene"),
+    "sweep": Command(".sweep.options:Sweep", ".sweep.command:run", "train many runs and make one table"),
+    "eval": Command(
+        ".evaluation.options:Eval", ".evaluation.command:run", "evaluate a run: PSNR, SSIM, LPIPS, smoothness, FPS"
+    ),
+    "view": Command(".viewer.options:View", ".viewer.command:run", "look around in a run in the browser"),
+    "render": Command(".video.options:Render", ".video.command:run", "render a run to images and a video"),
+    "export": Command(".export.options:Export", ".export.command:run", "export a run for other programs"),
+    "report": Command(".report.options:Report", ".report.command:run", "write one HTML file about runs"),
+    "bench": Command(".bench.options:Bench", ".bench.command:run", "measure rendering times"),
 }
 """All commands, in the order in which they are used."""
 
@@ -81,9 +105,10 @@ def _run(name: str, arguments: Sequence[str], prog: str) -> object:
     with ending_at_once():
         from .command_line.parsing import parse  # imports tyro
 
-        command = COMMANDS[name].load()
+        command = COMMANDS[name]
+        options = command.load()
     plain = ["--help" if argument == "--help-all" else argument for argument in arguments]  # help shows all options
-    return parse(command, plain, prog).run()
+    return command.run(parse(options, plain, prog))
 
 
 @program

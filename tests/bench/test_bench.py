@@ -10,8 +10,8 @@ import torch
 from tests import tiny
 from tests.errors import error_line
 from warpgs.bench import measure
-from warpgs.bench.command import Bench
 from warpgs.bench.measure import STAGES, time_in_turn
+from warpgs.bench.options import Bench
 from warpgs.bench.run_bench import bench
 from warpgs.bench.scenes import SCENES, Scene, in_disc, random_splats
 from warpgs.bench.training import measure_steps, plain_phase, random_scene

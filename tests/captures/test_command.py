@@ -8,7 +8,8 @@ import pytest
 import tyro
 
 from tests.prepare import boards
-from warpgs.captures.command import Check
+from warpgs.captures.command import run_check
+from warpgs.captures.options import Check
 
 HEAVY = ("torch", "numpy", "cv2", "warp", "scipy")
 
@@ -19,7 +20,7 @@ def root(tmp_path_factory):
 
 
 def check(*arguments):
-    tyro.cli(Check, args=[str(argument) for argument in arguments]).run()
+    run_check(tyro.cli(Check, args=[str(argument) for argument in arguments]))
 
 
 def test_a_fit_capture_is_reported_without_an_exit(root, capsys):
@@ -48,8 +49,8 @@ def test_the_dataset_and_factor_given_are_used(root, capsys):
     assert "read as hypernerf" in capsys.readouterr().out
 
 
-def test_importing_the_command_imports_no_heavy_package():
+def test_importing_the_options_imports_no_heavy_package():
     """Otherwise ``warpgs --help`` would be slow."""
-    code = f"import warpgs.captures.command, sys; print([name for name in {HEAVY} if name in sys.modules])"
+    code = f"import warpgs.captures.options, sys; print([name for name in {HEAVY} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

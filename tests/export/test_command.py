@@ -17,10 +17,10 @@ from warpgs.cli import main
 from warpgs.data.capture import Capture
 from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
-from warpgs.export.command import Export
 from warpgs.export.compressed import read_compressed
 from warpgs.export.export_run import export_run
 from warpgs.export.job import Writer
+from warpgs.export.options import Export
 from warpgs.export.standard import read_standard
 from warpgs.export.start_camera import start_view
 from warpgs.export.writers import WRITERS

@@ -8,8 +8,8 @@ import pytest
 from tests.export import scenes
 from warpgs.export import fourdgs, usd
 from warpgs.export.cloud import Cloud, logit
-from warpgs.export.command import Export
 from warpgs.export.job import Job
+from warpgs.export.options import Export
 from warpgs.export.orientation import AXES, rotated, upright
 from warpgs.model.gaussians import SH_C0
 from warpgs.runs.run import Run

@@ -20,11 +20,12 @@ from warpgs.cli import main
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.evaluation import evaluate_run
+from warpgs.report import command
 from warpgs.report.charts import HEIGHT, MAX_POINTS, MAX_VALUES, WIDTH, Series, chart
-from warpgs.report.command import Report
 from warpgs.report.evaluated_run import read_runs
 from warpgs.report.image_strips import MAX_WIDTH, data_uri, saved_strips, saved_views
 from warpgs.report.metrics_table import config_rows, formatted
+from warpgs.report.options import Report
 from warpgs.report.page import Gallery, page
 from warpgs.report.write_report import extremes
 
@@ -77,7 +78,7 @@ class Page(html.parser.HTMLParser):
 
 def report(tmp_path, *folders, **options):
     out = tmp_path / "report.html"
-    Report(folders, out=out, device="cpu", **options).run()
+    command.run(Report(folders, out=out, device="cpu", **options))
     return Page(out.read_text())
 
 

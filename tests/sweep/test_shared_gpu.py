@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from warpgs.sweep import shared_gpu
-from warpgs.sweep.command import Sweep
+from warpgs.sweep.options import Sweep
 from warpgs.sweep.run_sweep import _shares_local_gpus
 from warpgs.sweep.shared_gpu import CONTROL, PIPES, shared_gpus
 

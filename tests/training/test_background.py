@@ -27,7 +27,7 @@ from warpgs.training.command import parse
 from warpgs.training.train import make_trainer, train
 from warpgs.training.trainer import Trainer
 from warpgs.video import frames
-from warpgs.video.command import Render
+from warpgs.video.options import Render
 from warpgs.views.views import Views
 
 WHITE = (1.0, 1.0, 1.0)

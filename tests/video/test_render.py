@@ -18,9 +18,9 @@ from warpgs.cli import main
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
-from warpgs.video import frames, render_run, writer
+from warpgs.video import command, frames, render_run, writer
 from warpgs.video.camera_paths import training_path
-from warpgs.video.command import Render
+from warpgs.video.options import Render
 from warpgs.visualize.images import to_bytes
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -348,7 +348,7 @@ def test_too_little_memory_ends_a_command_with_one_line_of_advice(run, monkeypat
     def fail(_):
         raise MemoryError("no")
 
-    monkeypatch.setattr(render_run, "render_run", fail)
+    monkeypatch.setattr(command, "render_run", fail)
     assert main(["render", str(run)]) == 2
     message = capsys.readouterr().err
     assert message.startswith("warpgs render: out of memory (")

@@ -20,8 +20,8 @@ from tests.errors import error_line
 from tests.viewer.watched import until
 from warpgs.cli import main
 from warpgs.command_line.version import install_command
-from warpgs.viewer import serve, server
-from warpgs.viewer.command import View
+from warpgs.viewer import command, serve, server
+from warpgs.viewer.options import View
 from warpgs.viewer.renderer import Renderer
 from warpgs.viewer.serve import training_cameras
 from warpgs.viewer.server import Viewer, check_address
@@ -208,7 +208,7 @@ def test_a_viewer_waits_for_a_training_that_has_not_created_its_run(run, tmp_pat
     monkeypatch.setattr(serve, "_wait", lambda: None)
     monkeypatch.setattr(serve, "lower_priority", lambda _: None)
     monkeypatch.setattr(serve.time, "sleep", create)
-    View(tmp_path / "later", port=0, while_training=True, device="cpu").run()
+    command.run(View(tmp_path / "later", port=0, while_training=True, device="cpu"))
     assert f"waiting for a training to create {tmp_path}/later (press Ctrl-C to stop)" in capsys.readouterr().out
     assert len(waited) == 2
 
@@ -221,7 +221,7 @@ def test_a_viewer_of_a_run_in_training_has_a_low_priority(run, monkeypatch):
     given = []
     monkeypatch.setattr(serve, "_wait", lambda: None)
     monkeypatch.setattr(serve, "lower_priority", given.append)
-    View(run, port=0, while_training=True, device="cpu").run()
+    command.run(View(run, port=0, while_training=True, device="cpu"))
     assert given == [serve.NICENESS]
 
 

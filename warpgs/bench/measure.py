@@ -18,7 +18,7 @@ from warpgs.ops.tiles import bin_splats
 from warpgs.runtime.graphs import capture
 from warpgs.runtime.profiling import KernelTime, profile
 
-from .command import Bench
+from .options import Bench
 from .scenes import SEED, Scene
 from .timing import milliseconds
 from .workloads import OTHERS, Workload, graphed, make_workload, parameter_names

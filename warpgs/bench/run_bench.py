@@ -10,8 +10,8 @@ import torch
 from warpgs.files import write_json
 from warpgs.ops.tiles import reset_budgets
 
-from .command import Bench
 from .measure import Measurements, measure
+from .options import Bench
 from .report import machine, print_machine, print_result, trace_events
 from .scenes import SCENES, Scene
 from .training import bench_fps, bench_steps

@@ -1,68 +1,36 @@
 """The commands ``warpgs check`` and ``warpgs import``."""
 
 import json
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
 
 from warpgs.command_line.screen import show
-from warpgs.errors import ending_at_once
+
+from .check import check_capture
+from .import_capture import import_capture
+from .options import Check, Import
 
 
-@dataclass(frozen=True)
-class Check:
-    """Checks whether a capture is fit to train on; exit code 1 if it is not."""
+def run_check(options: Check) -> None:
+    """Prints the report.
 
-    capture: Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional]
-    """Folder of the capture, or a built-in one (builtin:studio)."""
-    dataset: str | None = None
-    """Layout: iphone, nerfds, hypernerf, nerfstudio, blender, llff, colmap, vipe or megasam; recognized from the files
-    by default."""
-    factor: int | None = None
-    """Downscaling factor of the images; the dataset's usual one by default."""
-    assume: Literal["masks", "static", "dynamic"] = "masks"
-    """As in training: take what the masks say, or everything, as static or dynamic."""
-    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
-    """Print JSON."""
-
-    def run(self) -> None:
-        """Prints the report.
-
-        Raises:
-            SystemExit: With code 1 if the capture is not fit to train on.
-        """
-        with ending_at_once():
-            from .check import check_capture
-        report = check_capture(self.capture, self.dataset, self.factor, self.assume)
-        if self.as_json:
-            print(json.dumps(report.plain(), indent=2))
-        else:
-            show(report)
-        if not report.is_fit:
-            raise SystemExit(1)
+    Raises:
+        SystemExit: With code 1 if the capture is not fit to train on.
+    """
+    report = check_capture(options.capture, options.dataset, options.factor, options.assume)
+    if options.as_json:
+        print(json.dumps(report.plain(), indent=2))
+    else:
+        show(report)
+    if not report.is_fit:
+        raise SystemExit(1)
 
 
-@dataclass(frozen=True)
-class Import:
-    """Copies a capture of any layout into that of warpgs (docs/capture-format.md), undistorted and in scene units."""
-
-    source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
-    """Folder of a capture: COLMAP, nerfstudio, D-NeRF, LLFF, NVIDIA, ViPE, MegaSaM, NeRF-DS, HyperNeRF or iPhone."""
-    capture: Annotated[Path, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional]
-    """Folder to write; it must not exist or be empty."""
-    dataset: str | None = None
-    """Layout of the source; recognized from its files by default."""
-    factor: int | None = None
-    """Downscaling factor of the images; that of the layout by default."""
-    holdout: int | None = None
-    """Keep every N-th frame for evaluation, 0 for none; by default those that the source keeps."""
-    quiet: bool = False
-    """Print errors only."""
-
-    def run(self) -> None:
-        with ending_at_once():
-            from .import_capture import import_capture
-        log = None if self.quiet else show
-        import_capture(self.source, self.capture, self.dataset, factor=self.factor, holdout=self.holdout, log=log)
+def run_import(options: Import) -> None:
+    """Copies the capture; raises as ``import_capture``."""
+    import_capture(
+        options.source,
+        options.capture,
+        options.dataset,
+        factor=options.factor,
+        holdout=options.holdout,
+        log=None if options.quiet else show,
+    )

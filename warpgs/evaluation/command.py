@@ -1,44 +1,15 @@
 """``warpgs eval``."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
-
-from warpgs.command_line.parsing import RunFolder
 from warpgs.command_line.screen import show
-from warpgs.config import NetName
-from warpgs.errors import ending_at_once
+from warpgs.runs.run import Run
+
+from .evaluate_run import evaluate_run
+from .options import Eval
 
 
-@dataclass(frozen=True)
-class Eval:
-    """Evaluates a run's newest checkpoint; writes metrics.json, views.csv, images and a video into its folder.
-
-    If training corrected camera poses (preset best), held-out cameras are aligned to the scene by their images first.
-    """
-
-    run_folder: RunFolder
-    """Run folder."""
-    lpips: Path | None = None
-    """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
-    lpips_net: NetName | None = None
-    """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
-    as_taken: bool = False
-    """Compare frames as they were taken, with the distortion of their lens; by default they are undistorted first."""
-    data: Path | None = None
-    """Current folder of the capture, if it was moved."""
-    device: Literal["cuda", "cpu"] | None = None
-    """Device to render on; by default CUDA if there is a GPU."""
-    quiet: bool = False
-    """Hide progress."""
-
-    def run(self) -> None:
-        """Evaluates and prints a summary; raises as ``evaluate_run``."""
-        with ending_at_once():
-            from warpgs.runs.run import Run
-
-            from .evaluate_run import evaluate_run
-        weights, capture = (self.lpips, self.lpips_net), None
-        if self.data is not None:
-            capture = Run.open(self.run_folder, self.device, self.data).open_capture(self.quiet)
-        show(evaluate_run(self.run_folder, capture, weights, self.device, self.quiet, self.as_taken))
+def run(options: Eval) -> None:
+    """Evaluates and prints a summary; raises as ``evaluate_run``."""
+    weights, capture = (options.lpips, options.lpips_net), None
+    if options.data is not None:
+        capture = Run.open(options.run_folder, options.device, options.data).open_capture(options.quiet)
+    show(evaluate_run(options.run_folder, capture, weights, options.device, options.quiet, options.as_taken))

@@ -1,56 +1,11 @@
 """``warpgs export``."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
-
-from warpgs.command_line.parsing import RunFolder
 from warpgs.command_line.screen import show
-from warpgs.errors import ending_at_once
+
+from .export_run import export_run
+from .options import Export
 
 
-@dataclass(frozen=True)
-class Export:
-    """Exports the newest checkpoint of a run for other programs, at one time or moving."""
-
-    run_folder: RunFolder
-    """Run folder."""
-    format: str = "ply"
-    """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.
-    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). usd: OpenUSD with
-    time samples. 4dgs: container of moving scenes. html: one web page that plays the scene offline."""
-    out: Path | None = None
-    """Output folder, or output file if this ends as files of the format do (scene.ply); RUN/export by default."""
-    time: float | None = None
-    """Time of a file, in [0, 1]; 0 by default."""
-    frames: int | None = None
-    """Write this many files, one per time, at times evenly spaced over [0, 1]."""
-    layers: Literal["all", "static", "dynamic", "apart"] = "all"
-    """Gaussians in files of one time: all, static or dynamic ones, or both apart in two files."""
-    up: Literal["capture", "x", "y", "z", "-x", "-y", "-z", "scene"] = "capture"
-    """What is up in the files: the capture's upward direction, estimated from its training cameras, or an axis of the
-    scene; scene keeps the scene's coordinates, in which the capture's cameras fit."""
-    keys: int | None = None
-    """Number of key times of html, usd and 4dgs, between which programs interpolate; 30 by default."""
-    seconds: float | None = None
-    """Duration of the scene in html, usd and 4dgs [s]; 5 by default."""
-    max_gaussians: int | None = None
-    """Export at most this many Gaussians: those that the training cameras see most of."""
-    max_megabytes: float | None = None
-    """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
-    precision: float | None = None
-    """Divide the quantisation steps of a page by this; 1 by default, for about 40 dB against the scene itself."""
-    data: Path | None = None
-    """Current folder of the capture, if it was moved; a page starts at one of its cameras."""
-    quiet: bool = False
-    """Hide progress bars."""
-
-    def is_out_file(self, suffix: str) -> bool:
-        """Whether ``out`` is a file that ends with this suffix, not a folder."""
-        return self.out is not None and self.out.suffix.lower() == suffix != "" and not self.out.is_dir()
-
-    def run(self) -> None:
-        """Exports and prints a summary; raises as ``export_run``."""
-        with ending_at_once():
-            from .export_run import export_run
-        show(export_run(self))
+def run(options: Export) -> None:
+    """Exports and prints a summary; raises as ``export_run``."""
+    show(export_run(options))

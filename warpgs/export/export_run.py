@@ -9,8 +9,8 @@ from warpgs.runs.run import Run
 from warpgs.video.camera_paths import MAX_FRAMES
 
 from .clouds import Clouds
-from .command import Export
 from .job import Job
+from .options import Export
 from .page import MAX_KEYS
 from .start_camera import sample_cameras
 from .writers import WRITERS

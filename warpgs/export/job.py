@@ -15,7 +15,7 @@ from warpgs.video.camera_paths import UP
 
 from . import orientation
 from .clouds import Clouds
-from .command import Export
+from .options import Export
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Options of ``warpgs prepare``. Imports nothing heavy, so that the command line starts quickly."""
+"""Options of ``warpgs prepare`` and ``warpgs sample``."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,3 +61,34 @@ class Options:
     def depth_method(self) -> str:
         """The name in ``depth.DEPTHS``."""
         return self.depth or ("flow" if self.camera == "moving" else "none")
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Makes a capture in the NeRF-DS layout from a video or a folder of frames in temporal order.
+
+    After an interruption or an error, the same command continues with the first unfinished step. With ``--add``, adds
+    what a capture lacks, with its own cameras: ``warpgs prepare CAPTURE --add masks,depth,points``.
+    """
+
+    source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
+    """Video, or folder of PNG or JPEG frames of one size; with --add the capture."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional] = None
+    """Folder to write the capture to; not with --add."""
+    add: str | None = None
+    """Add these to a capture that lacks them: masks, depth and points, separated by commas."""
+    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
+    force: bool = False
+    """Replace an existing capture of prepare; other files are kept."""
+    quiet: bool = False
+    """Print errors only."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Writes a short ray-traced video, as a hand-held camera records it, to try ``warpgs prepare`` on."""
+
+    video: Annotated[Path, tyro.conf.arg(metavar="VIDEO"), tyro.conf.Positional]
+    """File to write, such as sample.mp4."""
+    quiet: bool = False
+    """Print errors only."""

@@ -1,35 +1,11 @@
 """``warpgs report``."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
-
 from warpgs.command_line.screen import show
-from warpgs.errors import ending_at_once
+
+from .options import Report
+from .write_report import write_report
 
 
-@dataclass(frozen=True)
-class Report:
-    """Writes one HTML file about evaluated runs: metrics, curves, worst and best views, timing.
-
-    The file contains everything that it shows and loads nothing.
-    """
-
-    run_folders: Annotated[tuple[Path, ...], tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
-    """Run folders, shown side by side."""
-    out: Path | None = None
-    """Output file; report.html by default, in the run folder if there is only one."""
-    views: int = 3
-    """Number of worst views and of best views to show."""
-    device: Literal["cuda", "cpu"] | None = None
-    """Device to render on; CUDA by default if there is a GPU."""
-    quiet: bool = False
-    """Hide progress bars."""
-
-    def run(self) -> None:
-        """Writes the report and prints a summary; raises as ``write_report``."""
-        with ending_at_once():
-            from .write_report import write_report
-        show(write_report(self))
+def run(options: Report) -> None:
+    """Writes the report and prints a summary; raises as ``write_report``."""
+    show(write_report(options))

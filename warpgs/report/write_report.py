@@ -9,9 +9,9 @@ from warpgs.command_line.version import version
 from warpgs.errors import one_line
 from warpgs.files import write_text
 
-from .command import Report
 from .evaluated_run import EvaluatedRun, groups, read_runs
 from .image_strips import Strips, rendered_strips, saved_strips, saved_views
+from .options import Report
 from .page import Gallery, page
 
 

@@ -25,10 +25,11 @@ def main(arguments: Sequence[str], parent: int) -> int:
 
         return train(rest, "warpgs train")
     from warpgs.command_line.parsing import parse
-    from warpgs.evaluation.command import Eval
+    from warpgs.evaluation.command import run as evaluate
+    from warpgs.evaluation.options import Eval
 
     prog = "warpgs eval"
-    return run_command(lambda: parse(Eval, rest, prog).run(), prog)
+    return run_command(lambda: evaluate(parse(Eval, rest, prog)), prog)
 
 
 if __name__ == "__main__":

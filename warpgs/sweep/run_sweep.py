@@ -29,7 +29,7 @@ from .cells import (
     plan_cells,
     trained_captures,
 )
-from .command import Sweep
+from .options import Sweep
 from .peers import read_peers
 from .ray_pool import RayPool
 from .results import show_tables, write_report, write_tables

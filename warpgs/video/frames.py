@@ -17,7 +17,7 @@ from warpgs.visualize.depth import depth_bounds, depth_image
 from warpgs.visualize.images import averaged, to_bytes
 
 from . import camera_paths
-from .command import Render
+from .options import Render
 
 NUM_SAMPLES = 8
 """Number of cameras that decide the range of depths of a path."""

@@ -16,9 +16,9 @@ from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
 from . import camera_paths, keyframes, writer
-from .command import Render
 from .encodings import ENCODINGS
 from .frames import COLORED, render_frames
+from .options import Render
 
 FRAMES = 120
 """Default number of frames along a path."""

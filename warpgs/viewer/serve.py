@@ -14,7 +14,7 @@ from warpgs.errors import one_line
 from warpgs.posix import lower_priority
 from warpgs.runs import config_file
 
-from .command import View
+from .options import View
 from .source import POLL_SECONDS, Source, open_source
 from .training_cameras import TrainingCameras
 

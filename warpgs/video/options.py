@@ -1,0 +1,78 @@
+"""Options of ``warpgs render``."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from warpgs.command_line.parsing import RunFolder
+
+PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
+
+MAX_SIDE = 16_384
+"""Maximum width and height of ``--size`` [px]."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Renders a run's newest checkpoint to images and a video."""
+
+    run_folder: RunFolder
+    """Run folder."""
+    path: PathName | None = None
+    """Camera path: the evaluation views (default); a fixed camera over time; the training camera's path at one fixed
+    time; the same path over time; a spiral around the middle view; bullet time, which stops on the same path."""
+    keyframes: Path | None = None
+    """JSON file of keyframes to follow instead (docs/viewing.md)."""
+    out: Path | None = None
+    """Output folder; RUN/render/PATH by default."""
+    view: str | None = None
+    """Id of the start view of fixed, spiral and bullet; by default the middle evaluation view. Without it, bullet
+    follows the training camera, unless that jumps from frame to frame."""
+    time: float | None = None
+    """Time in [0, 1] of frozen and spiral, and at which bullet stops; default 0.5, but all times for spiral."""
+    frames: int | None = None
+    """Frames along a path; 120 by default."""
+    rate: float | None = None
+    """Frames per second of the video; 24 by default."""
+    write: Literal["both", "png", "mp4", "gif", "webp"] = "both"
+    """Numbered PNG files, a video (MP4, GIF or WebP), or both PNG files and MP4."""
+    layers: Literal["joint", "static", "dynamic", "all", "depth", "alpha"] = "joint"
+    """What to show: one of the layers, all three side by side, depth in colours (red is near, black is empty), or
+    opacity in grey."""
+    transparent: bool = False
+    """Leave pixels transparent where the layer is; for PNG, GIF and WebP."""
+    truth: bool = False
+    """For views: show the ground truth beside the rendered image."""
+    scale: float = 1.0
+    """Image size as a factor of the capture's."""
+    size: Annotated[str | None, tyro.conf.arg(metavar="WIDTHxHEIGHT")] = None
+    """Image size instead, such as 1080x1920; the view is cropped to it, not stretched [px]."""
+    supersample: int = 1
+    """Render at this multiple of the size, then average down."""
+    data: Path | None = None
+    """Current folder of the capture, if it was moved."""
+    device: Literal["cuda", "cpu"] | None = None
+    """Device to render on; CUDA by default if there is a GPU."""
+    quiet: bool = False
+    """Hide progress."""
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) of ``size`` [px].
+
+        Raises:
+            ValueError: If it does not have the form WIDTHxHEIGHT, or is out of range.
+        """
+        numbers = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", self.size or "")
+        width, height = (int(number) for number in numbers.groups()) if numbers else (0, 0)
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise ValueError(f"--size must be WIDTHxHEIGHT with sides of 1 to {MAX_SIDE:,} pixels, got {self.size!r}")
+        return width, height
+
+    @property
+    def path_name(self) -> str:
+        """The path, or "keyframes"."""
+        return "keyframes" if self.keyframes is not None else self.path or "views"
