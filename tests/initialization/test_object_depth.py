@@ -18,7 +18,9 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.initialization import object_depth as module
 from warpgs.initialization import objects
-from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth, without_rims
+from warpgs.initialization.averaged_depth import without_rims
+from warpgs.initialization.depth_by_size import depth_by_size
+from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth
 from warpgs.initialization.objects import MIN_VISIBLE, find_objects
 from warpgs.training.train import _describe
 from warpgs.training.trainer import Trainer
@@ -80,7 +82,7 @@ def changed(capture: Capture, change: Callable[[Frame], Frame]) -> Capture:
 
 
 def object_depth(capture: Capture) -> dict[int, torch.Tensor]:
-    return module.object_depth(capture, module.find_all_objects(capture))
+    return depth_by_size(capture, module.find_all_objects(capture))
 
 
 def depths_at(capture: Capture, masks) -> np.ndarray:
@@ -396,7 +398,7 @@ def rim_of(static_mask: torch.Tensor, width: int) -> torch.Tensor:
 @pytest.fixture
 def blurred(monkeypatch) -> Capture:
     """A capture whose depth is half way to the wall in a rim of one pixel, as depth networks blur edges."""
-    monkeypatch.setattr("warpgs.initialization.object_depth.RIM", 2.5 / WIDTH)
+    monkeypatch.setattr("warpgs.initialization.averaged_depth.RIM", 2.5 / WIDTH)
 
     def with_rims(frame: Frame) -> Frame:
         half_way = 0.5 * (frame.inverse_depth + 1.0 / WALL)

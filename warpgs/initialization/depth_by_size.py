@@ -1,0 +1,85 @@
+"""Depth of dynamic objects by their size, in each frame that shows them."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.data.capture import Capture
+from warpgs.data.dynamic_regions import MIN_FRAMES
+
+from .objects import MovingObject
+from .point_cloud import filled
+from .seen_objects import SeenObject, see_objects
+
+SMOOTHING = 0.05
+"""Standard deviation of the time, of all in [0, 1], over which the depth around an object is smoothed."""
+
+
+def depth_by_size(capture: Capture, objects: Sequence[MovingObject]) -> dict[int, Float[Tensor, "h w"]]:
+    """Depth of the objects in a capture's training frames, if it has some that keep their size.
+
+    Args:
+        capture: The capture, with masks and static points.
+        objects: All of its objects.
+
+    Returns:
+        By index of the frame, [h, w] depth in its scaled mask [scene units], NaN elsewhere: that of round objects, or,
+        of objects that are hardly ever whole, of flat ones as far away as the static points around them.
+    """
+    images: dict[int, Tensor] = {}
+    for seen in see_objects(capture, objects):
+        if not seen.item.is_mostly_cut:
+            paint(images, seen, _depths(seen))
+        elif images:  # without any depth, dynamic Gaussians start in front of the points around them
+            paint(images, seen, _depths_around(seen))
+    return images
+
+
+def paint(images: dict[int, Tensor], seen: SeenObject, values: Mapping[int, Float[Tensor, " P"]]) -> None:
+    """Writes values of an object's pixels into images of the scaled masks, where these have none yet.
+
+    Args:
+        images: [h, w] values by index of the frame, NaN where there are none; images that are missing are added.
+        seen: The object.
+        values: Values of its pixels by index of the frame.
+    """
+    for index, found in values.items():
+        shape = seen.views[index].size[::-1]
+        image = images.setdefault(index, torch.full(shape, torch.nan, dtype=torch.float32)).view(-1)
+        pixels = torch.from_numpy(seen.item.pixels[index]).long()
+        image[pixels] = torch.where(image[pixels].isnan(), found, image[pixels])
+
+
+def _depths(seen: SeenObject) -> dict[int, Float[Tensor, " P"]]:
+    """Depth of an object's pixels in each frame that shows it whole or near another one; none if it cannot be told.
+
+    The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
+    it tumbles, the area of a body while it deforms.
+    """
+    choices, views = [], seen.views
+    for sizes, factor in seen.sizes():
+        if math.isnan(factor):
+            return {}
+        found = {index: factor / size for index, size in sizes.items()}
+        path = np.stack([views[index].position(found[index]) for index in seen.item.whole])
+        choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
+    _, depths = min(choices, key=lambda choice: choice[0])
+    return {index: views[index].surface(depth) for index, depth in depths.items()}
+
+
+def _depths_around(seen: SeenObject) -> dict[int, Float[Tensor, " P"]]:
+    """Depth of the static points around an object, smoothed over time, at its pixels by frame; none if unknown."""
+    bounds = {index: seen.bound(index) for index in seen.views}
+    known = [index for index, bound in bounds.items() if math.isfinite(bound)]
+    if len(known) < MIN_FRAMES:
+        return {}
+    times, logs = np.array([seen.views[index].time for index in known]), np.log([bounds[index] for index in known])
+    found = {}
+    for index, view in seen.views.items():
+        weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
+        found[index] = filled(len(seen.item.pixels[index]), math.exp(np.average(logs, weights=weights)))
+    return found

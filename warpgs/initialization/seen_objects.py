@@ -1,0 +1,156 @@
+"""Dynamic objects as training frames see them: their size, and the static points around them."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from operator import attrgetter
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from warpgs.cameras import Camera
+from warpgs.data.capture import Capture
+from warpgs.data.dynamic_regions import scaled_size
+
+from .objects import MovingObject
+from .point_cloud import filled, front_of_ball
+
+AROUND = 0.015
+"""Width of the rim around an object where static points bound its depth, as a fraction of the image's longer side."""
+
+MIN_POINTS = 3
+"""Minimum number of points in that rim."""
+
+NEAREST, TIGHTEST = 0.02, 0.05
+"""Quantile of these points' depths that is the bound in a frame; quantile of the frames' bounds that is the bound of
+the factor. Both tolerate outliers."""
+
+MAX_POINTS = 10_000
+"""Maximum number of static points that are projected into each frame."""
+
+Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
+"""Rows, columns and depths [scene units] of points."""
+
+
+def see_objects(capture: Capture, objects: Sequence[MovingObject]) -> Iterator["SeenObject"]:
+    """The objects as a capture's training frames see them, mostly cut ones last.
+
+    Objects that cannot be told apart are omitted.
+
+    Args:
+        capture: The capture, with masks and static points.
+        objects: All of its objects.
+    """
+    points_of = cache(partial(_static_points, capture))
+    for item in sorted((item for item in objects if not item.is_mixture), key=attrgetter("is_mostly_cut")):
+        views = {k: ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
+        yield SeenObject(item, views, points_of)
+
+
+def _static_points(capture: Capture, index: int) -> Points:
+    """Rows and columns in the scaled mask, and depths, of the static points that a training frame shows."""
+    frame = capture.frame(capture.train[index])
+    assert frame.static_mask is not None
+    row, column, depth, inside = frame.camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
+    shown = inside & frame.static_mask[row, column]
+    width, height = scaled_size(frame.camera)
+    row, column = row[shown] * height // frame.camera.height, column[shown] * width // frame.camera.width
+    return row.int(), column.int(), depth[shown]
+
+
+class Sizes(NamedTuple):
+    """An object's size by one measure.
+
+    Attributes:
+        sizes: By index of the frame, in those that show it whole or next to another one [at depth 1].
+        bound: Largest factor by which depth may be divided by size, by the static points around it; NaN if unknown.
+    """
+
+    sizes: dict[int, float]
+    bound: float
+
+
+class SeenObject(NamedTuple):
+    """An object as training frames see it.
+
+    Attributes:
+        item: The object.
+        views: How each frame sees it, by index of the frame.
+        points_of: Given the index of a frame, the static points that it shows.
+    """
+
+    item: MovingObject
+    views: dict[int, "ObjectView"]
+    points_of: Callable[[int], Points]
+
+    def bound(self, index: int) -> float:
+        """Depth of the static points around it in a frame; NaN if there are too few."""
+        return self.views[index].bound(self.points_of(index))
+
+    def sizes(self) -> list[Sizes]:
+        """Its size by each measure."""
+        bounds = np.array([self.bound(index) for index in self.item.whole])
+        known = np.isfinite(bounds).any()
+        found = []
+        for measure in (ObjectView.diameter, ObjectView.area):
+            sizes = {index: measure(view) for index, view in self.views.items() if index not in self.item.cut}
+            factors = bounds * [sizes[index] for index in self.item.whole]
+            found.append(Sizes(sizes, float(np.nanquantile(factors, TIGHTEST)) if known else math.nan))
+        return found
+
+
+class ObjectView:
+    """An object as one frame sees it.
+
+    Args:
+        pixels: Flat indices of its pixels in the scaled mask.
+        camera: The camera of the frame.
+
+    Attributes:
+        time: Time of the frame in [0, 1].
+        size: (width, height) of the scaled mask.
+    """
+
+    def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
+        self._camera = camera.resized(*scaled_size(camera))
+        self.time, self.size = camera.time, self._camera.size
+        rows, columns = np.divmod(pixels, self._camera.width)
+        self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
+        viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4, dtype=torch.float32))
+        self._slopes = viewed.unproject(self._rows, self._columns, filled(len(pixels), 1.0))[:, :2].contiguous().numpy()
+
+    def diameter(self) -> float:
+        """Largest distance of two of its pixels at depth 1."""
+        hull = cv2.convexHull(self._slopes)[:, 0]
+        return float(np.linalg.norm(hull[:, None] - hull, axis=-1).max())
+
+    def area(self) -> float:
+        """Square root of its area at depth 1."""
+        return math.sqrt(len(self._rows) / float(self._camera.K[0, 0] * self._camera.K[1, 1]))
+
+    def position(self, depth: float) -> Float[np.ndarray, "3"]:
+        """Where its centre is at a depth, in scene units."""
+        points = self._camera.unproject(self._rows, self._columns, filled(len(self._rows), depth))
+        return points.mean(0).double().numpy()
+
+    def surface(self, depth: float) -> Float[Tensor, " P"]:
+        """Depth of its pixels if it is round, with that mean."""
+        points = depth * self._slopes
+        nearer = front_of_ball(points - points.mean(0))
+        return torch.from_numpy(depth + nearer.mean() - nearer).float()
+
+    def bound(self, points: Points) -> float:
+        """Depth of the static points around it; NaN if there are too few."""
+        row, column, depth = points
+        width, height = self.size
+        region = np.zeros((height, width), np.uint8)
+        region[self._rows, self._columns] = 1
+        reach = 2 * max(1, round(AROUND * max(width, height))) + 1
+        around = torch.from_numpy(cv2.dilate(region, np.ones((reach, reach), np.uint8)) > 0)
+        near = depth[around[row, column]]
+        return float(near.quantile(NEAREST)) if len(near) >= MIN_POINTS else math.nan
