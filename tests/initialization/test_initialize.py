@@ -1,7 +1,6 @@
 """Initial Gaussians: from points, and from the depth of dynamic pixels."""
 
 import dataclasses
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 from tests import tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig
+from warpgs.config import DensifyConfig, ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization import alignment, dynamic_points, initialize
 from warpgs.initialization.point_cloud import (
@@ -585,117 +584,3 @@ def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
     scene = initialize.initial_scene(config, capture, generator())
     for gaussians in (scene.static, scene.dynamic, dynamic_gaussians(capture, ALIGNMENT, config)):
         assert gaussians.sh.shape[1] == (degree + 1) ** 2
-
-
-def capture_of_grid(inverse_of):
-    """Points of random depth in every second row and column, and there ``inverse_of(depth, column)``."""
-    row, column = torch.cartesian_prod(torch.arange(2, HEIGHT, 2), torch.arange(1, WIDTH, 2)).T
-    depth = 1.5 + 2.5 * torch.rand(len(row), generator=generator(3))
-    inverse_depth = torch.full((HEIGHT, WIDTH), torch.nan)
-    inverse_depth[row, column] = inverse_of(depth, column)
-    return make_capture(CAMERA.unproject(row, column, depth), inverse_depth=inverse_depth)
-
-
-def aligned(factor, signal=1.0):
-    """The alignment of views whose inverse depth is the true one times ``signal``, times random numbers in 1 ± factor.
-
-    What ``signal`` leaves out is a constant.
-    """
-
-    def inverse_of(depth, column):
-        noise = 1.0 + factor * (2.0 * torch.rand(len(depth), generator=generator(4)) - 1.0)
-        return (signal / depth + 0.4 * (1.0 - signal)) * noise
-
-    capture = capture_of_grid(inverse_of)
-    return alignment.align_to_points(capture, views_of(capture))
-
-
-def test_exact_depth_is_trusted_whatever_the_tolerance():
-    found = aligned(0.0)
-    assert (found.errors[:, 0] < 2e-3).all()  # depth is stored in half precision
-    assert error(found.alignments, torch.tensor([[1.0, 0.0]] * 3)) < 2e-2
-    assert (found.trust(LossConfig(depth_tolerance=0.03)).weight > 0.99).all()
-
-
-def test_trust_is_a_half_at_the_tolerance():
-    found = aligned(0.1)
-    tolerance = found.errors[0, 0].item()
-    assert 0.02 < tolerance < 0.1
-    assert error(found.trust(LossConfig(depth_tolerance=tolerance)).weight, torch.full((3,), 0.5)) < 1e-6
-    assert error(found.trust(LossConfig(depth_tolerance=tolerance / 3.0)).weight, torch.full((3,), 0.1)) < 1e-6
-
-
-def test_depth_that_is_noise_is_not_trusted():
-    assert torch.equal(aligned(0.5, signal=0.0).trust(LossConfig(depth_tolerance=0.03)).weight, torch.zeros(3))
-
-
-def test_without_a_tolerance_every_view_is_trusted():
-    assert torch.equal(aligned(0.1).trust(LossConfig(depth_tolerance=0.0)).weight, torch.ones(3))
-    assert torch.equal(aligned(0.5, signal=0.0).trust(LossConfig(depth_tolerance=0.0)).weight, torch.ones(3))
-
-
-def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
-    errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
-    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03))
-    assert error(trust.weight, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
-
-
-def test_the_margin_is_a_multiple_of_the_error_of_each_view():
-    errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.01, 0.4], [0.02, 0.4]])
-    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_margin=3.0))
-    assert error(trust.margin, torch.tensor([0.09, 0.06, 0.03, 0.06])) < 1e-7
-    assert torch.equal(trust.weight, torch.ones(4))
-
-
-def test_without_points_nothing_is_refused():
-    found = alignment.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
-    trust = found.trust(LossConfig(depth_tolerance=0.03, depth_margin=3.0))
-    assert torch.equal(trust.weight, torch.ones(2))
-    assert torch.equal(trust.margin, torch.zeros(2))
-
-
-def test_depth_with_smooth_errors_is_brought_to_the_points():
-    capture = capture_of_grid(lambda depth, column: (1.0 + 0.1 * torch.sin(column / 16.0)) / depth)
-    views = views_of(capture)
-    plain = alignment.align_to_points(capture, views)
-    smooth = alignment.align_to_points(capture, views, smooth=True)
-    assert (smooth.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
-    assert torch.equal(smooth.alignments, plain.alignments)
-    again = alignment.align_to_points(capture, views)  # of the depth as it is now
-    assert (again.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
-
-
-def test_depth_that_a_smooth_factor_makes_no_better_stays():
-    capture = capture_of_grid(lambda depth, _: 1.0 / depth)
-    views = views_of(capture)
-    before = views[0].inverse_depth.clone()
-    alignment.align_to_points(capture, views, smooth=True)
-    assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))
-
-
-@pytest.mark.parametrize("source", ["points", "rendering"])
-def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch, source):
-    row, column = torch.cartesian_prod(torch.arange(HEIGHT), torch.arange(WIDTH)).T
-    depth = 1.5 + 2.5 * torch.rand(HEIGHT, WIDTH, generator=generator(3))
-    capture = make_capture(CAMERA.unproject(row, column, depth.flatten()))
-    factors = {"0": 1.0, "1": torch.nan, "2": 4.0}
-
-    def read(name):
-        known = torch.arange(HEIGHT)[:, None] < 10 * (1 + int(name))  # the number of samples differs, too
-        return dataclasses.replace(
-            capture.frame(name), inverse_depth=torch.where(known, factors[name] / depth, torch.nan)
-        )
-
-    views = views_of(with_frames(capture, read))
-    layer = SimpleNamespace(depth=depth, alpha=torch.ones(HEIGHT, WIDTH))
-    monkeypatch.setattr(alignment, "render", lambda *_, **__: SimpleNamespace(joint=layer))
-    before = torch.full((3, 2), 7.0)
-    for most in (1, 1 << 20):
-        monkeypatch.setattr(alignment, "MAX_SAMPLES_ON_CPU", most)
-        if source == "points":
-            found, unknown = alignment.align_to_points(capture, views).alignments, torch.nan
-        else:
-            scene = initialize.initial_scene(CONFIG, capture, generator())
-            found, unknown = alignment.align_to_rendering(before, views, scene, 0), 7.0
-        expected = torch.tensor([[1.0, 0.0], [unknown, unknown], [0.25, 0.0]])
-        assert torch.allclose(found, expected, atol=2e-3, equal_nan=True)  # depth is stored in half precision
